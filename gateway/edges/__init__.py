@@ -1,0 +1,1 @@
+"""Clocks, ports, sockets and files: the only I/O."""

@@ -1,0 +1,1 @@
+"""Calibrated samples to navigation states; pure."""

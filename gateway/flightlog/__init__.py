@@ -1,0 +1,1 @@
+"""Recording formats and playback state machines; pure."""

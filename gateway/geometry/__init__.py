@@ -1,0 +1,1 @@
+"""Rotations and geodesy shared by the stages."""

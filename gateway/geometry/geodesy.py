@@ -1,0 +1,95 @@
+"""The WGS 84 ellipsoid near one place: metres north and east against degrees.
+
+`pymap3d` does the exact conversions in tools and analysis; the two radii here are for the
+per-sample kernels, which only ever step a few metres from a known latitude.
+"""
+
+import math
+
+from gateway.compiled import compiled
+
+SEMI_MAJOR_M = 6_378_137.0
+ECCENTRICITY_SQ = 6.694_379_990_141_317e-3
+
+
+@compiled
+def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
+    """Compute the radii of curvature at a latitude and height.
+
+    Parameters
+    ----------
+    lat_deg : float
+        Geodetic latitude in degrees.
+    alt_m : float
+        Height above the ellipsoid in metres.
+
+    Returns
+    -------
+    meridian_m : float
+        Metres per radian of latitude.
+    parallel_m : float
+        Metres per radian of longitude; the cosine of the latitude is included.
+
+    References
+    ----------
+    .. [1] P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation
+       Systems", 2nd ed., 2013, eq. 2.105 and 2.106.
+    """
+    sin_lat = math.sin(math.radians(lat_deg))
+    w_sq = 1.0 - ECCENTRICITY_SQ * sin_lat * sin_lat
+    w = math.sqrt(w_sq)
+    meridian = SEMI_MAJOR_M * (1.0 - ECCENTRICITY_SQ) / (w_sq * w)
+    transverse = SEMI_MAJOR_M / w
+    return (meridian + alt_m, (transverse + alt_m) * math.cos(math.radians(lat_deg)))
+
+
+@compiled
+def offset_deg(
+    lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float
+) -> tuple[float, float]:
+    """Step a short way north and east.
+
+    Parameters
+    ----------
+    lat_deg, lon_deg : float
+        Start in degrees.
+    alt_m : float
+        Height in metres.
+    north_m, east_m : float
+        Step in metres; exact to first order, so for steps well below a kilometre.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Latitude and longitude in degrees, the longitude in [-180, 180).
+    """
+    meridian, parallel = radii_m(lat_deg, alt_m)
+    lat = lat_deg + math.degrees(north_m / meridian)
+    lon = lon_deg + math.degrees(east_m / max(parallel, 1.0))
+    return (lat, (lon + 180.0) % 360.0 - 180.0)
+
+
+@compiled
+def displacement_m(
+    from_lat_deg: float, from_lon_deg: float, to_lat_deg: float, to_lon_deg: float, alt_m: float
+) -> tuple[float, float]:
+    """Measure a short way as metres north and east, radii taken at the start.
+
+    Parameters
+    ----------
+    from_lat_deg, from_lon_deg, to_lat_deg, to_lon_deg : float
+        Both ends in degrees.
+    alt_m : float
+        Height in metres.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Metres north and east.
+    """
+    meridian, parallel = radii_m(from_lat_deg, alt_m)
+    delta_lon = (to_lon_deg - from_lon_deg + 180.0) % 360.0 - 180.0
+    return (
+        math.radians(to_lat_deg - from_lat_deg) * meridian,
+        math.radians(delta_lon) * parallel,
+    )

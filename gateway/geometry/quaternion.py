@@ -1,0 +1,167 @@
+"""Unit quaternions of attitude: Hamilton, scalar first, body FRD to NED.
+
+All functions take and return plain tuples of floats, so they cost the same inside a compiled
+kernel and in a per-sample call. Equation numbers are those of Arfakhsyad et al., "UAV Data-Driven
+Modeling Software with Integrated 9-Axis IMU-GPS Sensor Fusion and Data Filtering Algorithm".
+"""
+
+import math
+
+from gateway.compiled import compiled
+from gateway.records import Quat, Vec3
+
+IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
+
+
+@compiled
+def multiply(p: Quat, q: Quat) -> Quat:
+    """Compose two rotations: the Hamilton product `p * q`.
+
+    Eq. 14; deviation: the printed second row has `-c1*d2` and the last row `b1*b2` in place of
+    `b1*c2`, which is no Hamilton product.
+
+    Parameters
+    ----------
+    p, q : tuple of 4 floats
+        Quaternions, scalar first.
+
+    Returns
+    -------
+    tuple of 4 floats
+        The rotation `q` followed by `p`.
+    """
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+@compiled
+def conjugate(q: Quat) -> Quat:
+    """Invert a unit rotation."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+@compiled
+def normalise(q: Quat) -> Quat:
+    """Scale to unit norm; the zero quaternion becomes the identity."""
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if norm == 0.0:
+        return (1.0, 0.0, 0.0, 0.0)
+    return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+@compiled
+def rotate(q: Quat, v: Vec3) -> Vec3:
+    """Take a vector from the body to the navigation frame: eq. 13, `q * v * conj(q)`.
+
+    Parameters
+    ----------
+    q : tuple of 4 floats
+        `q_nb`, unit norm.
+    v : tuple of 3 floats
+        Vector in the body frame.
+
+    Returns
+    -------
+    tuple of 3 floats
+        The same vector in NED.
+    """
+    w, x, y, z = q
+    tx = 2.0 * (y * v[2] - z * v[1])
+    ty = 2.0 * (z * v[0] - x * v[2])
+    tz = 2.0 * (x * v[1] - y * v[0])
+    return (
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    )
+
+
+@compiled
+def rotate_inverse(q: Quat, v: Vec3) -> Vec3:
+    """Take a vector from the navigation to the body frame."""
+    return rotate((q[0], -q[1], -q[2], -q[3]), v)
+
+
+@compiled
+def from_rotation_vector(v: Vec3) -> Quat:
+    """Turn a rotation vector into a quaternion: eq. 9 to 12, the standard axis-angle form.
+
+    Parameters
+    ----------
+    v : tuple of 3 floats
+        Axis times angle in rad; any length, zero included.
+
+    Returns
+    -------
+    tuple of 4 floats
+        Unit quaternion.
+    """
+    angle_sq = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if angle_sq < 1e-12:
+        # Series of sin(a/2)/a: the closed form divides by zero here.
+        scale = 0.5 - angle_sq / 48.0
+        return normalise((1.0 - angle_sq / 8.0, v[0] * scale, v[1] * scale, v[2] * scale))
+    angle = math.sqrt(angle_sq)
+    scale = math.sin(0.5 * angle) / angle
+    return (math.cos(0.5 * angle), v[0] * scale, v[1] * scale, v[2] * scale)
+
+
+@compiled
+def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
+    """Build `q_nb` from intrinsic Z-Y-X angles (yaw, then pitch, then roll).
+
+    Parameters
+    ----------
+    roll_rad, pitch_rad, yaw_rad : float
+        Angles in rad.
+
+    Returns
+    -------
+    tuple of 4 floats
+        `q_nb`, unit norm.
+    """
+    cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
+    cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
+    cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@compiled
+def to_euler(q: Quat) -> Vec3:
+    """Split `q_nb` into roll, pitch and yaw.
+
+    Eq. 16; deviations: the printed pitch repeats the roll's numerator, and the first denominator
+    has `S4` for `S3`; the angles are named as the field names them (roll phi, yaw psi).
+
+    Parameters
+    ----------
+    q : tuple of 4 floats
+        `q_nb`, unit norm.
+
+    Returns
+    -------
+    tuple of 3 floats
+        `roll_rad` and `yaw_rad` in (-pi, pi], `pitch_rad` in [-pi/2, pi/2].
+    """
+    w, x, y, z = q
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return (roll, pitch, yaw)
+
+
+@compiled
+def wrap_pi(angle_rad: float) -> float:
+    """Bring an angle into [-pi, pi): the shortest way round."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi

@@ -1,0 +1,299 @@
+"""The frozen records that the stages exchange.
+
+Names follow the rule quantity, frame, unit. Body frame `_b` is FRD (x forward, y right, z down);
+navigation frame `_n` is NED. Times are integers in microseconds: `time_us` on the gateway clock
+(monotonic, zero when the daemon starts), `node_time_us` on a node's own clock. A float that is not
+known is NaN; a whole record that does not exist yet is None.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+Vec3 = tuple[float, float, float]
+Int3 = tuple[int, int, int]
+Quat = tuple[float, float, float, float]
+
+NAN = float("nan")
+UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
+
+
+class ImuFlags(IntFlag):
+    """State of an IMU node, one bit each; the same bits travel in the radio payload."""
+
+    ACCEL_FILTERED = 1 << 0
+    """The node has low-passed the acceleration; the gateway must not do it again."""
+    GYRO_FILTERED = 1 << 1
+    """The node has high-passed the angular rate; the gateway must not do it again."""
+    MAG_NEW = 1 << 2
+    """The magnetometer words were sampled since the previous IMU payload."""
+    MAG_ABSENT = 1 << 3
+    BARO_ABSENT = 1 << 4
+    SELF_TEST_FAILED = 1 << 5
+    ACCEL_CLIPPED = 1 << 6
+    GYRO_CLIPPED = 1 << 7
+
+
+class GpsFixType(IntEnum):
+    """Fix types of UBX-NAV-PVT."""
+
+    NONE = 0
+    DEAD_RECKONING = 1
+    FIX_2D = 2
+    FIX_3D = 3
+    GNSS_AND_DEAD_RECKONING = 4
+    TIME_ONLY = 5
+
+
+class NavFlags(IntFlag):
+    """What an estimator is doing and which of its outputs hold."""
+
+    ATTITUDE_VALID = 1 << 0
+    """Roll and pitch have converged."""
+    HEADING_VALID = 1 << 1
+    """Yaw refers to true north (magnetometer or GPS course)."""
+    POSITION_VALID = 1 << 2
+    VELOCITY_VALID = 1 << 3
+    ALTITUDE_VALID = 1 << 4
+    AT_REST = 1 << 5
+    """Rest was detected; gyro bias is being learned."""
+    USING_GPS = 1 << 6
+    USING_MAG = 1 << 7
+    USING_BARO = 1 << 8
+    MAG_DISTURBED = 1 << 9
+    GPS_REJECTED = 1 << 10
+    """The newest fixes failed the innovation check and were not used."""
+    DEAD_RECKONING = 1 << 11
+    """Position and velocity run on inertial data alone since the last fix is old."""
+    SENSOR_FAULT = 1 << 12
+    """A sensor is stuck, saturated or not finite, and was left out."""
+    DEGRADED = 1 << 13
+    """At least one output is worse than the estimator's normal working."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeId:
+    """Which node of which aircraft a payload comes from."""
+
+    vehicle_id: int
+    """1 to 31; becomes the MAVLink system id unless the settings say otherwise."""
+    node_id: int
+    """0 to 7, unique within the aircraft."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuRaw:
+    """One IMU payload on the gateway clock, in sensor counts and sensor axes."""
+
+    time_us: int
+    node: NodeId
+    node_time_us: int
+    accel_raw: Int3
+    gyro_raw: Int3
+    mag_raw: Int3
+    temperature_raw: int
+    accel_range_g: int
+    gyro_range_dps: int
+    mag_lsb_per_gauss: int
+    flags: ImuFlags
+
+
+@dataclass(frozen=True, slots=True)
+class BaroRaw:
+    """One barometer payload on the gateway clock; the node has applied the BMP180's own words."""
+
+    time_us: int
+    node: NodeId
+    node_time_us: int
+    pressure_pa: float
+    temperature_degc: float
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """One GPS fix at its arrival on the gateway clock; it was valid `latency` earlier."""
+
+    time_us: int
+    node: NodeId
+    node_time_us: int
+    itow_ms: int
+    fix_type: GpsFixType
+    fix_ok: bool
+    """The receiver's own gnssFixOK: within its accuracy masks."""
+    satellites: int
+    lat_dege7: int
+    lon_dege7: int
+    alt_amsl_m: float
+    vel_n_mps: Vec3
+    alt_ellipsoid_m: float
+    """NaN until a quality payload has told the geoid separation."""
+    h_acc_m: float
+    v_acc_m: float
+    speed_acc_mps: float
+    course_acc_deg: float
+    pdop: float
+    utc_us: int | None
+    """Unix time of the fix, or None while the receiver does not vouch for date and time."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """A node's own once-a-second report."""
+
+    time_us: int
+    node: NodeId
+    node_time_us: int
+    firmware_version: tuple[int, int]
+    reset_cause: int
+    sensors_present: int
+    sensors_failed: int
+    bus_errors: int
+    radio_failed: int
+    radio_retries: int
+    loop_max_us: int
+    sample_rate_hz: int
+    supply_mv: int
+
+
+@dataclass(frozen=True, slots=True)
+class PipeCounters:
+    """What the receiver counted on one of its six radio pipes since it started."""
+
+    received: int
+    lost: int
+    overruns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverStatus:
+    """The receiver's own once-a-second report."""
+
+    time_us: int
+    receiver_time_us: int
+    channel: int
+    noise_percent: int
+    """Share of idle listening in which the channel held a carrier above -64 dBm."""
+    uart_dropped: int
+    reset_cause: int
+    pipes: tuple[PipeCounters, ...]
+
+
+RawRecord = ImuRaw | BaroRaw | GpsFix | NodeStatus
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """One calibrated IMU sample in body FRD, with its filtered twins."""
+
+    time_us: int
+    accel_b_mps2: Vec3
+    """Specific force, calibrated, as wide as the node sends it; level at rest (0, 0, -9.81)."""
+    gyro_b_radps: Vec3
+    accel_lowpass_b_mps2: Vec3
+    """Specific force behind the second-order low-pass; equals `accel_b_mps2` if filtered on the
+    node."""
+    gyro_highpass_b_radps: Vec3
+    """Angular rate behind the high-pass; equals `gyro_b_radps` if filtered on the node."""
+    mag_b_ut: Vec3 | None
+    """Calibrated magnetic field, None unless sampled anew."""
+    temperature_degc: float
+    flags: ImuFlags
+
+
+@dataclass(frozen=True, slots=True)
+class BaroSample:
+    """One calibrated barometer sample."""
+
+    time_us: int
+    pressure_pa: float
+    temperature_degc: float
+    alt_pressure_m: float
+    """Height in the ICAO standard atmosphere, positive up."""
+
+
+@dataclass(frozen=True, slots=True)
+class NavState:
+    """What an estimator believes at the time of one IMU sample; unknown values are NaN."""
+
+    time_us: int
+    q_nb: Quat
+    """Attitude, body FRD to NED, scalar first, unit norm."""
+    rate_b_radps: Vec3
+    """Angular rate, bias removed."""
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    vel_n_mps: Vec3
+    attitude_std_rad: Vec3
+    """Standard deviations about north, east and down."""
+    vel_std_mps: Vec3
+    pos_std_m: Vec3
+    """Standard deviations north, east, down."""
+    flags: NavFlags
+
+
+@dataclass(frozen=True, slots=True)
+class NodeLink:
+    """What the gateway counted of one node since it started."""
+
+    node: NodeId
+    pipe: int
+    received: int
+    lost: int
+    """Gaps in the node's sequence, less what came late."""
+    duplicates: int
+    reordered: int
+    restarts: int
+    rate_hz: float
+    """Payloads per second, over the last second."""
+    last_time_us: int
+    """Arrival of the newest payload on the gateway clock."""
+    clock_skew_ppm: float
+    """How much faster than the gateway's the node's clock runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """State of the serial link and of every node behind it; built once a second."""
+
+    time_us: int
+    connected: bool
+    port: str
+    bytes_received: int
+    frames: int
+    frames_lost: int
+    """Gaps in the receiver's own frame sequence."""
+    faults: tuple[tuple[str, int], ...]
+    """Kind of fault and how often, only kinds that happened."""
+    nodes: tuple[NodeLink, ...]
+    receiver: ReceiverStatus | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """One encoded MAVLink frame and where it goes."""
+
+    frame: bytes
+    message_id: int
+    client_id: int | None = None
+    """The one client it answers, or None for every client."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientInterval:
+    """A client's wish for the rate at which it is sent one message of one system."""
+
+    client_id: int
+    system_id: int
+    message_id: int
+    interval_us: int
+    """Least time between two frames; 0 for the settings' rate, -1 for none at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """One MAVLink frame that a client sent."""
+
+    client_id: int
+    frame: bytes
+    trusted: bool
+    """Whether the settings let this client change state."""

@@ -1,0 +1,1 @@
+"""Raw records to calibrated SI samples and their filters; pure."""

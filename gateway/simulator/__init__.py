@@ -1,0 +1,1 @@
+"""A seeded flight, its sensors and its radio; pure."""

@@ -1,0 +1,1 @@
+"""Navigation states to MAVLink messages, and a client's requests to answers; pure."""

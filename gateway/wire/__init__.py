@@ -1,0 +1,1 @@
+"""Bytes of the receiver to raw records on the gateway clock; pure."""

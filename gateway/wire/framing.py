@@ -1,0 +1,153 @@
+"""The serial line: zero-delimited COBS frames closed by a CRC-16.
+
+Theory of operation. The receiver sends `COBS(content + crc) 0x00`. COBS removes every zero from
+the content, so a zero on the line can only be a frame's end: after any damage the next zero brings
+the decoder back into step, and no length field can mislead it. The decoder has two states:
+
+| state     | byte is zero                             | byte is not zero                        |
+| --------- | ---------------------------------------- | --------------------------------------- |
+| gathering | frame complete: check it, start anew     | keep it; at the bound go to `skipping`  |
+| skipping  | one `TOO_LONG` fault, back to gathering  | count it and drop it                    |
+
+The first frame after opening a port is usually cut; it comes out as one fault and nothing more.
+"""
+
+import binascii
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from cobs import cobs
+
+CRC_START: Final = 0xFFFF
+CRC_SIZE: Final = 2
+DELIMITER: Final = b"\x00"
+
+MAX_CONTENT: Final = 72
+"""Longest content: the receiver's status frame."""
+MAX_ENCODED: Final = MAX_CONTENT + CRC_SIZE + 1
+"""COBS adds one byte to anything up to 254 bytes."""
+
+
+class FaultKind(StrEnum):
+    """What can be wrong with bytes from the line."""
+
+    COBS = "cobs"
+    CRC = "crc"
+    TOO_LONG = "too_long"
+    TOO_SHORT = "too_short"
+    VERSION = "version"
+    KIND = "kind"
+    PAYLOAD = "payload"
+    VALUE = "value"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The checked content of one frame, CRC removed."""
+
+    content: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Bytes that were dropped, and why."""
+
+    kind: FaultKind
+    size: int
+
+
+def crc16(content: bytes) -> int:
+    """Compute CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, no reflection.
+
+    avr-libc's `_crc_xmodem_update`, started with 0xFFFF, gives the same value.
+    """
+    return binascii.crc_hqx(content, CRC_START)
+
+
+def encode_frame(content: bytes) -> bytes:
+    """Build the bytes of one frame, delimiter included.
+
+    Parameters
+    ----------
+    content : bytes
+        At most `MAX_CONTENT` bytes.
+
+    Returns
+    -------
+    bytes
+        COBS-encoded content and CRC (little-endian), then a zero.
+
+    Raises
+    ------
+    ValueError
+        If the content is too long for a receiver to accept.
+    """
+    if len(content) > MAX_CONTENT:
+        raise ValueError(f"content of {len(content)} bytes; at most {MAX_CONTENT} fit a frame")
+    stuffed: bytes = cobs.encode(content + crc16(content).to_bytes(CRC_SIZE, "little"))
+    return stuffed + DELIMITER
+
+
+class FrameDecoder:
+    """Turn any chunks of bytes into frames and faults."""
+
+    def __init__(self) -> None:
+        self._partial = b""
+        self._skipped = 0
+
+    def feed(self, data: bytes) -> list[Frame | Fault]:
+        """Take the next bytes from the line.
+
+        Parameters
+        ----------
+        data : bytes
+            Any chunk, from one byte to all of a recording.
+
+        Returns
+        -------
+        list of Frame or Fault
+            Every frame that the chunk completes and every fault it reveals, in order. Never
+            raises on data.
+        """
+        events: list[Frame | Fault] = []
+        *complete, rest = data.split(DELIMITER)
+        for piece in complete:
+            self._take(piece)
+            if event := self._finish():
+                events.append(event)
+        self._take(rest)
+        return events
+
+    def reset(self) -> None:
+        """Forget a half-received frame, as after reopening the port."""
+        self._partial = b""
+        self._skipped = 0
+
+    def _take(self, piece: bytes) -> None:
+        if self._skipped or len(self._partial) + len(piece) > MAX_ENCODED:
+            self._skipped += len(self._partial) + len(piece)
+            self._partial = b""
+        else:
+            self._partial += piece
+
+    def _finish(self) -> Frame | Fault | None:
+        if self._skipped:
+            fault = Fault(FaultKind.TOO_LONG, self._skipped)
+            self._skipped = 0
+            return fault
+        stuffed, self._partial = self._partial, b""
+        return _open(stuffed) if stuffed else None
+
+
+def _open(stuffed: bytes) -> Frame | Fault:
+    try:
+        checked: bytes = cobs.decode(stuffed)
+    except cobs.DecodeError:
+        return Fault(FaultKind.COBS, len(stuffed))
+    if len(checked) <= CRC_SIZE:
+        return Fault(FaultKind.TOO_SHORT, len(stuffed))
+    content, crc = checked[:-CRC_SIZE], checked[-CRC_SIZE:]
+    if crc16(content) != int.from_bytes(crc, "little"):
+        return Fault(FaultKind.CRC, len(stuffed))
+    return Frame(content)

@@ -1,0 +1,384 @@
+"""The bytes of radio payloads and receiver frames: `firmware/PROTOCOL.md` in code.
+
+Decoding never raises on data: content that is no payload of this version becomes a `Fault`.
+Encoding serves the simulator and the golden vectors that the firmware's tests share.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import IntEnum
+from typing import Final
+
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
+from gateway.wire.framing import Fault, FaultKind
+
+PROTOCOL_VERSION: Final = 1
+MAX_PAYLOAD: Final = 32
+"""One nRF24L01+ packet."""
+PIPES: Final = 6
+
+ACCEL_RANGES_G: Final = (2, 4, 8, 16)
+GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
+MAG_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
+"""HMC5883L gain codes 0 to 7."""
+
+
+class FrameKind(IntEnum):
+    """What the receiver sends: low nibble of a frame's first byte."""
+
+    RADIO = 1
+    RECEIVER_STATUS = 2
+
+
+class PayloadKind(IntEnum):
+    """What a node sends: low nibble of a payload's first byte."""
+
+    IMU = 1
+    BARO = 2
+    GPS_FIX = 3
+    GPS_QUALITY = 4
+    NODE_STATUS = 5
+
+
+_FRAME_HEADER: Final = struct.Struct("<BBBI")
+_HEADER: Final = struct.Struct("<BBHI")
+_IMU: Final = struct.Struct("<3h3h3hhHB")
+_BARO: Final = struct.Struct("<Ih")
+_GPS_FIX: Final = struct.Struct("<Iiii3hBB")
+_GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
+_NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHH")
+_RECEIVER_HEAD: Final = struct.Struct("<BBHB")
+_PIPE: Final = struct.Struct("<IIH")
+
+_MAG_SHIFT: Final = 4
+_GYRO_SHIFT: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What every radio payload starts with."""
+
+    node: NodeId
+    seq: int
+    """Counts this node's payloads of every kind, modulo 65536."""
+    node_time_us: int
+    """Modulo 2**32: wraps every 71.6 minutes."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuPayload:
+    """Counts of MPU6050 and HMC5883L, and the codes of their ranges."""
+
+    accel: tuple[int, int, int]
+    gyro: tuple[int, int, int]
+    mag: tuple[int, int, int]
+    temperature: int
+    flags: ImuFlags
+    accel_range: int
+    gyro_range: int
+    mag_gain: int
+
+
+@dataclass(frozen=True, slots=True)
+class BaroPayload:
+    """BMP180 reading, compensated on the node."""
+
+    pressure_centipa: int
+    temperature_ddegc: int
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFixPayload:
+    """Place and velocity of one UBX-NAV-PVT."""
+
+    itow_ms: int
+    lat_dege7: int
+    lon_dege7: int
+    alt_amsl_mm: int
+    vel_n_cmps: tuple[int, int, int]
+    fix_type: GpsFixType
+    fix_ok: bool
+    satellites: int
+
+
+@dataclass(frozen=True, slots=True)
+class GpsQualityPayload:
+    """Accuracy and UTC of the fix with the same `itow_ms`; sent before it."""
+
+    itow_ms: int
+    h_acc_cm: int
+    v_acc_cm: int
+    speed_acc_cmps: int
+    course_acc_cdeg: int
+    pdop_centi: int
+    geoid_separation_cm: int
+    utc: datetime | None
+    """To a hundredth of a second; None unless the receiver vouches for date and time."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatusPayload:
+    """A node's once-a-second report."""
+
+    firmware_version: tuple[int, int]
+    reset_cause: int
+    sensors_present: int
+    sensors_failed: int
+    bus_errors: int
+    radio_failed: int
+    radio_retries: int
+    loop_max_us: int
+    sample_rate_hz: int
+    supply_mv: int
+
+
+Payload = ImuPayload | BaroPayload | GpsFixPayload | GpsQualityPayload | NodeStatusPayload
+
+
+@dataclass(frozen=True, slots=True)
+class RadioFrame:
+    """One radio payload as the receiver passed it on."""
+
+    frame_seq: int
+    pipe: int
+    receiver_time_us: int
+    header: Header
+    payload: Payload
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverStatusFrame:
+    """The receiver's once-a-second report."""
+
+    frame_seq: int
+    receiver_time_us: int
+    channel: int
+    noise_percent: int
+    uart_dropped: int
+    reset_cause: int
+    pipes: tuple[PipeCounters, ...]
+
+
+def encode_payload(header: Header, payload: Payload) -> bytes:
+    """Build the bytes of one radio payload, at most `MAX_PAYLOAD`.
+
+    Raises
+    ------
+    struct.error
+        If a value does not fit its field.
+    """
+    kind, body = _encode_body(payload)
+    address = header.node.vehicle_id << 3 | header.node.node_id
+    first = PROTOCOL_VERSION << 4 | kind
+    return _HEADER.pack(first, address, header.seq, header.node_time_us) + body
+
+
+def encode_radio(frame_seq: int, pipe: int, receiver_time_us: int, payload: bytes) -> bytes:
+    """Build the content of the serial frame that passes one radio payload on."""
+    first = PROTOCOL_VERSION << 4 | FrameKind.RADIO
+    return _FRAME_HEADER.pack(first, frame_seq, pipe, receiver_time_us) + payload
+
+
+def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
+    """Build the content of a receiver status frame."""
+    first = PROTOCOL_VERSION << 4 | FrameKind.RECEIVER_STATUS
+    head = _FRAME_HEADER.pack(first, status.frame_seq, 0xFF, status.receiver_time_us)
+    body = _RECEIVER_HEAD.pack(
+        status.channel, status.noise_percent, status.uart_dropped, status.reset_cause
+    )
+    pipes = b"".join(_PIPE.pack(p.received, p.lost, p.overruns) for p in status.pipes)
+    return head + body + pipes
+
+
+def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | Fault:
+    """Read the content of one checked serial frame.
+
+    Parameters
+    ----------
+    content : bytes
+        A frame without COBS and CRC.
+
+    Returns
+    -------
+    RadioFrame, ReceiverStatusFrame or Fault
+        The fault names what does not fit: version, kind, length or a value.
+    """
+    size = len(content)
+    if size < _FRAME_HEADER.size:
+        return Fault(FaultKind.TOO_SHORT, size)
+    first, frame_seq, pipe, receiver_time_us = _FRAME_HEADER.unpack_from(content)
+    if first >> 4 != PROTOCOL_VERSION:
+        return Fault(FaultKind.VERSION, size)
+    body = content[_FRAME_HEADER.size :]
+    if first & 0xF == FrameKind.RADIO:
+        decoded = decode_payload(body)
+        if isinstance(decoded, Fault):
+            return Fault(decoded.kind, size)
+        if pipe >= PIPES:
+            return Fault(FaultKind.VALUE, size)
+        return RadioFrame(frame_seq, pipe, receiver_time_us, *decoded)
+    if first & 0xF == FrameKind.RECEIVER_STATUS:
+        return _decode_receiver_status(frame_seq, receiver_time_us, body, size)
+    return Fault(FaultKind.KIND, size)
+
+
+def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
+    """Read one radio payload.
+
+    Parameters
+    ----------
+    data : bytes
+        Header and body, as the node sent them.
+
+    Returns
+    -------
+    tuple of Header and Payload, or Fault
+    """
+    if not _HEADER.size <= len(data) <= MAX_PAYLOAD:
+        return Fault(FaultKind.PAYLOAD, len(data))
+    first, address, seq, node_time_us = _HEADER.unpack_from(data)
+    if first >> 4 != PROTOCOL_VERSION:
+        return Fault(FaultKind.VERSION, len(data))
+    if address >> 3 == 0:
+        return Fault(FaultKind.VALUE, len(data))
+    layout = _BODIES.get(first & 0xF)
+    if layout is None:
+        return Fault(FaultKind.KIND, len(data))
+    body_struct, read = layout
+    if len(data) != _HEADER.size + body_struct.size:
+        return Fault(FaultKind.PAYLOAD, len(data))
+    try:
+        payload = read(body_struct.unpack_from(data, _HEADER.size))
+    except ValueError:
+        return Fault(FaultKind.VALUE, len(data))
+    return Header(NodeId(address >> 3, address & 0x7), seq, node_time_us), payload
+
+
+def _decode_receiver_status(
+    frame_seq: int, receiver_time_us: int, body: bytes, size: int
+) -> ReceiverStatusFrame | Fault:
+    if len(body) != _RECEIVER_HEAD.size + PIPES * _PIPE.size:
+        return Fault(FaultKind.PAYLOAD, size)
+    channel, noise, dropped, cause = _RECEIVER_HEAD.unpack_from(body)
+    if noise > 100:
+        return Fault(FaultKind.VALUE, size)
+    pipes = tuple(PipeCounters(*p) for p in _PIPE.iter_unpack(body[_RECEIVER_HEAD.size :]))
+    return ReceiverStatusFrame(frame_seq, receiver_time_us, channel, noise, dropped, cause, pipes)
+
+
+def _encode_body(payload: Payload) -> tuple[PayloadKind, bytes]:
+    match payload:
+        case ImuPayload():
+            ranges = payload.accel_range | payload.gyro_range << _GYRO_SHIFT
+            ranges |= payload.mag_gain << _MAG_SHIFT
+            words = (*payload.accel, *payload.gyro, *payload.mag, payload.temperature)
+            return PayloadKind.IMU, _IMU.pack(*words, payload.flags, ranges)
+        case BaroPayload():
+            body = _BARO.pack(payload.pressure_centipa, payload.temperature_ddegc)
+            return PayloadKind.BARO, body
+        case GpsFixPayload():
+            place = (payload.itow_ms, payload.lat_dege7, payload.lon_dege7, payload.alt_amsl_mm)
+            kind = payload.fix_type | payload.fix_ok << 7
+            body = _GPS_FIX.pack(*place, *payload.vel_n_cmps, kind, payload.satellites)
+            return PayloadKind.GPS_FIX, body
+        case GpsQualityPayload():
+            return PayloadKind.GPS_QUALITY, _encode_quality(payload)
+        case NodeStatusPayload():
+            return PayloadKind.NODE_STATUS, _encode_node_status(payload)
+
+
+def _encode_quality(payload: GpsQualityPayload) -> bytes:
+    utc = payload.utc
+    moment = (0,) * 7
+    if utc is not None:
+        clock = (utc.hour, utc.minute, utc.second, utc.microsecond // 10_000)
+        moment = (utc.year - 2000, utc.month, utc.day, *clock)
+    return _GPS_QUALITY.pack(
+        payload.itow_ms,
+        payload.h_acc_cm,
+        payload.v_acc_cm,
+        payload.speed_acc_cmps,
+        payload.course_acc_cdeg,
+        payload.pdop_centi,
+        payload.geoid_separation_cm,
+        utc is not None,
+        *moment,
+    )
+
+
+def _encode_node_status(payload: NodeStatusPayload) -> bytes:
+    return _NODE_STATUS.pack(
+        *payload.firmware_version,
+        payload.reset_cause,
+        payload.sensors_present,
+        payload.sensors_failed,
+        payload.bus_errors,
+        payload.radio_failed,
+        payload.radio_retries,
+        payload.loop_max_us,
+        payload.sample_rate_hz,
+        payload.supply_mv,
+    )
+
+
+def _read_imu(words: tuple[int, ...]) -> ImuPayload:
+    ranges = words[11]
+    return ImuPayload(
+        accel=(words[0], words[1], words[2]),
+        gyro=(words[3], words[4], words[5]),
+        mag=(words[6], words[7], words[8]),
+        temperature=words[9],
+        flags=ImuFlags(words[10]),
+        accel_range=ranges & 3,
+        gyro_range=ranges >> _GYRO_SHIFT & 3,
+        mag_gain=ranges >> _MAG_SHIFT & 7,
+    )
+
+
+def _read_baro(words: tuple[int, ...]) -> BaroPayload:
+    return BaroPayload(*words)
+
+
+def _read_gps_fix(words: tuple[int, ...]) -> GpsFixPayload:
+    itow, lat, lon, alt, north, east, down, kind, satellites = words
+    if not (-900_000_000 <= lat <= 900_000_000 and -1_800_000_000 <= lon <= 1_800_000_000):
+        raise ValueError("no place on earth")
+    return GpsFixPayload(
+        itow_ms=itow,
+        lat_dege7=lat,
+        lon_dege7=lon,
+        alt_amsl_mm=alt,
+        vel_n_cmps=(north, east, down),
+        fix_type=GpsFixType(kind & 0x7F),
+        fix_ok=bool(kind & 0x80),
+        satellites=satellites,
+    )
+
+
+def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
+    valid, year, month, day, hour, minute, second, hundredths = words[7:]
+    utc = None
+    if valid:
+        # A leap second is sent as 60; the last hundredth before it is near enough.
+        if second == 60:
+            second, hundredths = 59, 99
+        clock = (hour, minute, second, hundredths * 10_000)
+        utc = datetime(2000 + year, month, day, *clock, tzinfo=UTC)
+    itow, h_acc, v_acc, speed_acc, course_acc, pdop, geoid = words[:7]
+    return GpsQualityPayload(itow, h_acc, v_acc, speed_acc, course_acc, pdop, geoid, utc)
+
+
+def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
+    major, minor, *rest = words
+    return NodeStatusPayload((major, minor), *rest)
+
+
+_BODIES: Final[dict[int, tuple[struct.Struct, Callable[[tuple[int, ...]], Payload]]]] = {
+    PayloadKind.IMU: (_IMU, _read_imu),
+    PayloadKind.BARO: (_BARO, _read_baro),
+    PayloadKind.GPS_FIX: (_GPS_FIX, _read_gps_fix),
+    PayloadKind.GPS_QUALITY: (_GPS_QUALITY, _read_gps_quality),
+    PayloadKind.NODE_STATUS: (_NODE_STATUS, _read_node_status),
+}

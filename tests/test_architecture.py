@@ -1,0 +1,122 @@
+"""The architecture, enforced: who may import whom, what is pure, how large a file may grow."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent / "gateway"
+
+FOUNDATION = {"records", "units", "settings", "compiled", "geometry"}
+
+MAY_IMPORT: dict[str, set[str]] = {
+    "records": set(),
+    "units": set(),
+    "settings": set(),
+    "compiled": set(),
+    "geometry": {"records", "compiled"},
+    "wire": FOUNDATION,
+    "sensing": FOUNDATION,
+    "estimation": FOUNDATION,
+    "vehicle": FOUNDATION,
+    "flightlog": FOUNDATION,
+    "simulator": FOUNDATION | {"wire"},
+    "pipeline": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
+    "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "simulator", "pipeline"},
+    "analysis": FOUNDATION
+    | {"wire", "sensing", "estimation", "flightlog", "simulator", "pipeline"},
+    "config": FOUNDATION | {"wire", "sensing", "estimation", "vehicle", "flightlog", "pipeline"},
+    "daemon": FOUNDATION
+    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator"}
+    | {"pipeline", "edges", "config"},
+    "cli": FOUNDATION
+    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator"}
+    | {"pipeline", "edges", "config", "daemon", "analysis"},
+}
+"""The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
+
+PURE = FOUNDATION | {
+    "wire", "sensing", "estimation", "vehicle", "flightlog", "simulator", "pipeline"
+}  # fmt: skip
+
+IMPURE_MODULES = {
+    "asyncio", "fcntl", "glob", "io", "logging", "multiprocessing", "os", "pathlib", "pty",
+    "random", "secrets", "select", "selectors", "serial", "shutil", "signal", "socket",
+    "subprocess", "sys", "tempfile", "termios", "threading", "time", "tty",
+}  # fmt: skip
+"""I/O, threads, clocks, logs and unseeded chance: none of them in a pure room."""
+
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 40
+
+SOURCES = sorted(ROOT.rglob("*.py"))
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def imported_modules(tree: ast.AST) -> set[str]:
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            if node.module == "gateway":
+                found |= {f"gateway.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+class TestSource:
+    def test_imports_follow_the_flow(self, path: Path) -> None:
+        room = room_of(path)
+        if room == "__init__":
+            return
+        rooms = {
+            parts[1]
+            for module in imported_modules(ast.parse(path.read_text()))
+            if (parts := module.split("."))[0] == "gateway" and len(parts) > 1
+        } - {"__version__"}
+        assert rooms - {room} <= MAY_IMPORT[room]
+
+    def test_pure_rooms_do_no_io(self, path: Path) -> None:
+        if room_of(path) not in PURE:
+            return
+        tree = ast.parse(path.read_text())
+        tops = {module.split(".")[0] for module in imported_modules(tree)}
+        assert not tops & IMPURE_MODULES
+        calls = {
+            node.func.id
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert not calls & {"open", "print", "input"}
+
+    def test_no_module_wide_state_from_mavutil(self, path: Path) -> None:
+        assert "pymavlink.mavutil" not in imported_modules(ast.parse(path.read_text()))
+
+    def test_one_idea_a_file(self, path: Path) -> None:
+        assert len(path.read_text().splitlines()) <= MAX_FILE_LINES
+
+    def test_short_functions(self, path: Path) -> None:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                body = node.body
+                if ast.get_docstring(node):
+                    body = body[1:]
+                if body:
+                    lines = (body[-1].end_lineno or 0) - body[0].lineno + 1
+                    assert lines <= MAX_FUNCTION_LINES, f"{node.name} has {lines} lines"
+
+
+def test_only_the_daemon_and_the_command_line_know_edges() -> None:
+    """Edges know nothing of one another's owners; the composition root joins them."""
+    knowing = {
+        room_of(path)
+        for path in SOURCES
+        for module in imported_modules(ast.parse(path.read_text()))
+        if module.startswith("gateway.edges")
+    }
+    assert knowing <= {"edges", "daemon", "cli"}

@@ -1,0 +1,177 @@
+"""Write tests/vectors/frames.json: the exact bytes of every payload and frame kind.
+
+The Python tests and the firmware's host tests both read the table, so the two implementations of
+firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself changes.
+"""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
+from gateway.wire import payloads
+from gateway.wire.framing import encode_frame
+
+TARGET = Path(__file__).resolve().parent.parent / "tests" / "vectors" / "frames.json"
+
+RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
+    "imu_level": (
+        payloads.Header(NodeId(1, 0), 7, 1_000_000),
+        payloads.ImuPayload(
+            accel=(0, 0, 4096),
+            gyro=(-12, 3, 0),
+            mag=(218, 0, -431),
+            temperature=-3920,
+            flags=ImuFlags.MAG_NEW,
+            accel_range=2,
+            gyro_range=1,
+            mag_gain=1,
+        ),
+    ),
+    "imu_extremes": (
+        payloads.Header(NodeId(31, 7), 65535, 4_294_967_295),
+        payloads.ImuPayload(
+            accel=(-32768, 32767, -1),
+            gyro=(32767, -32768, 1),
+            mag=(-4096, 2047, -2048),
+            temperature=-32768,
+            flags=ImuFlags(0xFF),
+            accel_range=3,
+            gyro_range=3,
+            mag_gain=7,
+        ),
+    ),
+    "imu_zeros": (
+        payloads.Header(NodeId(1, 0), 0, 0),
+        payloads.ImuPayload((0, 0, 0), (0, 0, 0), (0, 0, 0), 0, ImuFlags(0), 0, 0, 0),
+    ),
+    "baro_sea_level": (
+        payloads.Header(NodeId(1, 0), 8, 1_002_500),
+        payloads.BaroPayload(pressure_centipa=10_132_500, temperature_ddegc=250),
+    ),
+    "baro_cold": (
+        payloads.Header(NodeId(2, 0), 300, 90_000_000),
+        payloads.BaroPayload(pressure_centipa=3_000_012, temperature_ddegc=-400),
+    ),
+    "gps_fix_3d": (
+        payloads.Header(NodeId(1, 1), 41, 8_123_456),
+        payloads.GpsFixPayload(
+            itow_ms=345_600_200,
+            lat_dege7=-77_123_456,
+            lon_dege7=1_103_654_321,
+            alt_amsl_mm=153_250,
+            vel_n_cmps=(1234, -567, -89),
+            fix_type=GpsFixType.FIX_3D,
+            fix_ok=True,
+            satellites=14,
+        ),
+    ),
+    "gps_no_fix": (
+        payloads.Header(NodeId(1, 1), 1, 250_000),
+        payloads.GpsFixPayload(0, 0, 0, 0, (0, 0, 0), GpsFixType.NONE, False, 0),
+    ),
+    "gps_fix_extremes": (
+        payloads.Header(NodeId(31, 1), 65_280, 16_777_216),
+        payloads.GpsFixPayload(
+            itow_ms=604_799_900,
+            lat_dege7=900_000_000,
+            lon_dege7=-1_800_000_000,
+            alt_amsl_mm=-2_147_483_648,
+            vel_n_cmps=(-32_767, 32_767, -32_768),
+            fix_type=GpsFixType.TIME_ONLY,
+            fix_ok=False,
+            satellites=255,
+        ),
+    ),
+    "gps_quality_utc": (
+        payloads.Header(NodeId(1, 1), 40, 8_123_456),
+        payloads.GpsQualityPayload(
+            itow_ms=345_600_200,
+            h_acc_cm=180,
+            v_acc_cm=310,
+            speed_acc_cmps=42,
+            course_acc_cdeg=275,
+            pdop_centi=161,
+            geoid_separation_cm=2_345,
+            utc=datetime(2026, 11, 19, 0, 0, 2, 200_000, tzinfo=UTC),
+        ),
+    ),
+    "gps_quality_no_time": (
+        payloads.Header(NodeId(1, 1), 0, 249_000),
+        payloads.GpsQualityPayload(0, 65_535, 65_535, 65_535, 65_535, 9_999, -32_768, None),
+    ),
+    "node_status": (
+        payloads.Header(NodeId(1, 0), 512, 60_000_000),
+        payloads.NodeStatusPayload(
+            firmware_version=(1, 2),
+            reset_cause=8,
+            sensors_present=7,
+            sensors_failed=0,
+            bus_errors=3,
+            radio_failed=12,
+            radio_retries=65_535,
+            loop_max_us=812,
+            sample_rate_hz=100,
+            supply_mv=3300,
+        ),
+    ),
+}
+
+RECEIVER_STATUS = {
+    "receiver_status": payloads.ReceiverStatusFrame(
+        frame_seq=255,
+        receiver_time_us=61_000_000,
+        channel=76,
+        noise_percent=4,
+        uart_dropped=1,
+        reset_cause=1,
+        pipes=(
+            PipeCounters(6_000, 12, 0),
+            PipeCounters(600, 1, 0),
+            *(PipeCounters(0, 0, 0),) * 3,
+            PipeCounters(4_294_967_295, 65_536, 65_535),
+        ),
+    ),
+}
+
+
+def main() -> None:
+    """Build every vector and write the table."""
+    vectors = []
+    for frame_seq, (name, (header, payload)) in enumerate(RADIO.items()):
+        packet = payloads.encode_payload(header, payload)
+        pipe, receiver_time_us = frame_seq % payloads.PIPES, 5_000_000 + frame_seq
+        content = payloads.encode_radio(frame_seq, pipe, receiver_time_us, packet)
+        vectors.append(
+            {
+                "name": name,
+                "kind": type(payload).__name__,
+                "frame_seq": frame_seq,
+                "pipe": pipe,
+                "receiver_time_us": receiver_time_us,
+                "header": asdict(header),
+                "fields": asdict(payload),
+                "payload_hex": packet.hex(),
+                "content_hex": content.hex(),
+                "frame_hex": encode_frame(content).hex(),
+            }
+        )
+    for name, status in RECEIVER_STATUS.items():
+        content = payloads.encode_receiver_status(status)
+        vectors.append(
+            {
+                "name": name,
+                "kind": "ReceiverStatus",
+                "fields": asdict(status),
+                "content_hex": content.hex(),
+                "frame_hex": encode_frame(content).hex(),
+            }
+        )
+    text = json.dumps(vectors, indent=1, default=lambda moment: moment.isoformat())
+    TARGET.write_text(text + "\n", encoding="utf-8")
+    print(f"{len(vectors)} vectors written to {TARGET}")
+
+
+if __name__ == "__main__":
+    main()
