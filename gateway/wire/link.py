@@ -1,0 +1,332 @@
+"""Bytes of the receiver to raw records on the gateway clock, and the account of what was lost.
+
+One `Link` stands for one serial line. It joins the frame decoder, the payload codec, one clock
+tracker for the receiver and one for each node, and counts everything that does not come through.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+from gateway.records import (
+    NAN,
+    BaroRaw,
+    GpsFix,
+    ImuRaw,
+    LinkReport,
+    NodeId,
+    NodeLink,
+    NodeStatus,
+    RawRecord,
+    ReceiverStatus,
+)
+from gateway.units import M_PER_CM, M_PER_MM, US_PER_S
+from gateway.wire import payloads
+from gateway.wire.framing import Fault, FrameDecoder
+from gateway.wire.timesync import ClockTracker
+
+UINT16_MAX: Final = 65_535
+
+SEQUENCE_MODULUS: Final = 1 << 16
+LATE_WINDOW: Final = 64
+"""Payloads further back than any retry queue belong to another life of the node."""
+RATE_SPAN_US: Final = US_PER_S
+MAX_ARRIVALS: Final = 2048
+"""Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
+
+
+class Arrival(Enum):
+    """How a payload's sequence number stands to those before it."""
+
+    NEW = "new"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+
+
+class SequenceCounter:
+    """Tell new payloads from duplicates and late ones, and count the gaps."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.lost = 0
+        self.duplicates = 0
+        self.reordered = 0
+        self._last: int | None = None
+        self._seen = 0
+
+    def forget(self) -> None:
+        """Start anew after a restart of the sender; the counts stay."""
+        self._last = None
+
+    def count(self, seq: int) -> Arrival:
+        """Count one sequence number, modulo 65536."""
+        if self._last is None:
+            return self._begin(seq)
+        ahead = (seq - self._last) % SEQUENCE_MODULUS
+        if 0 < ahead < SEQUENCE_MODULUS // 2:
+            self._last = seq
+            self._seen = (self._seen << ahead | 1) & ((1 << LATE_WINDOW) - 1)
+            self.lost += ahead - 1
+            self.received += 1
+            return Arrival.NEW
+        behind = -ahead % SEQUENCE_MODULUS
+        if behind >= LATE_WINDOW:
+            return self._begin(seq)
+        if self._seen >> behind & 1:
+            self.duplicates += 1
+            return Arrival.DUPLICATE
+        self._seen |= 1 << behind
+        self.reordered += 1
+        self.received += 1
+        self.lost -= 1
+        return Arrival.LATE
+
+    def _begin(self, seq: int) -> Arrival:
+        self._last = seq
+        # Numbers before the first one heard are no late arrivals of this life.
+        self._seen = (1 << LATE_WINDOW) - 1
+        self.received += 1
+        return Arrival.NEW
+
+
+@dataclass(slots=True)
+class _Node:
+    """What the link knows of one node."""
+
+    clock: ClockTracker = field(default_factory=ClockTracker)
+    sequence: SequenceCounter = field(default_factory=SequenceCounter)
+    pipe: int = 0
+    last_time_us: int = 0
+    quality: payloads.GpsQualityPayload | None = None
+    arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
+
+
+class Link:
+    """Decode one receiver's serial line."""
+
+    def __init__(self) -> None:
+        self._decoder = FrameDecoder()
+        self._receiver_clock = ClockTracker()
+        self._receiver_status: ReceiverStatus | None = None
+        self._nodes: dict[NodeId, _Node] = {}
+        self._faults: Counter[str] = Counter()
+        self._bytes_received = 0
+        self._frames = 0
+        self._frames_lost = 0
+        self._last_frame_seq: int | None = None
+
+    def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
+        """Take the next bytes from the line.
+
+        Parameters
+        ----------
+        data : bytes
+            Any chunk.
+        arrival_us : int
+            When the chunk was read, on the gateway clock.
+
+        Returns
+        -------
+        list of ImuRaw, BaroRaw, GpsFix or NodeStatus
+            In the order of their arrival, without duplicates; the times of one node's IMU records
+            strictly grow. Never raises on data: faults are counted.
+        """
+        self._bytes_received += len(data)
+        records: list[RawRecord] = []
+        for event in self._decoder.feed(data):
+            decoded = event if isinstance(event, Fault) else payloads.decode_content(event.content)
+            if isinstance(decoded, Fault):
+                self._faults[decoded.kind] += 1
+                continue
+            heard_us = self._hear(decoded, arrival_us)
+            if isinstance(decoded, payloads.ReceiverStatusFrame):
+                self._receiver_status = _receiver_status(decoded, heard_us)
+            elif record := self._take_radio(decoded, heard_us, arrival_us):
+                records.append(record)
+        return records
+
+    def reopened(self) -> None:
+        """Forget the cut frame and the frame sequence after the port was opened again."""
+        self._decoder.reset()
+        self._last_frame_seq = None
+
+    def report(self, now_us: int, *, connected: bool, port: str) -> LinkReport:
+        """Sum up the line and every node behind it.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        connected : bool
+            Whether the port is open.
+        port : str
+            Name of the port, for people.
+
+        Returns
+        -------
+        LinkReport
+        """
+        return LinkReport(
+            time_us=now_us,
+            connected=connected,
+            port=port,
+            bytes_received=self._bytes_received,
+            frames=self._frames,
+            frames_lost=self._frames_lost,
+            faults=tuple(sorted(self._faults.items())),
+            nodes=tuple(_node_link(node_id, n, now_us) for node_id, n in self._nodes.items()),
+            receiver=self._receiver_status,
+        )
+
+    def _hear(
+        self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
+    ) -> int:
+        """Count a frame and tell when the receiver heard it, on the gateway clock."""
+        restarts = self._receiver_clock.restarts
+        heard_us = self._receiver_clock.observe(frame.receiver_time_us, arrival_us)
+        if self._last_frame_seq is not None and self._receiver_clock.restarts == restarts:
+            self._frames_lost += (frame.frame_seq - self._last_frame_seq - 1) % 256
+        self._last_frame_seq = frame.frame_seq
+        self._frames += 1
+        return heard_us
+
+    def _take_radio(
+        self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
+    ) -> RawRecord | None:
+        header = frame.header
+        node = self._nodes.setdefault(header.node, _Node())
+        restarts = node.clock.restarts
+        time_us = node.clock.observe(header.node_time_us, heard_us)
+        if node.clock.restarts != restarts:
+            node.sequence.forget()
+        # A late payload is counted but not used: every stage behind relies on growing times.
+        if node.sequence.count(header.seq) is not Arrival.NEW:
+            return None
+        node.pipe = frame.pipe
+        node.arrivals_us.append(arrival_us)
+        # A better estimate of the clock may move time back by a hair; a sample may not.
+        node.last_time_us = max(time_us, node.last_time_us + 1)
+        return _to_record(header, frame.payload, node)
+
+
+def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) -> RawRecord | None:
+    match payload:
+        case payloads.ImuPayload():
+            return _imu(header, payload, node.last_time_us)
+        case payloads.BaroPayload():
+            return BaroRaw(
+                time_us=node.last_time_us,
+                node=header.node,
+                node_time_us=header.node_time_us,
+                pressure_pa=payload.pressure_centipa * 1e-2,
+                temperature_degc=payload.temperature_ddegc * 1e-1,
+            )
+        case payloads.GpsFixPayload():
+            return _gps_fix(header, payload, node)
+        case payloads.GpsQualityPayload():
+            node.quality = payload
+            return None
+        case payloads.NodeStatusPayload():
+            return _node_status(header, payload, node.last_time_us)
+
+
+def _imu(header: payloads.Header, payload: payloads.ImuPayload, time_us: int) -> ImuRaw:
+    return ImuRaw(
+        time_us=time_us,
+        node=header.node,
+        node_time_us=header.node_time_us,
+        accel_raw=payload.accel,
+        gyro_raw=payload.gyro,
+        mag_raw=payload.mag,
+        temperature_raw=payload.temperature,
+        accel_range_g=payloads.ACCEL_RANGES_G[payload.accel_range],
+        gyro_range_dps=payloads.GYRO_RANGES_DPS[payload.gyro_range],
+        mag_lsb_per_gauss=payloads.MAG_LSB_PER_GAUSS[payload.mag_gain],
+        flags=payload.flags,
+    )
+
+
+def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) -> GpsFix:
+    north, east, down = fix.vel_n_cmps
+    alt_amsl_m = fix.alt_amsl_mm * M_PER_MM
+    quality = node.quality
+    separation_m = NAN if quality is None else quality.geoid_separation_cm * M_PER_CM
+    # Another epoch's accuracy would vouch for a fix it does not know; the geoid stays.
+    if quality is None or quality.itow_ms != fix.itow_ms:
+        quality = payloads.GpsQualityPayload(fix.itow_ms, *(UINT16_MAX,) * 5, 0, None)
+    utc_us = None if quality.utc is None else round(quality.utc.timestamp() * US_PER_S)
+    return GpsFix(
+        time_us=node.last_time_us,
+        node=header.node,
+        node_time_us=header.node_time_us,
+        itow_ms=fix.itow_ms,
+        fix_type=fix.fix_type,
+        fix_ok=fix.fix_ok,
+        satellites=fix.satellites,
+        lat_dege7=fix.lat_dege7,
+        lon_dege7=fix.lon_dege7,
+        alt_amsl_m=alt_amsl_m,
+        vel_n_mps=(north * M_PER_CM, east * M_PER_CM, down * M_PER_CM),
+        alt_ellipsoid_m=alt_amsl_m + separation_m,
+        h_acc_m=_unless_held(quality.h_acc_cm, M_PER_CM),
+        v_acc_m=_unless_held(quality.v_acc_cm, M_PER_CM),
+        speed_acc_mps=_unless_held(quality.speed_acc_cmps, M_PER_CM),
+        course_acc_deg=_unless_held(quality.course_acc_cdeg, 1e-2),
+        pdop=_unless_held(quality.pdop_centi, 1e-2),
+        utc_us=utc_us,
+    )
+
+
+def _unless_held(value: float, scale: float) -> float:
+    """Scale a 16-bit figure; one that is held at its end says no more than "bad"."""
+    return NAN if value == UINT16_MAX else value * scale
+
+
+def _node_status(
+    header: payloads.Header, status: payloads.NodeStatusPayload, time_us: int
+) -> NodeStatus:
+    return NodeStatus(
+        time_us=time_us,
+        node=header.node,
+        node_time_us=header.node_time_us,
+        firmware_version=status.firmware_version,
+        reset_cause=status.reset_cause,
+        sensors_present=status.sensors_present,
+        sensors_failed=status.sensors_failed,
+        bus_errors=status.bus_errors,
+        radio_failed=status.radio_failed,
+        radio_retries=status.radio_retries,
+        loop_max_us=status.loop_max_us,
+        sample_rate_hz=status.sample_rate_hz,
+        supply_mv=status.supply_mv,
+    )
+
+
+def _receiver_status(status: payloads.ReceiverStatusFrame, time_us: int) -> ReceiverStatus:
+    return ReceiverStatus(
+        time_us=time_us,
+        receiver_time_us=status.receiver_time_us,
+        channel=status.channel,
+        noise_percent=status.noise_percent,
+        uart_dropped=status.uart_dropped,
+        reset_cause=status.reset_cause,
+        pipes=status.pipes,
+    )
+
+
+def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:
+    counter = node.sequence
+    recent = sum(1 for t in node.arrivals_us if t > now_us - RATE_SPAN_US)
+    return NodeLink(
+        node=node_id,
+        pipe=node.pipe,
+        received=counter.received,
+        lost=counter.lost,
+        duplicates=counter.duplicates,
+        reordered=counter.reordered,
+        restarts=node.clock.restarts,
+        rate_hz=recent * US_PER_S / RATE_SPAN_US,
+        last_time_us=node.arrivals_us[-1],
+        clock_skew_ppm=node.clock.skew_ppm,
+    )

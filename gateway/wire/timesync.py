@@ -1,0 +1,141 @@
+"""Node clocks to the gateway clock: offset and drift from the packets that arrived soonest.
+
+Theory of operation. A packet stamped `t` by a remote clock arrives at `t + offset + delay` on the
+local one, where the delay is never negative but has bursts (retries, buffers, USB polling). The
+difference `arrival - t` therefore lies above the line `offset + skew * t`, and touches it whenever
+a packet meets no queue: the line is the lower envelope of all points. As in [1]_, it is found as
+the lower convex hull's edge above the window's middle, which is the supporting line with the least
+sum of distances to the points.
+
+| what happens                                          | what the tracker does                  |
+| ------------------------------------------------------ | -------------------------------------- |
+| stamp agrees with the arrival, any number of wraps on  | unwraps it, adds the point             |
+| stamp is late, or early, by less than RESTART_JUMP_US  | the same: a queue, not a restart       |
+| stamp disagrees by more                                | the remote restarted: learns anew      |
+
+References
+----------
+.. [1] S. B. Moon, P. Skelly, D. Towsley, "Estimation and removal of clock skew from network delay
+   measurements", INFOCOM 1999.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+WRAP_US: Final = 1 << 32
+BUCKET_US: Final = 250_000
+"""Only the soonest packet of a bucket is kept: at any rate a window costs the same."""
+MAX_BUCKETS: Final = 120
+"""30 s: long enough to average quantisation, short enough to follow a warming resonator."""
+MIN_SKEW_SPAN_US: Final = 2_000_000
+"""Below this span, a burst of retries would pass for drift."""
+MAX_SKEW: Final = 0.01
+"""Ceramic resonators drift by up to 0.5 %; twice that is not a clock."""
+RESTART_JUMP_US: Final = 1_500_000
+"""More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    remote_us: int
+    delta_us: int
+
+
+class ClockTracker:
+    """Follow one remote 32-bit microsecond clock from pairs of (its time, arrival)."""
+
+    def __init__(self) -> None:
+        self.restarts = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._last_remote_us: int | None = None
+        self._last_arrival_us = 0
+        self._buckets: list[_Point] = []
+        self._line = _Point(0, 0)
+        self._skew = 0.0
+
+    @property
+    def skew_ppm(self) -> float:
+        """How much faster than the local clock the remote one runs."""
+        return (1.0 / (1.0 + self._skew) - 1.0) * 1e6
+
+    def observe(self, remote_u32: int, arrival_us: int) -> int:
+        """Take in one packet and tell its time on the local clock.
+
+        Parameters
+        ----------
+        remote_u32 : int
+            The remote clock's stamp, modulo 2**32, in µs.
+        arrival_us : int
+            Arrival on the local clock, in µs.
+
+        Returns
+        -------
+        int
+            The stamp on the local clock, in µs; never later than the arrival.
+        """
+        remote_us = self._unwrap(remote_u32, arrival_us)
+        self._add(_Point(remote_us, arrival_us - remote_us))
+        return min(self._to_local(remote_us), arrival_us)
+
+    def _unwrap(self, remote_u32: int, arrival_us: int) -> int:
+        if self._last_remote_us is not None:
+            elapsed_us = arrival_us - self._last_arrival_us
+            error_us = remote_u32 - self._last_remote_us - elapsed_us
+            error_us = (error_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
+            if abs(error_us) <= RESTART_JUMP_US + MAX_SKEW * elapsed_us:
+                remote_us = self._last_remote_us + elapsed_us + error_us
+                if remote_us > self._last_remote_us:
+                    self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
+                return remote_us
+            self._forget()
+            self.restarts += 1
+        self._last_remote_us, self._last_arrival_us = remote_u32, arrival_us
+        return remote_u32
+
+    def _add(self, point: _Point) -> None:
+        buckets = self._buckets
+        if buckets:
+            bucket, newest = (p.remote_us // BUCKET_US for p in (point, buckets[-1]))
+            if bucket < newest or (bucket == newest and point.delta_us >= buckets[-1].delta_us):
+                return
+            if bucket == newest:
+                buckets.pop()
+        buckets.append(point)
+        del buckets[:-MAX_BUCKETS]
+        self._fit()
+
+    def _fit(self) -> None:
+        first, last = self._buckets[0], self._buckets[-1]
+        if last.remote_us - first.remote_us < MIN_SKEW_SPAN_US:
+            self._line = min(self._buckets, key=lambda p: p.delta_us)
+            self._skew = 0.0
+            return
+        hull = _lower_hull(self._buckets)
+        middle_us = (first.remote_us + last.remote_us) // 2
+        right = next(i for i in range(1, len(hull)) if hull[i].remote_us >= middle_us)
+        a, b = hull[right - 1], hull[right]
+        skew = (b.delta_us - a.delta_us) / (b.remote_us - a.remote_us)
+        self._skew = max(-MAX_SKEW, min(MAX_SKEW, skew))
+        self._line = a
+
+    def _to_local(self, remote_us: int) -> int:
+        delta_us = self._line.delta_us + self._skew * (remote_us - self._line.remote_us)
+        return remote_us + round(delta_us)
+
+
+def _lower_hull(points: list[_Point]) -> list[_Point]:
+    """Keep the points of the lower convex hull (Andrew's monotone chain); x is ascending."""
+    hull: list[_Point] = []
+    for p in points:
+        while len(hull) >= 2 and _turn(hull[-2], hull[-1], p) <= 0:
+            hull.pop()
+        hull.append(p)
+    return hull
+
+
+def _turn(a: _Point, b: _Point, c: _Point) -> int:
+    return (b.remote_us - a.remote_us) * (c.delta_us - a.delta_us) - (b.delta_us - a.delta_us) * (
+        c.remote_us - a.remote_us
+    )

@@ -1,0 +1,105 @@
+"""The serial line's frames: golden bytes, chunks, garbage."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.wire.framing import (
+    MAX_CONTENT,
+    MAX_ENCODED,
+    Fault,
+    FaultKind,
+    Frame,
+    FrameDecoder,
+    crc16,
+    encode_frame,
+)
+
+VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "frames.json").read_text())
+
+
+def test_crc_check_value() -> None:
+    assert crc16(b"123456789") == 0x29B1
+
+
+def test_frame_by_hand() -> None:
+    """Content 11 00 is stuffed as 02 11, then 03 and the CRC: worked out with pencil and paper."""
+    crc = crc16(b"\x11\x00").to_bytes(2, "little")
+    assert 0 not in crc
+    assert encode_frame(b"\x11\x00") == b"\x02\x11\x03" + crc + b"\x00"
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
+class TestVectors:
+    def test_encode(self, vector: dict) -> None:
+        assert encode_frame(bytes.fromhex(vector["content_hex"])).hex() == vector["frame_hex"]
+
+    @pytest.mark.parametrize("trailing", [b"", b"\x00\x00", b"\x05half"])
+    def test_decode_whole(self, vector: dict, trailing: bytes) -> None:
+        frame = bytes.fromhex(vector["frame_hex"])
+        assert FrameDecoder().feed(frame + trailing) == [
+            Frame(bytes.fromhex(vector["content_hex"]))
+        ]
+
+    def test_decode_byte_by_byte(self, vector: dict) -> None:
+        decoder = FrameDecoder()
+        frame = bytes.fromhex(vector["frame_hex"])
+        events = [event for byte in frame for event in decoder.feed(bytes([byte]))]
+        assert events == [Frame(bytes.fromhex(vector["content_hex"]))]
+
+
+@pytest.mark.parametrize("size", [1, 2, 39, MAX_CONTENT])
+@pytest.mark.parametrize("seed", range(3))
+def test_round_trip(size: int, seed: int) -> None:
+    content = np.random.default_rng(seed).bytes(size)
+    encoded = encode_frame(content)
+    assert len(encoded) <= MAX_ENCODED + 1
+    assert encoded.count(0) == 1
+    assert FrameDecoder().feed(encoded) == [Frame(content)]
+
+
+def test_content_that_no_receiver_takes_is_refused() -> None:
+    with pytest.raises(ValueError, match="73 bytes"):
+        encode_frame(bytes(MAX_CONTENT + 1))
+
+
+def test_empty_frames_mean_nothing() -> None:
+    assert FrameDecoder().feed(b"\x00\x00\x00") == []
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"),
+    [
+        (b"\x05ab\x00", FaultKind.COBS),
+        (b"\x02\x11\x03\x01\x02\x00", FaultKind.CRC),
+        (b"\x03ab\x00", FaultKind.TOO_SHORT),
+        (b"\x01" * 200 + b"\x00", FaultKind.TOO_LONG),
+    ],
+)
+def test_one_fault_then_in_step_again(line: bytes, kind: FaultKind) -> None:
+    good = encode_frame(b"good")
+    for cut in range(len(line)):
+        decoder = FrameDecoder()
+        events = decoder.feed(line[:cut]) + decoder.feed(line[cut:] + good)
+        assert events == [Fault(kind, len(line) - 1), Frame(b"good")]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_garbage_gives_only_frames_or_faults(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    decoder = FrameDecoder()
+    for _ in range(50):
+        events = decoder.feed(rng.bytes(int(rng.integers(0, 300))))
+        assert all(isinstance(event, Frame | Fault) for event in events)
+        assert len(decoder._partial) <= MAX_ENCODED
+    events = decoder.feed(b"\x00" + encode_frame(b"after the storm"))
+    assert events[-1] == Frame(b"after the storm")
+
+
+def test_reset_forgets_the_half_frame() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(encode_frame(b"cut")[:-2])
+    decoder.reset()
+    assert decoder.feed(encode_frame(b"whole")) == [Frame(b"whole")]

@@ -1,0 +1,249 @@
+"""One receiver's line: records on the gateway clock, and an account that adds up."""
+
+from datetime import UTC, datetime
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    ImuRaw,
+    NodeId,
+    NodeStatus,
+    PipeCounters,
+)
+from gateway.wire import payloads
+from gateway.wire.framing import encode_frame
+from gateway.wire.link import LATE_WINDOW, Arrival, Link, SequenceCounter
+
+IMU = payloads.ImuPayload(
+    (1, 2, 3), (4, 5, 6), (7, 8, 9), -100, ImuFlags.MAG_NEW, accel_range=2, gyro_range=2, mag_gain=1
+)
+FIX = payloads.GpsFixPayload(
+    1000, -77_000_000, 1_103_000_000, 110_000, (100, -200, 30), GpsFixType.FIX_3D, True, 11
+)
+UTC_TIME = datetime(2026, 5, 4, 3, 2, 1, 200_000, tzinfo=UTC)
+QUALITY = payloads.GpsQualityPayload(1000, 150, 65_535, 30, 120, 140, 2_300, UTC_TIME)
+
+
+class Line:
+    """A sender of frames with true counters, to be damaged by the tests."""
+
+    def __init__(self, vehicle_id: int = 1, node_id: int = 0) -> None:
+        self.node = NodeId(vehicle_id, node_id)
+        self.seq = 0
+        self.frame_seq = 0
+
+    def frame(self, time_us: int, payload: payloads.Payload, seq: int | None = None) -> bytes:
+        seq = self.seq if seq is None else seq
+        self.seq = (seq + 1) % 65536
+        packet = payloads.encode_payload(payloads.Header(self.node, seq, time_us), payload)
+        content = payloads.encode_radio(self.frame_seq, self.node.node_id, time_us + 400, packet)
+        self.frame_seq = (self.frame_seq + 1) % 256
+        return encode_frame(content)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "received", "lost", "duplicates", "reordered"),
+    [
+        ([0, 1, 2, 3], 4, 0, 0, 0),
+        ([5, 6, 9, 10], 4, 2, 0, 0),
+        ([65534, 65535, 0, 1], 4, 0, 0, 0),
+        ([1, 2, 2, 3, 3, 3], 3, 0, 3, 0),
+        ([1, 3, 2, 4], 4, 0, 0, 1),
+        ([1, 5, 2, 2, 6], 4, 2, 1, 1),
+        ([10, 9], 1, 0, 1, 0),
+        ([40_000, 10, 11], 3, 25_545, 0, 0),
+        ([40_000, 39_000, 39_001], 3, 0, 0, 0),
+    ],
+)
+def test_sequence_account(
+    sequence: list[int], received: int, lost: int, duplicates: int, reordered: int
+) -> None:
+    counter = SequenceCounter()
+    for seq in sequence:
+        counter.count(seq)
+    account = (counter.received, counter.lost, counter.duplicates, counter.reordered)
+    assert account == (received, lost, duplicates, reordered)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sequence_account_adds_up(seed: int) -> None:
+    """Random loss, duplicates and swaps: the counts equal what was really done."""
+    rng = np.random.default_rng(seed)
+    sent = np.arange(5000)
+    kept = sent[(rng.random(sent.size) > 0.1) | (sent == 0) | (sent == sent[-1])].tolist()
+    line = []
+    for seq in kept:
+        line.append(seq)
+        if rng.random() < 0.05:
+            line.append(seq)
+    counter = SequenceCounter()
+    arrivals = [counter.count((seq + 64_000) % 65536) for seq in line]
+    assert counter.received == len(kept)
+    assert counter.lost == sent.size - len(kept)
+    assert arrivals.count(Arrival.DUPLICATE) == counter.duplicates == len(line) - len(kept)
+
+
+def test_far_behind_is_another_life() -> None:
+    counter = SequenceCounter()
+    counter.count(1000)
+    assert counter.count(1000 - LATE_WINDOW) is Arrival.NEW
+    assert counter.lost == 0
+
+
+def test_imu_record() -> None:
+    (record,) = Link().feed(Line(3).frame(1_000_000, IMU), 9_000_000)
+    assert record == ImuRaw(
+        time_us=9_000_000,
+        node=NodeId(3, 0),
+        node_time_us=1_000_000,
+        accel_raw=(1, 2, 3),
+        gyro_raw=(4, 5, 6),
+        mag_raw=(7, 8, 9),
+        temperature_raw=-100,
+        accel_range_g=8,
+        gyro_range_dps=1000,
+        mag_lsb_per_gauss=1090,
+        flags=ImuFlags.MAG_NEW,
+    )
+
+
+def test_baro_and_status_records() -> None:
+    line, link = Line(), Link()
+    (baro,) = link.feed(line.frame(0, payloads.BaroPayload(10_132_550, -12)), 0)
+    assert isinstance(baro, BaroRaw)
+    assert (baro.pressure_pa, baro.temperature_degc) == pytest.approx((101_325.5, -1.2))
+    status = payloads.NodeStatusPayload((1, 2), 8, 7, 1, 3, 4, 5, 600, 100, 3300)
+    (record,) = link.feed(line.frame(1000, status), 1000)
+    assert isinstance(record, NodeStatus)
+    assert record.firmware_version == (1, 2)
+    assert record.supply_mv == 3300
+
+
+def test_fix_takes_the_quality_of_its_own_epoch() -> None:
+    line, link = Line(1, 1), Link()
+    assert link.feed(line.frame(0, QUALITY), 0) == []
+    (fix,) = link.feed(line.frame(0, FIX), 0)
+    assert isinstance(fix, GpsFix)
+    assert fix.h_acc_m == pytest.approx(1.5)
+    assert np.isnan(fix.v_acc_m)
+    assert fix.vel_n_mps == pytest.approx((1.0, -2.0, 0.3))
+    assert fix.alt_ellipsoid_m == pytest.approx(133.0)
+    assert fix.utc_us == 1_777_863_721_200_000
+    assert datetime.fromtimestamp(fix.utc_us / 1e6, UTC) == UTC_TIME
+
+
+def test_fix_without_its_quality_claims_nothing() -> None:
+    line, link = Line(1, 1), Link()
+    link.feed(line.frame(0, QUALITY), 0)
+    later = payloads.GpsFixPayload(
+        1200, -77_000_000, 1_103_000_000, 110_000, (0, 0, 0), GpsFixType.FIX_3D, True, 11
+    )
+    (fix,) = link.feed(line.frame(200_000, later), 200_000)
+    assert np.isnan([fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps, fix.course_acc_deg]).all()
+    assert fix.utc_us is None
+    assert fix.alt_ellipsoid_m == pytest.approx(133.0), "the geoid does not move"
+
+
+def test_duplicates_and_late_payloads_do_not_come_out() -> None:
+    line, link = Line(), Link()
+    frames = [line.frame(i * 10_000, IMU) for i in range(6)]
+    order = [0, 1, 3, 2, 3, 4, 5, 5]
+    records = [r for i in order for r in link.feed(frames[i], 50_000 + i * 10_000)]
+    assert [r.node_time_us // 10_000 for r in records] == [0, 1, 3, 4, 5]
+    assert all(a.time_us < b.time_us for a, b in pairwise(records))
+    (node,) = link.report(0, connected=True, port="").nodes
+    assert (node.received, node.lost, node.duplicates, node.reordered) == (6, 0, 2, 1)
+
+
+def test_node_restart_costs_nothing_but_its_clock() -> None:
+    line, link = Line(), Link()
+    for i in range(50):
+        link.feed(line.frame(i * 10_000, IMU), 100_000_000 + i * 10_000)
+    line.seq = 0
+    (record,) = link.feed(line.frame(70_000, IMU), 103_000_000)
+    assert record.time_us == 103_000_000
+    (node,) = link.report(0, connected=True, port="").nodes
+    assert (node.lost, node.restarts) == (0, 1)
+
+
+def test_receiver_restart_is_no_serial_loss() -> None:
+    line, link = Line(), Link()
+    for i in range(10):
+        link.feed(line.frame(20_000_000 + i * 10_000, IMU), 20_000_000 + i * 10_000)
+    line.frame_seq = 0
+    link.feed(line.frame(0, IMU, seq=10), 25_000_000)
+    assert link.report(0, connected=True, port="").frames_lost == 0
+
+
+def test_aircraft_sharing_a_receiver_are_kept_apart() -> None:
+    link = Link()
+    lines = [Line(vehicle, node) for vehicle in (1, 2, 3) for node in (0, 1)]
+    frame_seq = 0
+    for i in range(10):
+        for line in lines:
+            line.frame_seq, frame_seq = frame_seq, (frame_seq + 1) % 256
+            link.feed(line.frame(i * 10_000, IMU), i * 10_000)
+    report = link.report(90_000, connected=True, port="pty")
+    assert {node.node for node in report.nodes} == {line.node for line in lines}
+    assert all(node.received == 10 and node.lost == 0 for node in report.nodes)
+    assert report.frames_lost == 0
+
+
+def test_serial_loss_and_faults_are_counted_apart_from_radio_loss() -> None:
+    line, link = Line(), Link()
+    frames = [line.frame(i * 10_000, IMU) for i in range(10)]
+    frames[4] = frames[4][:5] + b"\x55" + frames[4][6:]
+    del frames[7]
+    link.feed(b"".join(frames), 0)
+    report = link.report(0, connected=True, port="pty")
+    assert dict(report.faults) == {"crc": 1}
+    assert report.frames == 8
+    assert report.frames_lost == 2
+    assert report.nodes[0].lost == 2
+    assert report.bytes_received == sum(map(len, frames))
+
+
+def test_receiver_status_is_reported() -> None:
+    pipes = tuple(PipeCounters(i, i + 1, i + 2) for i in range(6))
+    status = payloads.ReceiverStatusFrame(0, 5_000_000, 76, 12, 3, 1, pipes)
+    link = Link()
+    assert link.feed(encode_frame(payloads.encode_receiver_status(status)), 7_000_000) == []
+    receiver = link.report(0, connected=True, port="").receiver
+    assert receiver is not None
+    assert (receiver.time_us, receiver.noise_percent, receiver.pipes) == (7_000_000, 12, pipes)
+
+
+def test_rate_is_that_of_the_last_second() -> None:
+    line, link = Line(), Link()
+    for i in range(300):
+        link.feed(line.frame(i * 10_000, IMU), i * 10_000)
+    assert link.report(2_990_000, connected=True, port="").nodes[0].rate_hz == 100.0
+    assert link.report(5_000_000, connected=True, port="").nodes[0].rate_hz == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ten_percent_corrupted_bytes(seed: int) -> None:
+    """Never an exception, never a wrong record, and all good frames come out."""
+    rng = np.random.default_rng(seed)
+    line, link = Line(), Link()
+    stream = bytearray(b"".join(line.frame(i * 5_000, IMU) for i in range(2000)))
+    hit = rng.random(len(stream)) < 0.10
+    for index in np.flatnonzero(hit):
+        stream[index] ^= int(rng.integers(1, 256))
+    bounds = np.flatnonzero(~hit & (np.frombuffer(stream, np.uint8) == 0))
+    records = [
+        record
+        for chunk in np.array_split(np.frombuffer(bytes(stream), np.uint8), 97)
+        for record in link.feed(chunk.tobytes(), 10_000_000)
+    ]
+    assert bounds.size
+    report = link.report(0, connected=True, port="")
+    assert report.frames == len(records)
+    assert sum(count for _, count in report.faults) > 0
+    assert all(r.accel_raw == (1, 2, 3) for r in records)

@@ -1,0 +1,149 @@
+"""Radio payloads and receiver frames: golden bytes both ways, faults for everything else."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.records import GpsFixType, ImuFlags, NodeId
+from gateway.wire.framing import Fault, FaultKind
+from gateway.wire.payloads import (
+    MAX_PAYLOAD,
+    BaroPayload,
+    GpsFixPayload,
+    Header,
+    ImuPayload,
+    RadioFrame,
+    ReceiverStatusFrame,
+    decode_content,
+    decode_payload,
+    encode_payload,
+    encode_radio,
+    encode_receiver_status,
+)
+
+VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "frames.json").read_text())
+RADIO = [vector for vector in VECTORS if "payload_hex" in vector]
+STATUS = [vector for vector in VECTORS if vector["kind"] == "ReceiverStatus"]
+
+
+def as_json(record: object) -> dict:
+    """Bring a record to what the table holds: lists for tuples, ISO text for times."""
+    return json.loads(json.dumps(asdict(record), default=lambda moment: moment.isoformat()))
+
+
+@pytest.mark.parametrize("vector", RADIO, ids=lambda v: v["name"])
+class TestRadioVectors:
+    def test_decode(self, vector: dict) -> None:
+        frame = decode_content(bytes.fromhex(vector["content_hex"]))
+        assert isinstance(frame, RadioFrame)
+        assert type(frame.payload).__name__ == vector["kind"]
+        assert as_json(frame.payload) == vector["fields"]
+        assert as_json(frame.header) == vector["header"]
+        assert frame.frame_seq == vector["frame_seq"]
+        assert frame.pipe == vector["pipe"]
+        assert frame.receiver_time_us == vector["receiver_time_us"]
+
+    def test_encode(self, vector: dict) -> None:
+        frame = decode_content(bytes.fromhex(vector["content_hex"]))
+        packet = encode_payload(frame.header, frame.payload)
+        assert len(packet) <= MAX_PAYLOAD
+        assert packet.hex() == vector["payload_hex"]
+        content = encode_radio(frame.frame_seq, frame.pipe, frame.receiver_time_us, packet)
+        assert content.hex() == vector["content_hex"]
+
+    def test_any_other_length_is_a_fault(self, vector: dict) -> None:
+        packet = bytes.fromhex(vector["payload_hex"])
+        for size in set(range(MAX_PAYLOAD + 4)) - {len(packet)}:
+            padded = packet[:size].ljust(size, b"\x01")
+            assert isinstance(decode_payload(padded), Fault)
+
+
+@pytest.mark.parametrize("vector", STATUS, ids=lambda v: v["name"])
+def test_receiver_status(vector: dict) -> None:
+    frame = decode_content(bytes.fromhex(vector["content_hex"]))
+    assert isinstance(frame, ReceiverStatusFrame)
+    assert as_json(frame) == vector["fields"]
+    assert encode_receiver_status(frame).hex() == vector["content_hex"]
+
+
+def test_imu_layout_by_hand() -> None:
+    """Every offset of PROTOCOL.md, written out without the codec."""
+    packet = bytes.fromhex(
+        "11 15 3412 78563412"  # version and kind, vehicle 2 node 5, sequence, node time
+        "0100 0200 0300"
+        "ffff feff fdff"
+        "0001 0002 0003"
+        "1020"
+        "0500"
+        "26"  # 0b0_010_01_10
+    )
+    header, payload = decode_payload(packet)
+    assert header == Header(NodeId(2, 5), 0x1234, 0x12345678)
+    assert payload == ImuPayload(
+        accel=(1, 2, 3),
+        gyro=(-1, -2, -3),
+        mag=(256, 512, 768),
+        temperature=0x2010,
+        flags=ImuFlags.ACCEL_FILTERED | ImuFlags.MAG_NEW,
+        accel_range=2,
+        gyro_range=1,
+        mag_gain=2,
+    )
+
+
+FIX = GpsFixPayload(1000, 10, 20, 30, (1, 2, 3), GpsFixType.FIX_3D, True, 9)
+HEADER = Header(NodeId(1, 1), 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "kind"),
+    [
+        (0, 0x23, FaultKind.VERSION),
+        (0, 0x1F, FaultKind.KIND),
+        (1, 0x01, FaultKind.VALUE),
+        (15, 0x7F, FaultKind.VALUE),
+        (19, 0x7F, FaultKind.VALUE),
+        (30, 0x06, FaultKind.VALUE),
+    ],
+    ids=["version", "kind", "vehicle 0", "latitude", "longitude", "fix type"],
+)
+def test_values_that_cannot_be(offset: int, value: int, kind: FaultKind) -> None:
+    packet = bytearray(encode_payload(HEADER, FIX))
+    packet[offset] = value
+    assert decode_payload(bytes(packet)) == Fault(kind, len(packet))
+
+
+def test_month_13_is_a_fault() -> None:
+    packet = bytearray.fromhex(
+        next(v for v in RADIO if v["name"] == "gps_quality_utc")["payload_hex"]
+    )
+    packet[26] = 13
+    assert decode_payload(bytes(packet)) == Fault(FaultKind.VALUE, len(packet))
+
+
+def test_leap_second_is_a_time() -> None:
+    packet = bytearray.fromhex(
+        next(v for v in RADIO if v["name"] == "gps_quality_utc")["payload_hex"]
+    )
+    packet[30] = 60
+    _, quality = decode_payload(bytes(packet))
+    assert (quality.utc.second, quality.utc.microsecond) == (59, 990_000)
+
+
+def test_pipe_above_five_is_a_fault() -> None:
+    content = encode_radio(0, 6, 0, encode_payload(HEADER, BaroPayload(1, 1)))
+    assert decode_content(content) == Fault(FaultKind.VALUE, len(content))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_garbage_gives_only_frames_or_faults(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(500):
+        content = bytearray(rng.bytes(int(rng.integers(0, 80))))
+        if len(content) > 7:
+            content[0] = rng.choice([0x11, 0x12, 0x13])
+            content[7] = rng.choice([0x11, 0x12, 0x13, 0x14, 0x15, 0x16])
+        assert isinstance(decode_content(bytes(content)), RadioFrame | ReceiverStatusFrame | Fault)

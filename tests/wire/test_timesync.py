@@ -1,0 +1,103 @@
+"""Clock tracking against simulated clocks whose truth is known."""
+
+import numpy as np
+import pytest
+
+from gateway.wire.timesync import MAX_BUCKETS, WRAP_US, ClockTracker
+
+
+def packets(
+    rng: np.random.Generator,
+    *,
+    seconds: float,
+    rate_hz: float = 100.0,
+    skew_ppm: float = 0.0,
+    offset_us: int = 5_000_000,
+    start_us: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make (remote stamp, true local time, arrival): delays with a floor and heavy bursts."""
+    true_us = np.arange(0, seconds * 1e6, 1e6 / rate_hz)
+    remote_us = start_us + true_us * (1 + skew_ppm * 1e-6)
+    queue_us = rng.exponential(1500.0, true_us.size) * (rng.random(true_us.size) < 0.7)
+    arrival_us = true_us + offset_us + 300.0 + queue_us
+    return remote_us.astype(np.int64) % WRAP_US, true_us + offset_us + 300.0, arrival_us.astype(int)
+
+
+@pytest.mark.parametrize("skew_ppm", [-5000.0, -80.0, 0.0, 35.0, 5000.0])
+@pytest.mark.parametrize("start_us", [0, WRAP_US - 20_000_000])
+@pytest.mark.parametrize("seed", range(2))
+def test_offset_and_drift(skew_ppm: float, start_us: int, seed: int) -> None:
+    """Once the window is filled, a sample is placed within 0.2 ms: a tenth of a mean queue."""
+    stamps, true_us, arrivals = packets(
+        np.random.default_rng(seed), seconds=60, skew_ppm=skew_ppm, start_us=start_us
+    )
+    tracker = ClockTracker()
+    told = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
+    error_us = np.array(told) - true_us
+    settled = error_us[true_us - true_us[0] > 15e6]
+    assert np.abs(settled).max() < 200.0
+    assert tracker.skew_ppm == pytest.approx(skew_ppm, abs=10.0)
+    assert tracker.restarts == 0
+
+
+def test_time_is_never_later_than_the_arrival(rng: np.random.Generator) -> None:
+    stamps, _, arrivals = packets(rng, seconds=5, skew_ppm=200.0)
+    tracker = ClockTracker()
+    for stamp, arrival in zip(stamps, arrivals, strict=True):
+        assert tracker.observe(int(stamp), int(arrival)) <= arrival
+
+
+def test_wrap_alone_is_no_restart() -> None:
+    tracker = ClockTracker()
+    before = tracker.observe(WRAP_US - 10_000, 1_000_000)
+    after = tracker.observe(0, 1_010_000)
+    assert after - before == 10_000
+    assert tracker.restarts == 0
+
+
+@pytest.mark.parametrize("gap_s", [10, 600, 71 * 60, 3 * 3600])
+def test_silence_of_any_length_is_no_restart(gap_s: int, rng: np.random.Generator) -> None:
+    """The node kept counting through several wraps; its clock is still known."""
+    stamps, _, arrivals = packets(rng, seconds=20, skew_ppm=40.0)
+    tracker = ClockTracker()
+    for stamp, arrival in zip(stamps, arrivals, strict=True):
+        last = tracker.observe(int(stamp), int(arrival))
+    stamp = (int(stamps[-1]) + gap_s * 1_000_040) % WRAP_US
+    told = tracker.observe(stamp, int(arrivals[-1]) + gap_s * 1_000_000)
+    assert tracker.restarts == 0
+    assert told - last == pytest.approx(gap_s * 1_000_000, abs=10_000)
+
+
+def test_restart_is_learned_anew(rng: np.random.Generator) -> None:
+    stamps, _, arrivals = packets(rng, seconds=20)
+    tracker = ClockTracker()
+    for stamp, arrival in zip(stamps, arrivals, strict=True):
+        tracker.observe(int(stamp), int(arrival))
+    told = tracker.observe(150_000, int(arrivals[-1]) + 400_000)
+    assert tracker.restarts == 1
+    assert told == int(arrivals[-1]) + 400_000
+
+
+def test_a_late_stamp_is_placed_in_the_past() -> None:
+    tracker = ClockTracker()
+    for step in range(100):
+        tracker.observe(step * 10_000, 2_000_000 + step * 10_000)
+    late = tracker.observe(500_000, 2_000_000 + 1_000_000)
+    assert late == 2_500_000
+    assert tracker.restarts == 0
+
+
+def test_memory_is_bounded(rng: np.random.Generator) -> None:
+    stamps, _, arrivals = packets(rng, seconds=120, rate_hz=200.0)
+    tracker = ClockTracker()
+    for stamp, arrival in zip(stamps, arrivals, strict=True):
+        tracker.observe(int(stamp), int(arrival))
+    assert len(tracker._buckets) == MAX_BUCKETS
+
+
+def test_absurd_drift_is_held(rng: np.random.Generator) -> None:
+    stamps, _, arrivals = packets(rng, seconds=30, skew_ppm=12_000.0)
+    tracker = ClockTracker()
+    for stamp, arrival in zip(stamps, arrivals, strict=True):
+        tracker.observe(int(stamp), int(arrival))
+    assert tracker.skew_ppm == pytest.approx(10_000.0, rel=0.02)
