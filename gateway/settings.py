@@ -14,9 +14,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 def setting(
-    meaning: str, unit: str = "", *, ge: float | None = None, le: float | None = None
+    meaning: str,
+    unit: str = "",
+    *,
+    ge: float | None = None,
+    le: float | None = None,
+    pattern: str | None = None,
 ) -> msgspec.Meta:
-    """Describe one setting: meaning, unit and range.
+    """Describe one setting: meaning, unit and what is allowed.
 
     Parameters
     ----------
@@ -26,10 +31,15 @@ def setting(
         Unit of the value; empty for a name, a switch or a pure number.
     ge, le : float, optional
         Least and greatest allowed number.
+    pattern : str, optional
+        Regular expression that a text must match.
 
     Returns
     -------
     msgspec.Meta
         To be used as `Annotated[float, setting(...)]`.
     """
-    return msgspec.Meta(description=meaning, ge=ge, le=le, extra={"unit": unit})
+    extra = {"unit": unit}
+    if pattern is not None:
+        return msgspec.Meta(description=meaning, pattern=pattern, extra=extra)
+    return msgspec.Meta(description=meaning, ge=ge, le=le, extra=extra)
