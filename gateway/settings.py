@@ -6,6 +6,11 @@ them from TOML. The documented `config/gateway.toml` and the MAVLink parameters 
 the same annotations, so a range is written once.
 """
 
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, Union, get_args, get_origin
+
 import msgspec
 
 
@@ -42,4 +47,73 @@ def setting(
     extra = {"unit": unit}
     if pattern is not None:
         return msgspec.Meta(description=meaning, pattern=pattern, extra=extra)
-    return msgspec.Meta(description=meaning, ge=ge, le=le, extra=extra)
+    return msgspec.Meta(description=meaning, ge=_exact(ge), le=_exact(le), extra=extra)
+
+
+def _exact(bound: float | None) -> float | None:
+    """Write a whole bound as an integer: msgspec takes no other for an integer field."""
+    return int(bound) if bound is not None and float(bound).is_integer() else bound
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One key of a settings class, with what its annotation tells."""
+
+    name: str
+    type: Any
+    """The annotated type, as msgspec converts to it."""
+    default: Any
+    section: "type[Settings] | None"
+    """The settings class, if the key is a section of its own."""
+    choices: tuple[str, ...]
+    """The allowed texts, if it is one of a few."""
+    meaning: str
+    unit: str
+    bounds: tuple[float | None, float | None]
+    """Least and greatest allowed number, None where there is no bound."""
+
+
+def fields_of(kind: type[Settings]) -> list[Field]:
+    """List the keys of a settings class, plain keys before sections as TOML wants them."""
+    found = []
+    for info in msgspec.structs.fields(kind):
+        factory = info.default_factory
+        default = info.default if factory is msgspec.NODEFAULT else factory()
+        found.append(_field(info.name, info.type, default))
+    return sorted(found, key=lambda field: field.section is not None)
+
+
+def _field(name: str, kind: Any, default: Any) -> Field:
+    plain = _plain(kind)
+    meta = next(_metas(kind), msgspec.Meta())
+    return Field(
+        name=name,
+        type=kind,
+        default=default,
+        section=plain if isinstance(plain, type) and issubclass(plain, Settings) else None,
+        choices=get_args(plain) if get_origin(plain) is Literal else (),
+        meaning=meta.description or "",
+        unit=(meta.extra or {}).get("unit", ""),
+        bounds=(meta.ge, meta.le),
+    )
+
+
+def _plain(kind: Any) -> Any:
+    """Strip annotations and `| None` from a type."""
+    while hasattr(kind, "__metadata__"):
+        kind = kind.__origin__
+    if get_origin(kind) in (Union, types.UnionType):
+        options = [option for option in get_args(kind) if option is not type(None)]
+        if len(options) == 1:
+            return _plain(options[0])
+    return kind
+
+
+def _metas(kind: Any) -> Iterator[msgspec.Meta]:
+    """Find every `setting(...)` in a type, the outermost first."""
+    for meta in getattr(kind, "__metadata__", ()):
+        if isinstance(meta, msgspec.Meta):
+            yield meta
+    for inner in (getattr(kind, "__origin__", None), *get_args(kind)):
+        if inner is not None and inner is not kind:
+            yield from _metas(inner)
