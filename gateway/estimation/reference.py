@@ -1,0 +1,113 @@
+"""What ties an estimate to the Earth: usable GPS fixes, their latency, and true north."""
+
+import math
+from typing import Annotated, Final, Literal
+
+from gateway.geometry.geodesy import displacement_m
+from gateway.geometry.geomagnetism import MagneticField, magnetic_field, year_of
+from gateway.records import GpsFix, GpsFixType
+from gateway.settings import Settings, setting
+
+USABLE_FIXES: Final = frozenset(
+    {GpsFixType.FIX_2D, GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING}
+)
+FIELD_RENEWAL_M: Final = 20_000.0
+"""The declination changes by well under 0.5 deg over this way."""
+
+
+class ReferenceSettings(Settings, frozen=True):
+    """GPS and magnetic reference, shared by all estimators."""
+
+    gps_latency_s: Annotated[
+        float,
+        setting(
+            "From the moment a fix is valid to its arrival at the gateway.", "s", ge=0.0, le=2.0
+        ),
+    ] = 0.15
+    gps_max_h_acc_m: Annotated[
+        float,
+        setting(
+            "Fixes whose own horizontal accuracy is worse are not used.", "m", ge=1.0, le=1000.0
+        ),
+    ] = 30.0
+    declination: Annotated[
+        Literal["model", "fixed"],
+        setting("Magnetic declination: model (World Magnetic Model at the fix) or fixed."),
+    ] = "model"
+    declination_deg: Annotated[
+        float, setting("Declination where it is fixed, positive east.", "deg", ge=-180.0, le=180.0)
+    ] = 0.0
+
+
+def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
+    """Tell whether a fix may be fused.
+
+    Parameters
+    ----------
+    fix : GpsFix
+        As it came; an accuracy that is not known (NaN) does not speak against it.
+    settings : ReferenceSettings
+        The accuracy limit.
+
+    Returns
+    -------
+    bool
+        False for no fix, a receiver that does not vouch for it, or values that cannot be.
+    """
+    return (
+        fix.fix_ok
+        and fix.fix_type in USABLE_FIXES
+        and math.isfinite(fix.alt_amsl_m)
+        and not fix.h_acc_m > settings.gps_max_h_acc_m
+        and (fix.lat_dege7, fix.lon_dege7) != (0, 0)
+    )
+
+
+class EarthField:
+    """The magnetic reference: looked up once, and again after a long way.
+
+    Parameters
+    ----------
+    settings : ReferenceSettings
+        Whether the declination comes from the model.
+    """
+
+    def __init__(self, settings: ReferenceSettings) -> None:
+        self._settings = settings
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the place."""
+        self._place: tuple[float, float] | None = None
+        self.field: MagneticField | None = None
+        """The model's field at the last place; None before the first fix."""
+
+    @property
+    def declination_rad(self) -> float:
+        """Declination, positive east; NaN as long as it is not known."""
+        if self._settings.declination == "fixed":
+            return math.radians(self._settings.declination_deg)
+        return math.nan if self.field is None else self.field.declination_rad
+
+    def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
+        """Tell the place.
+
+        Parameters
+        ----------
+        lat_deg, lon_deg, alt_m : float
+            Where the aircraft is.
+        utc_us : int or None
+            Unix time, if known.
+
+        Returns
+        -------
+        bool
+            Whether the field was looked up anew.
+        """
+        if self._place is not None:
+            north_m, east_m = displacement_m(*self._place, lat_deg, lon_deg, alt_m)
+            if math.hypot(north_m, east_m) < FIELD_RENEWAL_M:
+                return False
+        self._place = (lat_deg, lon_deg)
+        self.field = magnetic_field(lat_deg, lon_deg, alt_m, year_of(utc_us))
+        return True

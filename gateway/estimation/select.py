@@ -1,0 +1,36 @@
+"""The choice of an estimator: the settings of all, and one made from them."""
+
+from typing import Annotated, Literal
+
+from gateway.estimation.interface import Estimator
+from gateway.estimation.paper import PaperEstimator, PaperSettings
+from gateway.estimation.reference import ReferenceSettings
+from gateway.settings import Settings, setting
+
+EstimatorName = Literal["paper", "complementary", "eskf"]
+
+
+class EstimationSettings(Settings, frozen=True):
+    """Which estimator runs, and the settings of each."""
+
+    estimator: Annotated[EstimatorName, setting("Estimator: complementary, eskf or paper.")] = (
+        "complementary"
+    )
+    reference: ReferenceSettings = ReferenceSettings()
+    paper: PaperSettings = PaperSettings()
+
+
+def make_estimator(settings: EstimationSettings) -> Estimator:
+    """Build the estimator that the settings name.
+
+    Parameters
+    ----------
+    settings : EstimationSettings
+        The choice and every estimator's own settings.
+
+    Returns
+    -------
+    Estimator
+        Fresh, for one aircraft.
+    """
+    return PaperEstimator(settings.paper, settings.reference)

@@ -1,0 +1,57 @@
+"""The Earth's magnetic field at a place: the World Magnetic Model through `pygeomag`."""
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import pygeomag
+from pygeomag.wmm import wmm_2025
+
+EPOCH_YEAR = 2025.0
+"""First year of the model; it holds for five years and drifts by some 0.1 deg a year beyond."""
+
+_US_PER_YEAR = 365.2425 * 86_400e6
+
+
+class MagneticField(NamedTuple):
+    """The field of the Earth at one place."""
+
+    declination_rad: float
+    """Magnetic north against true north, positive east."""
+    inclination_rad: float
+    """Dip below the horizon, positive down."""
+    strength_ut: float
+
+
+@cache
+def _model() -> pygeomag.GeoMag:
+    # The coefficients come as Python data: reading the .COF file would be I/O in a pure room.
+    return pygeomag.GeoMag(coefficients_data=wmm_2025.WMM_2025)
+
+
+def year_of(utc_us: int | None) -> float:
+    """Turn Unix time into a decimal year; the middle of the model's span if not known."""
+    return EPOCH_YEAR + 2.5 if utc_us is None else 1970.0 + utc_us / _US_PER_YEAR
+
+
+def magnetic_field(lat_deg: float, lon_deg: float, alt_m: float, year: float) -> MagneticField:
+    """Look up the main field.
+
+    Parameters
+    ----------
+    lat_deg, lon_deg : float
+        Geodetic latitude and longitude in degrees.
+    alt_m : float
+        Height in metres; the geoid's separation does not matter here.
+    year : float
+        Decimal year, see `year_of`.
+
+    Returns
+    -------
+    MagneticField
+        Declination, dip and strength.
+    """
+    found = _model().calculate(
+        glat=lat_deg, glon=lon_deg, alt=alt_m * 1e-3, time=year, allow_date_outside_lifespan=True
+    )
+    return MagneticField(math.radians(found.d), math.radians(found.i), found.f * 1e-3)

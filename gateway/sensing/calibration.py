@@ -1,0 +1,111 @@
+"""A node's calibration: counts in sensor axes to SI in body FRD."""
+
+from typing import Annotated, Final
+
+from gateway.records import Int3, Vec3
+from gateway.settings import Settings, setting
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+Matrix3 = tuple[Vec3, Vec3, Vec3]
+
+IDENTITY3: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""Sensor x forward, y left, z up: the board lies face up with its x arrow to the nose."""
+
+FULL_SCALE_COUNTS: Final = 32768.0
+GYRO_LSB_PER_DPS: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+"""MPU6050 register map, section 4.19."""
+UT_PER_GAUSS: Final = 100.0
+MAG_OVERFLOW: Final = -4096
+"""The HMC5883L's own mark of an axis beyond its range."""
+RADPS_PER_DPS: Final = 0.017453292519943295
+
+_NO_OFFSET: Final[Vec3] = (0.0, 0.0, 0.0)
+
+
+class NodeCalibration(Settings, frozen=True):
+    """How one IMU node errs and how it is mounted.
+
+    A calibrated vector is `R @ M @ (s - b)`: `s` in SI and sensor axes, `b` the bias, `M` the
+    scale and misalignment, `R` the mounting rotation into body FRD.
+    """
+
+    mounting: Annotated[
+        Matrix3,
+        setting("Rows of the rotation from accelerometer and gyroscope axes to body FRD."),
+    ] = FACE_UP
+    accel_bias_mps2: Annotated[Vec3, setting("Accelerometer bias in sensor axes.", "m/s2")] = (
+        _NO_OFFSET
+    )
+    accel_matrix: Annotated[
+        Matrix3, setting("Rows of the accelerometer's scale and misalignment matrix.")
+    ] = IDENTITY3
+    gyro_bias_radps: Annotated[Vec3, setting("Gyroscope bias in sensor axes.", "rad/s")] = (
+        _NO_OFFSET
+    )
+    mag_mounting: Annotated[
+        Matrix3, setting("Rows of the rotation from magnetometer axes to body FRD.")
+    ] = FACE_UP
+    mag_hard_iron_ut: Annotated[
+        Vec3, setting("Field of the aircraft's own magnets in sensor axes.", "uT")
+    ] = _NO_OFFSET
+    mag_soft_iron: Annotated[
+        Matrix3, setting("Rows of the matrix that turns the measured ellipsoid into a sphere.")
+    ] = IDENTITY3
+
+
+def transform(matrix: Matrix3, v: Vec3) -> Vec3:
+    """Multiply a matrix and a vector."""
+    x, y, z = v
+    a, b, c = matrix
+    return (
+        a[0] * x + a[1] * y + a[2] * z,
+        b[0] * x + b[1] * y + b[2] * z,
+        c[0] * x + c[1] * y + c[2] * z,
+    )
+
+
+def compose(left: Matrix3, right: Matrix3) -> Matrix3:
+    """Multiply two matrices: first `right`, then `left`."""
+    columns = [transform(left, column) for column in zip(*right, strict=True)]
+    a, b, c = (tuple(row) for row in zip(*columns, strict=True))
+    return ((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2]))
+
+
+def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
+    """Scale MPU6050 accelerometer counts to m/s2 in sensor axes."""
+    scale = range_g * STANDARD_GRAVITY_MPS2 / FULL_SCALE_COUNTS
+    return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
+
+
+def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
+    """Scale MPU6050 gyroscope counts to rad/s in sensor axes."""
+    per_count_dps = 1.0 / GYRO_LSB_PER_DPS.get(range_dps, FULL_SCALE_COUNTS / max(range_dps, 1))
+    scale = per_count_dps * RADPS_PER_DPS
+    return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
+
+
+def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
+    """Scale HMC5883L counts to uT in sensor axes; None where an axis overflowed."""
+    if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw:
+        return None
+    scale = UT_PER_GAUSS / lsb_per_gauss
+    return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
+
+
+def temperature_from_counts(raw: int) -> float:
+    """Convert the MPU6050's temperature word to deg C."""
+    return raw / 340.0 + 36.53
+
+
+class Correction:
+    """One sensor's calibration, its matrices multiplied out: `v_b = matrix @ (v_s - bias)`."""
+
+    def __init__(self, mounting: Matrix3, matrix: Matrix3, bias: Vec3) -> None:
+        self._matrix = compose(mounting, matrix)
+        self._bias = bias
+
+    def apply(self, v: Vec3) -> Vec3:
+        """Correct one vector and turn it into body axes."""
+        b = self._bias
+        return transform(self._matrix, (v[0] - b[0], v[1] - b[1], v[2] - b[2]))

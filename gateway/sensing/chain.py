@@ -1,0 +1,237 @@
+"""The sensing stage of one aircraft: raw records in, calibrated and filtered samples out."""
+
+import math
+from typing import Annotated, Final
+
+from gateway.records import BaroRaw, BaroSample, ImuFlags, ImuRaw, ImuSample, Vec3
+from gateway.sensing.calibration import (
+    IDENTITY3,
+    Correction,
+    NodeCalibration,
+    accel_from_counts,
+    gyro_from_counts,
+    mag_from_counts,
+    temperature_from_counts,
+)
+from gateway.sensing.filters import (
+    Coefficients,
+    Kind,
+    VectorFilter,
+    design_highpass,
+    design_lowpass,
+)
+from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
+
+GAP_US: Final = 500_000
+"""Longer silence: the past says nothing about now, and the filters start afresh."""
+RATE_WINDOW: Final = 64
+"""Samples over which the sample rate is averaged; time stamps jitter by the radio's retries."""
+RETUNE_RATIO: Final = 0.1
+"""Difference of measured and designed rate that makes a new design worth its small step."""
+
+ICAO_PRESSURE_PA: Final = 101_325.0
+
+
+class SensingSettings(Settings, frozen=True):
+    """The filters that the gateway applies where a node has not."""
+
+    accel_filter: Annotated[
+        Kind, setting("Second-order low-pass on the acceleration: butterworth or chebyshev.")
+    ] = "butterworth"
+    accel_cutoff_hz: Annotated[
+        float, setting("Cutoff of the acceleration's low-pass.", "Hz", ge=0.1, le=500.0)
+    ] = 10.0
+    chebyshev_ripple_db: Annotated[
+        float, setting("Ripple of the Chebyshev filter's pass band.", "dB", ge=0.01, le=6.0)
+    ] = 1.0
+    gyro_highpass_hz: Annotated[
+        float,
+        setting(
+            "Cutoff of the angular rate's first-order high-pass; 0 for none.", "Hz", ge=0.0, le=10.0
+        ),
+    ] = 0.002
+    nominal_rate_hz: Annotated[
+        float,
+        setting("IMU rate to design for until the true one is measured.", "Hz", ge=1.0, le=2000.0),
+    ] = 100.0
+
+
+def pressure_altitude_m(pressure_pa: float) -> float:
+    """Convert pressure to height in the ICAO standard atmosphere (troposphere).
+
+    Parameters
+    ----------
+    pressure_pa : float
+        Static pressure.
+
+    Returns
+    -------
+    float
+        Height in metres above the 1013.25 hPa level, positive up; NaN for no pressure.
+    """
+    if not pressure_pa > 0.0:
+        return math.nan
+    return 44_330.769 * (1.0 - float((pressure_pa / ICAO_PRESSURE_PA) ** 0.190263))
+
+
+class SensorChain:
+    """Calibrates and filters the samples of one aircraft; never raises on data.
+
+    Parameters
+    ----------
+    settings : SensingSettings
+        The filters.
+    calibration : NodeCalibration
+        The IMU node's errors and mounting.
+    """
+
+    def __init__(self, settings: SensingSettings, calibration: NodeCalibration) -> None:
+        self._settings = settings
+        cal = calibration
+        self._accel = Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2)
+        self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
+        self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past but not the settings."""
+        self._rate_hz = self._settings.nominal_rate_hz
+        self._lowpass = VectorFilter(self._design_lowpass, self._rate_hz)
+        self._highpass = VectorFilter(self._design_highpass, self._rate_hz)
+        self._last_us: int | None = None
+        self._window: tuple[int, int] = (0, 0)
+
+    @property
+    def rate_hz(self) -> float:
+        """The sample rate that the filters are designed for now."""
+        return self._rate_hz
+
+    def imu(self, raw: ImuRaw) -> ImuSample:
+        """Turn one IMU payload into a sample in body FRD.
+
+        Parameters
+        ----------
+        raw : ImuRaw
+            Counts in sensor axes.
+
+        Returns
+        -------
+        ImuSample
+            Calibrated SI values and their filtered twins.
+        """
+        mag = None
+        if ImuFlags.MAG_NEW in raw.flags and ImuFlags.MAG_ABSENT not in raw.flags:
+            counts = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
+            mag = None if counts is None else self._mag.apply(counts)
+        return self.imu_si(
+            raw.time_us,
+            self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g)),
+            self._gyro.apply(gyro_from_counts(raw.gyro_raw, raw.gyro_range_dps)),
+            mag,
+            temperature_from_counts(raw.temperature_raw),
+            raw.flags,
+        )
+
+    def imu_si(
+        self,
+        time_us: int,
+        accel_b_mps2: Vec3,
+        gyro_b_radps: Vec3,
+        mag_b_ut: Vec3 | None,
+        temperature_degc: float,
+        flags: ImuFlags,
+    ) -> ImuSample:
+        """Filter a sample that is calibrated already, such as one of somebody else's log.
+
+        Parameters
+        ----------
+        time_us : int
+            Gateway clock.
+        accel_b_mps2, gyro_b_radps : tuple of 3 floats
+            Specific force and angular rate in body FRD; a value that is not finite stays so in
+            the sample but does not enter the filters.
+        mag_b_ut : tuple of 3 floats or None
+            Magnetic field in body FRD, None unless new.
+        temperature_degc : float
+            NaN if not known.
+        flags : ImuFlags
+            Tells what is filtered already.
+
+        Returns
+        -------
+        ImuSample
+            The same values with their filtered twins.
+        """
+        self._track_rate(time_us)
+        accel_lowpass, gyro_highpass = accel_b_mps2, gyro_b_radps
+        if ImuFlags.ACCEL_FILTERED not in flags:
+            accel_lowpass = _filtered(self._lowpass, accel_b_mps2)
+        if ImuFlags.GYRO_FILTERED not in flags:
+            gyro_highpass = _filtered(self._highpass, gyro_b_radps)
+        return ImuSample(
+            time_us=time_us,
+            accel_b_mps2=accel_b_mps2,
+            gyro_b_radps=gyro_b_radps,
+            accel_lowpass_b_mps2=accel_lowpass,
+            gyro_highpass_b_radps=gyro_highpass,
+            mag_b_ut=mag_b_ut,
+            temperature_degc=temperature_degc,
+            flags=flags,
+        )
+
+    def baro(self, raw: BaroRaw) -> BaroSample:
+        """Add the pressure altitude to a barometer payload.
+
+        Parameters
+        ----------
+        raw : BaroRaw
+            Compensated pressure.
+
+        Returns
+        -------
+        BaroSample
+            The same with its height.
+        """
+        return BaroSample(
+            time_us=raw.time_us,
+            pressure_pa=raw.pressure_pa,
+            temperature_degc=raw.temperature_degc,
+            alt_pressure_m=pressure_altitude_m(raw.pressure_pa),
+        )
+
+    def _design_lowpass(self, rate_hz: float) -> Coefficients:
+        s = self._settings
+        return design_lowpass(s.accel_filter, s.accel_cutoff_hz, rate_hz, s.chebyshev_ripple_db)
+
+    def _design_highpass(self, rate_hz: float) -> Coefficients:
+        return design_highpass(self._settings.gyro_highpass_hz, rate_hz)
+
+    def _track_rate(self, time_us: int) -> None:
+        """Measure the sample rate; start afresh after a gap, design anew when it has changed."""
+        last, self._last_us = self._last_us, time_us
+        if last is None:
+            return
+        dt_us = time_us - last
+        if not 0 < dt_us <= GAP_US:
+            self._window = (0, 0)
+            if dt_us > GAP_US or dt_us < -GAP_US:
+                self._lowpass.reset()
+                self._highpass.reset()
+            return
+        count, total_us = self._window[0] + 1, self._window[1] + dt_us
+        if count == RATE_WINDOW:
+            measured_hz = count * US_PER_S / total_us
+            if abs(measured_hz - self._rate_hz) > RETUNE_RATIO * self._rate_hz:
+                self._rate_hz = measured_hz
+                self._lowpass.retune(measured_hz)
+                self._highpass.retune(measured_hz)
+            count = total_us = 0
+        self._window = (count, total_us)
+
+
+def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:
+    """Pass a finite vector through; hold the last output in place of one that is not."""
+    if math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2]):
+        return vector_filter.step(v)
+    return v if vector_filter.state is None else vector_filter.state[1]

@@ -1,0 +1,204 @@
+"""The paper's filters on vectors of three: second-order low-pass and first-order high-pass.
+
+One compiled step serves the live sample and the offline array, so both give the same bits. The
+filters start as if the first sample had stood for ever, so they have no start-up transient.
+"""
+
+from collections.abc import Callable
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from gateway.compiled import compiled
+from gateway.records import Vec3
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["butterworth", "chebyshev"]
+Coefficients = tuple[float, float, float, float, float]
+"""`b0, b1, b2, a1, a2` of the difference equation, `a0` being 1."""
+Delays = tuple[float, float, float, float, float, float]
+"""The two delay elements of each axis, in transposed direct form II."""
+
+PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
+ZERO_DELAYS: Final[Delays] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def design_lowpass(
+    kind: Kind, cutoff_hz: float, rate_hz: float, ripple_db: float = 1.0
+) -> Coefficients:
+    """Design a second-order low-pass by the bilinear transform: eq. 17 and 18 for Butterworth.
+
+    Parameters
+    ----------
+    kind : {"butterworth", "chebyshev"}
+        Chebyshev is of type I; deviation: it is scaled to unit gain at 0 Hz, because its even
+        order would otherwise shrink gravity by the ripple.
+    cutoff_hz : float
+        Edge of the pass band: -3 dB for Butterworth, the end of the ripple for Chebyshev.
+    rate_hz : float
+        Sample rate.
+    ripple_db : float
+        Ripple of the Chebyshev pass band.
+
+    Returns
+    -------
+    tuple of 5 floats
+        Coefficients; those of a wire where the cutoff is at or above half the sample rate.
+    """
+    if cutoff_hz >= 0.5 * rate_hz:
+        return PASS_THROUGH
+    if kind == "butterworth":
+        b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
+    else:
+        b, a = signal.cheby1(2, ripple_db, cutoff_hz, fs=rate_hz)
+        b = b * (a.sum() / b.sum())
+    return (float(b[0]), float(b[1]), float(b[2]), float(a[1]), float(a[2]))
+
+
+def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
+    """Design a first-order high-pass; a cutoff of 0 Hz gives a wire.
+
+    Parameters
+    ----------
+    cutoff_hz : float
+        -3 dB frequency; the time constant is `1 / (2 pi cutoff_hz)`.
+    rate_hz : float
+        Sample rate.
+
+    Returns
+    -------
+    tuple of 5 floats
+        Coefficients.
+    """
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        return PASS_THROUGH
+    b, a = signal.butter(1, cutoff_hz, "highpass", fs=rate_hz)
+    return (float(b[0]), float(b[1]), 0.0, float(a[1]), 0.0)
+
+
+def gain_at_rest(c: Coefficients) -> float:
+    """Tell the gain at 0 Hz."""
+    return (c[0] + c[1] + c[2]) / (1.0 + c[3] + c[4])
+
+
+@compiled
+def settled(c: Coefficients, x: Vec3, y: Vec3) -> Delays:
+    """Find the delays of a filter at which a constant input `x` gives a constant output `y`."""
+    b1, b2, a1, a2 = c[1], c[2], c[3], c[4]
+    w0, w1, w2 = b2 * x[0] - a2 * y[0], b2 * x[1] - a2 * y[1], b2 * x[2] - a2 * y[2]
+    return (
+        b1 * x[0] - a1 * y[0] + w0,
+        w0,
+        b1 * x[1] - a1 * y[1] + w1,
+        w1,
+        b1 * x[2] - a1 * y[2] + w2,
+        w2,
+    )
+
+
+@compiled
+def step(c: Coefficients, z: Delays, x: Vec3) -> tuple[Vec3, Delays]:
+    """Pass one sample through the filter."""
+    b0, b1, b2, a1, a2 = c
+    y0, y1, y2 = b0 * x[0] + z[0], b0 * x[1] + z[2], b0 * x[2] + z[4]
+    delays = (
+        b1 * x[0] - a1 * y0 + z[1],
+        b2 * x[0] - a2 * y0,
+        b1 * x[1] - a1 * y1 + z[3],
+        b2 * x[1] - a2 * y1,
+        b1 * x[2] - a1 * y2 + z[5],
+        b2 * x[2] - a2 * y2,
+    )
+    return ((y0, y1, y2), delays)
+
+
+@compiled
+def run(c: Coefficients, z: Delays, x: FloatArray) -> tuple[FloatArray, Delays]:
+    """Pass an array of shape (n, 3) through the filter."""
+    y = np.empty_like(x)
+    for i in range(x.shape[0]):
+        out, z = step(c, z, (x[i, 0], x[i, 1], x[i, 2]))
+        y[i, 0], y[i, 1], y[i, 2] = out
+    return (y, z)
+
+
+class VectorFilter:
+    """One filter on three axes, fed one sample at a time or a whole array.
+
+    Parameters
+    ----------
+    design : callable
+        Coefficients for a sample rate in Hz.
+    rate_hz : float
+        Sample rate to begin with.
+    """
+
+    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float) -> None:
+        self._design = design
+        self._coefficients = design(rate_hz)
+        self.state: tuple[Delays, Vec3] | None = None
+        """Delays and last output; None before the first sample. May be read and restored."""
+
+    def reset(self) -> None:
+        """Forget the past: the next sample starts the filter afresh."""
+        self.state = None
+
+    def retune(self, rate_hz: float) -> None:
+        """Design anew for another sample rate without a step in the output.
+
+        Parameters
+        ----------
+        rate_hz : float
+            The rate from here on.
+        """
+        self._coefficients = self._design(rate_hz)
+        if self.state is not None:
+            y = self.state[1]
+            gain = gain_at_rest(self._coefficients)
+            x = y if abs(gain) < 1e-9 else (y[0] / gain, y[1] / gain, y[2] / gain)
+            self.state = (settled(self._coefficients, x, y), y)
+
+    def step(self, x: Vec3) -> Vec3:
+        """Filter one sample.
+
+        Parameters
+        ----------
+        x : tuple of 3 floats
+            The newest sample, finite.
+
+        Returns
+        -------
+        tuple of 3 floats
+            The filtered sample.
+        """
+        y, delays = step(self._coefficients, self._delays(x), x)
+        self.state = (delays, y)
+        return y
+
+    def run(self, x: FloatArray) -> FloatArray:
+        """Filter an array; bit for bit what as many calls of `step` give.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, 3)
+            Samples in their order.
+
+        Returns
+        -------
+        ndarray, shape (n, 3)
+            Filtered samples.
+        """
+        if not len(x):
+            return x.copy()
+        y, delays = run(self._coefficients, self._delays(x[0]), np.ascontiguousarray(x))
+        self.state = (delays, (float(y[-1, 0]), float(y[-1, 1]), float(y[-1, 2])))
+        return y
+
+    def _delays(self, first: Vec3 | FloatArray) -> Delays:
+        if self.state is not None:
+            return self.state[0]
+        x = (float(first[0]), float(first[1]), float(first[2]))
+        gain = gain_at_rest(self._coefficients)
+        return settled(self._coefficients, x, (x[0] * gain, x[1] * gain, x[2] * gain))

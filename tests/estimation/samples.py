@@ -1,0 +1,63 @@
+"""Small exact motions for the estimators' tests."""
+
+import math
+from collections.abc import Iterator
+
+from gateway.records import GpsFix, GpsFixType, ImuFlags, ImuSample, NodeId, Vec3
+
+G = 9.80665
+LAT_DEG, LON_DEG, ALT_M = 47.0, 8.0, 500.0
+
+
+def imu(
+    time_us: int,
+    accel: Vec3 = (0.0, 0.0, -G),
+    gyro: Vec3 = (0.0, 0.0, 0.0),
+    mag: Vec3 | None = None,
+) -> ImuSample:
+    return ImuSample(
+        time_us=time_us,
+        accel_b_mps2=accel,
+        gyro_b_radps=gyro,
+        accel_lowpass_b_mps2=accel,
+        gyro_highpass_b_radps=gyro,
+        mag_b_ut=mag,
+        temperature_degc=25.0,
+        flags=ImuFlags(0),
+    )
+
+
+def fix(
+    time_us: int,
+    north_m: float = 0.0,
+    east_m: float = 0.0,
+    vel: Vec3 = (0.0, 0.0, 0.0),
+    alt_m: float = ALT_M,
+    fix_type: GpsFixType = GpsFixType.FIX_3D,
+) -> GpsFix:
+    lat_deg = LAT_DEG + math.degrees(north_m / 6_367_800.0)
+    lon_deg = LON_DEG + math.degrees(east_m / (6_389_700.0 * math.cos(math.radians(LAT_DEG))))
+    return GpsFix(
+        time_us=time_us,
+        node=NodeId(1, 1),
+        node_time_us=time_us,
+        itow_ms=time_us // 1000,
+        fix_type=fix_type,
+        fix_ok=fix_type >= GpsFixType.FIX_2D,
+        satellites=12,
+        lat_dege7=round(lat_deg * 1e7),
+        lon_dege7=round(lon_deg * 1e7),
+        alt_amsl_m=alt_m,
+        vel_n_mps=vel,
+        alt_ellipsoid_m=alt_m + 47.0,
+        h_acc_m=1.0,
+        v_acc_m=1.5,
+        speed_acc_mps=0.2,
+        course_acc_deg=1.0,
+        pdop=1.5,
+        utc_us=1_780_000_000_000_000 + time_us,
+    )
+
+
+def times(seconds: float, rate_hz: int = 100) -> Iterator[int]:
+    yield from range(0, round(seconds * 1e6), 1_000_000 // rate_hz)

@@ -1,0 +1,45 @@
+import math
+from dataclasses import replace
+
+import pytest
+
+from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
+from gateway.records import GpsFixType
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, fix
+
+
+def test_good_fix_and_unknown_accuracy_are_usable() -> None:
+    assert is_usable(fix(0), ReferenceSettings())
+    assert is_usable(replace(fix(0), h_acc_m=math.nan), ReferenceSettings())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fix_ok": False},
+        {"fix_type": GpsFixType.NONE},
+        {"fix_type": GpsFixType.TIME_ONLY},
+        {"h_acc_m": 100.0},
+        {"alt_amsl_m": math.nan},
+        {"lat_dege7": 0, "lon_dege7": 0},
+    ],
+    ids=str,
+)
+def test_what_makes_a_fix_unusable(change: dict[str, object]) -> None:
+    assert not is_usable(replace(fix(0), **change), ReferenceSettings())
+
+
+def test_field_is_looked_up_once_and_again_far_away() -> None:
+    earth = EarthField(ReferenceSettings())
+    assert math.isnan(earth.declination_rad)
+    assert earth.update(LAT_DEG, LON_DEG, ALT_M, None)
+    assert math.degrees(earth.declination_rad) == pytest.approx(3.5, abs=0.5)
+    assert not earth.update(LAT_DEG + 0.01, LON_DEG, ALT_M, None)
+    assert earth.update(LAT_DEG + 1.0, LON_DEG, ALT_M, None)
+    earth.reset()
+    assert earth.field is None
+
+
+def test_fixed_declination_needs_no_fix() -> None:
+    earth = EarthField(ReferenceSettings(declination="fixed", declination_deg=-10.0))
+    assert earth.declination_rad == pytest.approx(math.radians(-10.0))
