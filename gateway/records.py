@@ -232,6 +232,20 @@ class NavState:
 
 
 @dataclass(frozen=True, slots=True)
+class FusedSample:
+    """One IMU sample with all that went into its state: what a recording keeps of it."""
+
+    vehicle_id: int
+    imu: ImuRaw
+    sample: ImuSample
+    baro: BaroRaw | None
+    """The barometer payload since the previous IMU sample, if any."""
+    gps: GpsFix | None
+    """The fix since the previous IMU sample, if any."""
+    state: NavState
+
+
+@dataclass(frozen=True, slots=True)
 class NodeLink:
     """What the gateway counted of one node since it started."""
 

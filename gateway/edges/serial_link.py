@@ -136,8 +136,8 @@ class SerialLink:
     settings : SerialSettings
     on_bytes : callable
         Gets every chunk and the gateway time of its reading.
-    on_open : callable
-        Called after each successful opening, before the first bytes.
+    on_open, on_lost : callable
+        Called with the device after each opening, before the first bytes, and after each loss.
     now_us : callable
         The gateway clock.
     """
@@ -146,12 +146,14 @@ class SerialLink:
         self,
         settings: SerialSettings,
         on_bytes: Callable[[bytes, int], None],
-        on_open: Callable[[], None],
+        on_open: Callable[[str], None],
+        on_lost: Callable[[str], None],
         now_us: Callable[[], int],
     ) -> None:
         self._settings = settings
         self._on_bytes = on_bytes
         self._on_open = on_open
+        self._on_lost = on_lost
         self._now_us = now_us
         self._port: serial.Serial | None = None
         self._retry: asyncio.TimerHandle | None = None
@@ -162,11 +164,6 @@ class SerialLink:
     def connected(self) -> bool:
         """Whether the port is open."""
         return self._port is not None
-
-    @property
-    def name(self) -> str:
-        """The open device, or the setting while there is none."""
-        return self._settings.port if self._port is None else str(self._port.port)
 
     def start(self) -> None:
         """Open the port, now or as soon as it is there."""
@@ -201,7 +198,7 @@ class SerialLink:
         log.info("receiver on %s at %d baud", device, self._settings.baud)
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
-        self._on_open()
+        self._on_open(device)
         asyncio.get_running_loop().add_reader(self._port.fileno(), self._read)
 
     def _read(self) -> None:
@@ -210,8 +207,10 @@ class SerialLink:
             data = self._port.read(READ_SIZE)
         except (serial.SerialException, OSError, TypeError) as error:
             # pyserial raises TypeError when the descriptor vanishes inside a read.
-            self._complain(f"{self._port.port} is gone: {error}")
+            device = str(self._port.port)
+            self._complain(f"{device} is gone: {error}")
             self._release()
+            self._on_lost(device)
             self._try_later()
             return
         if data:

@@ -83,6 +83,7 @@ class Listener:
     def __init__(self) -> None:
         self.data = b""
         self.opened = 0
+        self.lost: list[str] = []
         self.changed = asyncio.Event()
 
     def on_bytes(self, data: bytes, now_us: int) -> None:
@@ -90,9 +91,12 @@ class Listener:
         self.data += data
         self.changed.set()
 
-    def on_open(self) -> None:
+    def on_open(self, device: str) -> None:
         self.opened += 1
         self.changed.set()
+
+    def on_lost(self, device: str) -> None:
+        self.lost.append(device)
 
     async def until(self, *, opened: int = 0, data: bytes = b"") -> None:
         async with asyncio.timeout(5):
@@ -117,7 +121,9 @@ async def test_unplugged_and_plugged_again(
     bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = SerialSettings(port=str(bench.link))
-    link = SerialLink(settings, listener.on_bytes, listener.on_open, lambda: 42)
+    link = SerialLink(
+        settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42
+    )
     link.start()
     assert not link.connected
     bench.plug()
@@ -128,6 +134,7 @@ async def test_unplugged_and_plugged_again(
     async with asyncio.timeout(5):
         while link.connected:
             await asyncio.sleep(0)
+    assert listener.lost == [str(bench.link)]
     bench.plug()
     await listener.until(opened=2)
     os.write(bench.master, b"second")
@@ -153,7 +160,11 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(loop, "call_later", call_later)
     link = SerialLink(
-        SerialSettings(port="/dev/does-not-exist"), listener.on_bytes, listener.on_open, lambda: 42
+        SerialSettings(port="/dev/does-not-exist"),
+        listener.on_bytes,
+        listener.on_open,
+        listener.on_lost,
+        lambda: 42,
     )
     link.start()
     for _ in range(7):

@@ -1,0 +1,99 @@
+"""The composition root: it alone builds the edges, joins them to the pipeline and ends them."""
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Iterable
+from typing import Final
+
+from gateway.config import GatewaySettings
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub import Hub
+from gateway.edges.serial_link import SerialLink
+from gateway.pipeline import Action, Pipeline, PipelineSettings
+from gateway.records import FusedSample, Incoming, Outgoing
+from gateway.status import Snapshot
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+LONGEST_WAIT_S: Final = 0.1
+"""A sample may make something due sooner than was known when the timer was set."""
+SHORTEST_WAIT_S: Final = 0.001
+
+
+class Daemon:
+    """The gateway at work: receiver in, MAVLink out.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        Everything that can be set.
+    """
+
+    def __init__(self, settings: GatewaySettings) -> None:
+        self.now_us = GatewayClock()
+        self._pipeline = Pipeline(
+            PipelineSettings(
+                settings.sensing, settings.estimation, settings.vehicle, settings.calibrations()
+            )
+        )
+        self._hub = Hub(settings.hub, self._on_frame, self.now_us)
+        self._serial = SerialLink(
+            settings.serial, self._on_bytes, self._on_open, self._on_lost, self.now_us
+        )
+        self._sent: Counter[int] = Counter()
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Open everything; needs a running event loop. What is not there yet is tried again."""
+        self._hub.start()
+        self._serial.start()
+        self._poll()
+
+    def close(self) -> None:
+        """End everything: first what comes in, then what goes out."""
+        self._serial.close()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._hub.close()
+
+    def snapshot(self) -> Snapshot:
+        """Describe this moment."""
+        aircraft = sorted(self._pipeline.aircraft.items())
+        return Snapshot(
+            time_us=self.now_us(),
+            report=self._pipeline.report,
+            states=tuple((key, a.state) for key, a in aircraft if a.state is not None),
+            clients=self._hub.clients(),
+            sent=tuple(sorted(self._sent.items())),
+        )
+
+    def _on_open(self, port: str) -> None:
+        self._pipeline.connect(port)
+
+    def _on_lost(self, port: str) -> None:
+        self._pipeline.disconnect(port)
+
+    def _on_bytes(self, data: bytes, now_us: int) -> None:
+        self._perform(self._pipeline.feed(data, now_us))
+
+    def _on_frame(self, incoming: Incoming) -> None:
+        self._perform(self._pipeline.handle(incoming, self.now_us()))
+
+    def _poll(self) -> None:
+        now_us = self.now_us()
+        self._perform(self._pipeline.poll(now_us))
+        wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
+        wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
+        self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
+
+    def _perform(self, actions: Iterable[Action]) -> None:
+        """Do outside what the pure stages decided."""
+        for action in actions:
+            match action:
+                case Outgoing():
+                    self._sent[action.message_id] += 1
+                    self._hub.send(action)
+                case FusedSample():
+                    pass

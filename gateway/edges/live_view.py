@@ -1,0 +1,175 @@
+"""The live view in the terminal: link, aircraft and clients at a glance."""
+
+import math
+from typing import Final
+
+from pymavlink.dialects.v20 import common as mavlink
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from gateway.geometry.quaternion import to_euler
+from gateway.records import LinkReport, NavFlags, NavState, NodeLink
+from gateway.routing.clients import ClientStats
+from gateway.status import Snapshot
+from gateway.units import US_PER_S
+
+SILENT_US: Final = 2 * US_PER_S
+UNKNOWN: Final = "—"
+RATE_COLUMNS: Final = 3
+"""Message rates stand side by side: the view must fit a terminal of 80 by 40."""
+
+FLAG_WORDS: Final = (
+    (NavFlags.ATTITUDE_VALID, "attitude", "green"),
+    (NavFlags.HEADING_VALID, "heading", "green"),
+    (NavFlags.POSITION_VALID, "position", "green"),
+    (NavFlags.AT_REST, "at rest", "cyan"),
+    (NavFlags.DEAD_RECKONING, "dead reckoning", "yellow"),
+    (NavFlags.GPS_REJECTED, "GPS rejected", "yellow"),
+    (NavFlags.MAG_DISTURBED, "magnetic disturbance", "yellow"),
+    (NavFlags.SENSOR_FAULT, "sensor fault", "red"),
+    (NavFlags.DEGRADED, "degraded", "red"),
+)
+
+
+class LiveView:
+    """Draw snapshots; keeps the previous one to tell rates."""
+
+    def __init__(self) -> None:
+        self._previous: Snapshot | None = None
+
+    def draw(self, snapshot: Snapshot) -> RenderableType:
+        """Build the whole view of one moment.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            The daemon's state now.
+
+        Returns
+        -------
+        RenderableType
+            To be shown by a rich `Live` or `Console`.
+        """
+        previous, self._previous = self._previous or snapshot, snapshot
+        parts: list[RenderableType] = [_link_line(snapshot), _nodes(snapshot.report)]
+        parts += [_aircraft(vehicle_id, state) for vehicle_id, state in snapshot.states]
+        if not snapshot.states:
+            parts.append(Text("no aircraft heard yet", style="dim"))
+        parts += [_rates(snapshot, previous), _clients(snapshot)]
+        return Group(*parts)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right")
+    return table
+
+
+def _link_line(snapshot: Snapshot) -> Text:
+    report = snapshot.report
+    up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
+    line = Text(f"mavgate  up {up}  receiver ")
+    state = ("connected", "green") if report.connected else ("not connected", "red")
+    line.append(f"{report.port} {state[0]}", style=state[1])
+    line.append(f"  {report.frames} frames, {report.frames_lost} lost on the line")
+    for kind, count in report.faults:
+        line.append(f", {count} {kind} faults", style="yellow")
+    if report.receiver is not None:
+        line.append(f"  channel {report.receiver.channel}")
+        line.append(f", noise {report.receiver.noise_percent} %")
+    return line
+
+
+def _nodes(report: LinkReport) -> Table:
+    columns = ("node", "pipe", "rate Hz", "received", "lost", "lost %", "dup", "restarts", "ppm")
+    table = _table("Radio", *columns, "age s")
+    for node in report.nodes:
+        table.add_row(*_node_cells(node), _age(report.time_us, node.last_time_us))
+    return table
+
+
+def _node_cells(node: NodeLink) -> tuple[str, ...]:
+    total = node.received + node.lost
+    return (
+        f"{node.node.vehicle_id}.{node.node.node_id}",
+        str(node.pipe),
+        f"{node.rate_hz:.0f}",
+        str(node.received),
+        str(node.lost),
+        f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
+        str(node.duplicates),
+        str(node.restarts),
+        f"{node.clock_skew_ppm:+.0f}",
+    )
+
+
+def _age(now_us: int, then_us: int) -> Text:
+    age_us = max(0, now_us - then_us)
+    return Text(f"{age_us / US_PER_S:.1f}", style="red" if age_us > SILENT_US else "")
+
+
+def _aircraft(vehicle_id: int, state: NavState) -> Table:
+    roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
+    north, east, down = state.vel_n_mps
+    table = _table(
+        f"Aircraft {vehicle_id}",
+        *("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "speed m/s", "climb m/s"),
+    )
+    table.add_row(
+        _figure(roll, "+.1f"),
+        _figure(pitch, "+.1f"),
+        _figure(yaw % 360.0, ".1f"),
+        _figure(state.lat_deg, ".6f"),
+        _figure(state.lon_deg, ".6f"),
+        _figure(state.alt_amsl_m, ".1f"),
+        _figure(math.hypot(north, east), ".1f"),
+        _figure(-down, "+.1f"),
+    )
+    table.caption = Text("  ").join(
+        Text(word, style=style) for flag, word, style in FLAG_WORDS if flag in state.flags
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _figure(value: float, spec: str) -> str:
+    return format(value, spec) if math.isfinite(value) else UNKNOWN
+
+
+def _rates(snapshot: Snapshot, previous: Snapshot) -> Table:
+    table = _table("MAVLink sent", *("message", "Hz") * RATE_COLUMNS)
+    span_s = (snapshot.time_us - previous.time_us) / US_PER_S
+    before = dict(previous.sent)
+    cells = [
+        (_message_name(key), f"{(count - before.get(key, 0)) / span_s:.1f}" if span_s else UNKNOWN)
+        for key, count in snapshot.sent
+    ]
+    for start in range(0, len(cells), RATE_COLUMNS):
+        table.add_row(*(text for cell in cells[start : start + RATE_COLUMNS] for text in cell))
+    return table
+
+
+def _message_name(message_id: int) -> str:
+    kind = mavlink.mavlink_map.get(message_id)
+    return str(message_id) if kind is None else str(kind.msgname)
+
+
+def _clients(snapshot: Snapshot) -> Table:
+    table = _table("Clients", "client", "state", "sent", "dropped", "received", "heard s ago")
+    for client in snapshot.clients:
+        table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
+    return table
+
+
+def _client_cells(client: ClientStats) -> tuple[str, ...]:
+    figures = (client.sent, client.dropped, client.received)
+    return (client.remote or client.endpoint, client.state, *(str(figure) for figure in figures))
+
+
+def _heard(now_us: int, client: ClientStats) -> str:
+    if client.heard_us is None:
+        return "never"
+    return f"{max(0, now_us - client.heard_us) / US_PER_S:.1f}"

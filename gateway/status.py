@@ -1,0 +1,19 @@
+"""One moment of the daemon: what the live view, the status command and the metrics show."""
+
+from dataclasses import dataclass
+
+from gateway.records import LinkReport, NavState
+from gateway.routing.clients import ClientStats
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """All that there is to see of the daemon at one moment."""
+
+    time_us: int
+    report: LinkReport
+    states: tuple[tuple[int, NavState], ...]
+    """Newest state by vehicle id; an aircraft without IMU samples yet is not in it."""
+    clients: tuple[ClientStats, ...]
+    sent: tuple[tuple[int, int], ...]
+    """MAVLink message id and how many were sent since the start."""
