@@ -1,0 +1,125 @@
+"""What happens to the vehicle, told as STATUSTEXT and never as a flood.
+
+Theory of operation. Every topic ("link", "GPS fix", a flag of the estimator) has a state, and only
+a change of state is told. After telling one, the topic is held for `HOLD_US`; what it does
+meanwhile is not lost but folded: at the end of the hold its state is told if it differs from the
+one told last. A flapping topic thus costs at most one text in `HOLD_US`, and the last text always
+tells the truth. Single events that have no state go through `say`, at most `BUCKET` at once
+and one more every `REFILL_US`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.units import US_PER_S
+
+CRITICAL: Final = mavlink.MAV_SEVERITY_CRITICAL
+WARNING: Final = mavlink.MAV_SEVERITY_WARNING
+NOTICE: Final = mavlink.MAV_SEVERITY_NOTICE
+INFO: Final = mavlink.MAV_SEVERITY_INFO
+
+HOLD_US: Final = 5 * US_PER_S
+BUCKET: Final = 10
+REFILL_US: Final = US_PER_S // 2
+TEXT_BYTES: Final = 50
+"""Length of STATUSTEXT's text; longer texts go out in chunks."""
+MAX_TEXT_BYTES: Final = 4 * TEXT_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A text and how grave it is."""
+
+    severity: int
+    text: str
+
+
+@dataclass(slots=True)
+class _Topic:
+    state: object
+    told: object
+    text: Told
+    held_until_us: int = 0
+
+
+class Announcer:
+    """Texts about changes of state, limited in rate."""
+
+    def __init__(self) -> None:
+        self._topics: dict[str, _Topic] = {}
+        self._tokens = BUCKET
+        self._refilled_us = 0
+        self._next_id = 0
+
+    def track(
+        self, topic: str, state: object, text: Told, now_us: int, *, initially: object = None
+    ) -> list[Any]:
+        """Note the present state of a topic, and tell it if it changed.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+        state : object
+            Any value; compared by equality.
+        text : Told
+            What to tell of this state.
+        now_us : int
+            Gateway clock.
+        initially : object, optional
+            The state in which a new topic begins, and of which nothing is told.
+
+        Returns
+        -------
+        list of MAVLink_message
+        """
+        known = self._topics.setdefault(topic, _Topic(initially, initially, text))
+        known.state, known.text = state, text
+        return self._tell(known, now_us)
+
+    def say(self, text: Told, now_us: int) -> list[Any]:
+        """Tell a single event, unless there were too many of late."""
+        self._refill(now_us)
+        if self._tokens == 0:
+            return []
+        self._tokens -= 1
+        return self._chunks(text)
+
+    def poll(self, now_us: int) -> list[Any]:
+        """Tell the states that changed while their topics were held."""
+        return [message for topic in self._topics.values() for message in self._tell(topic, now_us)]
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` has something to tell."""
+        pending = (t.held_until_us for t in self._topics.values() if t.state != t.told)
+        return min(pending, default=None)
+
+    def _tell(self, topic: _Topic, now_us: int) -> list[Any]:
+        if topic.state == topic.told or now_us < topic.held_until_us:
+            return []
+        topic.told = topic.state
+        topic.held_until_us = now_us + HOLD_US
+        return self._chunks(topic.text)
+
+    def _refill(self, now_us: int) -> None:
+        fresh = (now_us - self._refilled_us) // REFILL_US
+        if fresh > 0:
+            self._tokens = min(BUCKET, self._tokens + fresh)
+            self._refilled_us += fresh * REFILL_US
+
+    def _chunks(self, text: Told) -> list[Any]:
+        data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
+        if len(data) <= TEXT_BYTES:
+            return [mavlink.MAVLink_statustext_message(text.severity, data)]
+        # Id 0 means a text of one chunk.
+        self._next_id = self._next_id % 0xFFFF + 1
+        # A reader takes a chunk that is not full for the last one.
+        starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
+        return [
+            mavlink.MAVLink_statustext_message(
+                text.severity, data[start : start + TEXT_BYTES], self._next_id, number
+            )
+            for number, start in enumerate(starts)
+        ]

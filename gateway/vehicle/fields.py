@@ -1,0 +1,85 @@
+"""Physical values to the numbers of MAVLink fields: scaled, saturated, and never raising.
+
+A MAVLink integer field often reserves its greatest value for "unknown". Each function here takes
+what to send in that case, and keeps a value that is too large one short of that mark, so that
+"very much" is never read as "not known".
+"""
+
+import math
+from typing import Final
+
+INT16_MAX: Final = 2**15 - 1
+INT32_MAX: Final = 2**31 - 1
+UINT8_MAX: Final = 2**8 - 1
+UINT16_MAX: Final = 2**16 - 1
+UINT32_MAX: Final = 2**32 - 1
+FLOAT32_MAX: Final = 3.402_823_4e38
+
+
+def whole(value: float, low: int, high: int, unknown: int) -> int:
+    """Round to an integer field.
+
+    Parameters
+    ----------
+    value : float
+        In the field's unit; NaN is not known, an infinity is saturated.
+    low, high : int
+        Ends of the field, `unknown` excluded.
+    unknown : int
+        What the message definition sends for a value that is not known.
+
+    Returns
+    -------
+    int
+    """
+    if math.isnan(value):
+        return unknown
+    if value <= low:
+        return low
+    if value >= high:
+        return high
+    return round(value)
+
+
+def uint8(value: float, unknown: int = UINT8_MAX) -> int:
+    """Fit an unsigned byte whose 255 may mean unknown."""
+    return whole(value, 0, UINT8_MAX - (unknown == UINT8_MAX), unknown)
+
+
+def uint16(value: float, unknown: int = UINT16_MAX) -> int:
+    """Fit an unsigned 16-bit field whose 65535 may mean unknown."""
+    return whole(value, 0, UINT16_MAX - (unknown == UINT16_MAX), unknown)
+
+
+def int16(value: float, unknown: int = 0) -> int:
+    """Fit a signed 16-bit field; most of them have no mark for unknown."""
+    return whole(value, -INT16_MAX - 1, INT16_MAX - (unknown == INT16_MAX), unknown)
+
+
+def int32(value: float, unknown: int = 0) -> int:
+    """Fit a signed 32-bit field; most of them have no mark for unknown."""
+    return whole(value, -INT32_MAX - 1, INT32_MAX - (unknown == INT32_MAX), unknown)
+
+
+def uint32(value: float, unknown: int = 0) -> int:
+    """Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
+    return whole(value, 0, UINT32_MAX, unknown)
+
+
+def real(value: float) -> float:
+    """Fit a 32-bit float: NaN and infinities pass, a finite value beyond its range saturates."""
+    if math.isfinite(value):
+        return max(-FLOAT32_MAX, min(FLOAT32_MAX, value))
+    return value
+
+
+def compass_cdeg(angle_rad: float) -> int:
+    """Turn an angle from north into 0 to 35999 hundredths of a degree, 65535 if not known."""
+    if not math.isfinite(angle_rad):
+        return UINT16_MAX
+    return round(math.degrees(angle_rad) * 100.0) % 36000
+
+
+def compass_deg(angle_rad: float) -> int:
+    """Turn an angle from north into 0 to 359 whole degrees; an unknown angle must not come here."""
+    return round(math.degrees(angle_rad)) % 360

@@ -1,0 +1,95 @@
+"""What the operator may choose about the vehicle that ground stations see."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from gateway.settings import Settings, setting
+
+VehicleType = Literal[
+    "generic", "fixed_wing", "quadrotor", "hexarotor", "octorotor", "tricopter", "helicopter",
+    "airship", "free_balloon", "rocket", "ground_rover", "surface_boat", "submarine",
+    "flapping_wing", "kite", "vtol_tiltrotor", "parafoil",
+]  # fmt: skip
+"""The MAV_TYPE names that every ground station takes for a vehicle."""
+
+ArmedWhen = Literal["flying", "recording", "flying_or_recording", "always", "never"]
+
+
+def _rate(message: str) -> msgspec.Meta:
+    return setting(f"{message} per second; 0 sends none.", "Hz", ge=0.0, le=1000.0)
+
+
+class RateSettings(Settings, frozen=True):
+    """How often each message is sent; never more often than its sensor delivers."""
+
+    attitude_quaternion_hz: Annotated[float, _rate("ATTITUDE_QUATERNION")] = 50.0
+    attitude_hz: Annotated[float, _rate("ATTITUDE")] = 50.0
+    global_position_int_hz: Annotated[float, _rate("GLOBAL_POSITION_INT")] = 10.0
+    vfr_hud_hz: Annotated[float, _rate("VFR_HUD")] = 10.0
+    highres_imu_hz: Annotated[float, _rate("HIGHRES_IMU")] = 10.0
+    gps_raw_int_hz: Annotated[float, _rate("GPS_RAW_INT")] = 5.0
+    scaled_pressure_hz: Annotated[float, _rate("SCALED_PRESSURE")] = 5.0
+    nav_controller_output_hz: Annotated[float, _rate("NAV_CONTROLLER_OUTPUT")] = 2.0
+    sys_status_hz: Annotated[float, _rate("SYS_STATUS")] = 2.0
+    estimator_status_hz: Annotated[float, _rate("ESTIMATOR_STATUS")] = 1.0
+    extended_sys_state_hz: Annotated[float, _rate("EXTENDED_SYS_STATE")] = 2.0
+    system_time_hz: Annotated[float, _rate("SYSTEM_TIME")] = 1.0
+    home_position_hz: Annotated[float, _rate("HOME_POSITION")] = 1.0
+    mission_current_hz: Annotated[float, _rate("MISSION_CURRENT")] = 1.0
+    radio_status_hz: Annotated[float, _rate("RADIO_STATUS")] = 1.0
+
+
+class VehicleSettings(Settings, frozen=True):
+    """The vehicle that ground stations see; one per aircraft."""
+
+    type: Annotated[
+        VehicleType, setting("What ground stations draw and how they lay out their screens.")
+    ] = "fixed_wing"
+    rates: RateSettings = RateSettings()
+    armed_when: Annotated[
+        ArmedWhen,
+        setting(
+            "When the vehicle reports itself armed. Ground stations start flight time, distance, "
+            "track and their own logs by it."
+        ),
+    ] = "flying_or_recording"
+    node_silent_s: Annotated[
+        float,
+        setting(
+            "A node or sensor that has sent nothing for this long is unhealthy.",
+            "s",
+            ge=0.2,
+            le=60.0,
+        ),
+    ] = 2.0
+    home_accuracy_m: Annotated[
+        float,
+        setting(
+            "Home is set at the first 3D fix whose horizontal accuracy is at least this good.",
+            "m",
+            ge=0.5,
+            le=100.0,
+        ),
+    ] = 5.0
+    home_satellites: Annotated[
+        int, setting("Least number of satellites of the fix that sets home.", "", ge=4, le=20)
+    ] = 6
+    takeoff_speed_mps: Annotated[
+        float,
+        setting(
+            "Ground speed above which, held for two seconds, the vehicle is in the air.",
+            "m/s",
+            ge=0.5,
+            le=50.0,
+        ),
+    ] = 5.0
+    takeoff_height_m: Annotated[
+        float,
+        setting(
+            "Height above home above which, held for two seconds, the vehicle is in the air.",
+            "m",
+            ge=1.0,
+            le=100.0,
+        ),
+    ] = 10.0

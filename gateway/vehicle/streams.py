@@ -1,0 +1,111 @@
+"""When each message is due: at its own interval, on the clock of the samples that carry it.
+
+Theory of operation. A message about the attitude is worth most at the moment its sample arrives,
+so no timer sends it: every sample is offered to its stream, and the stream takes the samples
+nearest to a grid of its own interval. Three things could spoil that:
+
+- *Drift.* The grid advances by the interval, not from the sample that was sent, so 50 Hz out of
+  60 Hz samples stays 50 Hz.
+- *Beating.* With samples at nearly a multiple of the rate, the grid would slide across the samples
+  and now and then skip or double one. The grid therefore leans a sixteenth of the way towards
+  each sample it takes. Where the sample rate is within 3 % of a multiple the grid locks on, and
+  every n-th sample is sent; elsewhere the pulls cancel out over a period.
+- *Bursts.* After a gap, or where samples come slower than the interval, the grid starts anew
+  at the sample, so a sample is sent once at most.
+
+Messages that no sample carries (HEARTBEAT and the like) run on the same grid by `tick`.
+"""
+
+from typing import Final
+
+from gateway.units import US_PER_S
+
+OFF: Final = -1
+"""Interval of a message that is not sent, as in MESSAGE_INTERVAL."""
+
+LEAN: Final = 16
+"""A sixteenth: locks within 3 % of a multiple, and averages jitter over 16 samples."""
+PACE_WEIGHT: Final = 8
+MAX_PERIOD_US: Final = US_PER_S
+"""A longer gap says nothing about the pace of the samples."""
+
+
+def interval_us(rate_hz: float) -> int:
+    """Turn a rate into an interval; a rate of 0 into `OFF`."""
+    return round(US_PER_S / rate_hz) if rate_hz > 0.0 else OFF
+
+
+class Stream:
+    """One message's schedule."""
+
+    def __init__(self, interval: int) -> None:
+        self.interval_us = interval
+        self._due_us: int | None = None
+        self._last_us: int | None = None
+        self._period_us = 0
+
+    @property
+    def due_us(self) -> int | None:
+        """When the message is due next; None while it is off or has not begun."""
+        return None if self.interval_us == OFF else self._due_us
+
+    def change(self, interval: int) -> None:
+        """Take on a new interval, counted from the next sample."""
+        self.interval_us = interval
+        self._due_us = None
+
+    def offer(self, time_us: int) -> bool:
+        """Ask whether the sample of this time is to be sent.
+
+        Parameters
+        ----------
+        time_us : int
+            Time of the sample on the gateway clock.
+
+        Returns
+        -------
+        bool
+        """
+        self._follow_pace(time_us)
+        if self.interval_us == OFF:
+            return False
+        late = 0 if self._due_us is None else time_us - self._due_us
+        if late < -(self._period_us // 2):
+            return False
+        self._advance(time_us, late, late // LEAN)
+        return True
+
+    def tick(self, now_us: int) -> bool:
+        """Ask whether a message that no sample carries is due.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        bool
+        """
+        if self.interval_us == OFF:
+            return False
+        late = 0 if self._due_us is None else now_us - self._due_us
+        if late < 0:
+            return False
+        self._advance(now_us, late, 0)
+        return True
+
+    def _advance(self, time_us: int, late: int, lean: int) -> None:
+        if self._due_us is None or late > self.interval_us:
+            self._due_us = time_us + self.interval_us
+        else:
+            self._due_us += self.interval_us + lean
+
+    def _follow_pace(self, time_us: int) -> None:
+        if self._last_us is not None:
+            gap = time_us - self._last_us
+            if 0 < gap <= MAX_PERIOD_US:
+                if self._period_us == 0:
+                    self._period_us = gap
+                self._period_us += (gap - self._period_us) // PACE_WEIGHT
+        self._last_us = time_us
