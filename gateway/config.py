@@ -15,7 +15,11 @@ import msgspec
 import tomlkit
 
 from gateway.edges.serial_link import SerialSettings
+from gateway.estimation.select import EstimationSettings
+from gateway.routing.settings import HubSettings
+from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of
+from gateway.vehicle.settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
 
@@ -24,6 +28,10 @@ class GatewaySettings(Settings, frozen=True):
     """All settings of the gateway."""
 
     serial: SerialSettings = SerialSettings()
+    hub: HubSettings = HubSettings()
+    vehicle: VehicleSettings = VehicleSettings()
+    sensing: SensingSettings = SensingSettings()
+    estimation: EstimationSettings = EstimationSettings()
 
 
 class ConfigError(Exception):

@@ -61,6 +61,25 @@ class LiveView:
         return Group(*parts)
 
 
+def summary_line(snapshot: Snapshot) -> str:
+    """Sum up a moment in one line for a log."""
+    report = snapshot.report
+    parts = [f"receiver {report.port} {'connected' if report.connected else 'not connected'}"]
+    parts += [
+        f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
+        for node in report.nodes
+    ]
+    for vehicle_id, state in snapshot.states:
+        roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
+        place = f"{_figure(state.lat_deg, '.6f')} {_figure(state.lon_deg, '.6f')}"
+        parts.append(
+            f"aircraft {vehicle_id} at {place} {_figure(state.alt_amsl_m, '.1f')} m, "
+            f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
+        )
+    parts.append(f"{len(snapshot.clients)} clients")
+    return "; ".join(parts)
+
+
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for number, column in enumerate(columns):

@@ -1,0 +1,50 @@
+"""The command `mavgate`: one group of commands a file."""
+
+import logging
+import sys
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+
+from gateway import __version__
+from gateway.cli import run, setup
+
+app = typer.Typer(
+    name="mavgate",
+    help="A MAVLink telemetry gateway: shows a home-made UAV tracker on every ground station.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+run.register(app)
+setup.register(app)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"mavgate {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details too.")] = False,
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version.")
+    ] = False,
+) -> None:
+    level = logging.DEBUG if verbose else logging.INFO
+    if sys.stderr.isatty():
+        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
+        logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
+    else:
+        logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s")
+
+
+def main() -> None:
+    """Run the command line."""
+    app()

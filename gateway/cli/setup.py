@@ -1,0 +1,53 @@
+"""Commands that help to set the gateway up: ports and settings."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from gateway.cli.errors import refuse
+from gateway.config import ConfigError, GatewaySettings, load, render
+from gateway.edges.serial_link import PortNotFoundError, find_port, list_serial_ports
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command()(ports)
+    app.command()(check_config)
+
+
+def ports() -> None:
+    """List the serial ports, and the one that `auto` takes."""
+    found = list_serial_ports()
+    table = Table(box=box.SIMPLE_HEAD)
+    for column in ("device", "setting by USB id", "serial number", "description"):
+        table.add_column(column)
+    for port in found:
+        usb = f"usb:{port.usb_id}" if port.usb_id else ""
+        table.add_row(port.device, usb, port.serial_number, port.description)
+    console = Console()
+    if found:
+        console.print(table)
+    try:
+        console.print(f'port = "auto" takes {find_port("auto", found)}')
+    except PortNotFoundError as error:
+        console.print(f'port = "auto": {error}')
+
+
+def check_config(
+    file: Annotated[
+        Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
+    ] = None,
+) -> None:
+    """Check a settings file, or print all settings with their defaults and meanings."""
+    if file is None:
+        print(render(GatewaySettings()), end="")
+        return
+    try:
+        load(file)
+    except ConfigError as error:
+        refuse(str(error))
+    print(f"{file}: all settings are right")
