@@ -20,23 +20,26 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": FOUNDATION,
     "vehicle": FOUNDATION,
     "flightlog": FOUNDATION,
+    "routing": FOUNDATION | {"wire"},
     "simulator": FOUNDATION | {"wire"},
     "pipeline": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
-    "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "simulator", "pipeline"},
+    "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "simulator", "pipeline", "routing"},
     "analysis": FOUNDATION
     | {"wire", "sensing", "estimation", "flightlog", "simulator", "pipeline"},
-    "config": FOUNDATION | {"wire", "sensing", "estimation", "vehicle", "flightlog", "pipeline"},
+    "config": FOUNDATION
+    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "pipeline", "routing"},
     "daemon": FOUNDATION
-    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator"}
+    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator", "routing"}
     | {"pipeline", "edges", "config"},
     "cli": FOUNDATION
-    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator"}
+    | {"wire", "sensing", "estimation", "vehicle", "flightlog", "simulator", "routing"}
     | {"pipeline", "edges", "config", "daemon", "analysis"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
 PURE = FOUNDATION | {
-    "wire", "sensing", "estimation", "vehicle", "flightlog", "simulator", "pipeline"
+    "wire", "sensing", "estimation", "vehicle", "flightlog", "simulator", "pipeline",
+    "routing",
 }  # fmt: skip
 
 IMPURE_MODULES = {
