@@ -9,7 +9,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 import tomlkit
@@ -17,11 +17,15 @@ import tomlkit
 from gateway.edges.serial_link import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.routing.settings import HubSettings
+from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
-from gateway.settings import Field, Settings, fields_of
+from gateway.settings import Field, Settings, fields_of, setting
 from gateway.vehicle.settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
+VEHICLE_IDS: Final = range(1, 32)
+
+Kind = TypeVar("Kind", bound=Settings)
 
 
 class GatewaySettings(Settings, frozen=True):
@@ -32,6 +36,13 @@ class GatewaySettings(Settings, frozen=True):
     vehicle: VehicleSettings = VehicleSettings()
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
+    calibration_folder: Annotated[
+        str,
+        setting(
+            "Folder of the IMU nodes' calibrations, one file an aircraft, named by its id: "
+            '"1.toml". An aircraft without a file is taken as ideal.'
+        ),
+    ] = "~/.config/mavgate/calibration"
 
 
 class ConfigError(Exception):
@@ -39,7 +50,7 @@ class ConfigError(Exception):
 
 
 def load(path: Path) -> GatewaySettings:
-    """Read and check a settings file.
+    """Read and check the settings file.
 
     Parameters
     ----------
@@ -55,18 +66,33 @@ def load(path: Path) -> GatewaySettings:
     ConfigError
         If the file cannot be read, is no TOML, or has a key, type or value that is not allowed.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
-    errors = [f"{path}: {error}" for error in _check(table, GatewaySettings, "")]
-    if errors:
-        raise ConfigError("\n".join(errors))
-    return msgspec.convert(table, GatewaySettings)
+    return _load(path, GatewaySettings)
+
+
+def load_calibrations(folder: Path) -> dict[int, NodeCalibration]:
+    """Read the calibrations of all aircraft.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds `1.toml` to `31.toml`, any of them or none.
+
+    Returns
+    -------
+    dict of int to NodeCalibration
+        By vehicle id.
+
+    Raises
+    ------
+    ConfigError
+        As `load`.
+    """
+    files = {vehicle_id: folder / f"{vehicle_id}.toml" for vehicle_id in VEHICLE_IDS}
+    return {
+        vehicle_id: _load(file, NodeCalibration)
+        for vehicle_id, file in files.items()
+        if file.exists()
+    }
 
 
 def render(settings: GatewaySettings) -> str:
@@ -86,6 +112,21 @@ def render(settings: GatewaySettings) -> str:
         "`mavgate check-config FILE` tells what is wrong with a file."
     )
     return "\n".join([*head, *_render_section(settings, "")]) + "\n"
+
+
+def _load(path: Path, kind: type[Kind]) -> Kind:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    errors = [f"{path}: {error}" for error in _check(table, kind, "")]
+    if errors:
+        raise ConfigError("\n".join(errors))
+    return msgspec.convert(table, kind)
 
 
 def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Iterator[str]:

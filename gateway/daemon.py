@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from gateway.config import GatewaySettings
@@ -12,6 +12,7 @@ from gateway.edges.hub import Hub
 from gateway.edges.serial_link import SerialLink
 from gateway.pipeline import Action, Pipeline, PipelineSettings
 from gateway.records import FusedSample, Incoming, Outgoing
+from gateway.sensing.calibration import NodeCalibration
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 
@@ -29,14 +30,16 @@ class Daemon:
     ----------
     settings : GatewaySettings
         Everything that can be set.
+    calibrations : mapping of int to NodeCalibration
+        By vehicle id.
     """
 
-    def __init__(self, settings: GatewaySettings) -> None:
+    def __init__(
+        self, settings: GatewaySettings, calibrations: Mapping[int, NodeCalibration]
+    ) -> None:
         self.now_us = GatewayClock()
         self._pipeline = Pipeline(
-            PipelineSettings(
-                settings.sensing, settings.estimation, settings.vehicle, settings.calibrations()
-            )
+            PipelineSettings(settings.sensing, settings.estimation, settings.vehicle, calibrations)
         )
         self._hub = Hub(settings.hub, self._on_frame, self.now_us)
         self._serial = SerialLink(

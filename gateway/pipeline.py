@@ -1,8 +1,9 @@
 """The one place where the stages meet: `wire → sensing → estimation → vehicle`.
 
     receiver's bytes ─ Link ─ raw records ─┬─ Aircraft 1: SensorChain ─ Estimator ─ Vehicle ─┐
-                                           └─ Aircraft 2: …                                  ├─ actions
-    client's frames ──────────────────────────────────────────────────────────── Vehicle ────┘
+                                           └─ Aircraft 2: …                                  │
+    client's frames ──────────────────────────────────────────────────────────── Vehicle ────┤
+                                                                                          actions
 
 Pure: time is an argument, and what should happen outside comes back as a list of actions, in
 order. An aircraft comes into being with its first payload. Live, demo and playback differ only in

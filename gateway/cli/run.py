@@ -13,9 +13,10 @@ import typer
 from rich.live import Live
 
 from gateway.cli.errors import refuse
-from gateway.config import ConfigError, GatewaySettings, load
+from gateway.config import ConfigError, GatewaySettings, load, load_calibrations
 from gateway.daemon import Daemon
 from gateway.edges.live_view import LiveView, summary_line
+from gateway.sensing.calibration import NodeCalibration
 
 log = logging.getLogger(__name__)
 
@@ -27,9 +28,7 @@ LOG_INTERVAL_S: Final = 10.0
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help=f"Settings file [default: {USER_CONFIG}].")
 ]
-PlainOption = Annotated[
-    bool, typer.Option("--plain", help="Log lines in place of the live view.")
-]
+PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines in place of the live view.")]
 EndpointOption = Annotated[
     list[str] | None,
     typer.Option("--endpoint", "-e", help="Where MAVLink goes, in place of the settings'."),
@@ -56,7 +55,8 @@ def run_gateway(
         serial = msgspec.structs.replace(settings.serial, port=port)
         settings = msgspec.structs.replace(settings, serial=serial)
     settings = with_endpoints(settings, endpoint)
-    asyncio.run(serve(lambda: Daemon(settings), plain=plain))
+    calibrations = read_calibrations(settings)
+    asyncio.run(serve(lambda: Daemon(settings, calibrations), plain=plain))
 
 
 def read_settings(file: Path | None) -> GatewaySettings:
@@ -67,6 +67,14 @@ def read_settings(file: Path | None) -> GatewaySettings:
             return GatewaySettings()
     try:
         return load(file)
+    except ConfigError as error:
+        refuse(str(error))
+
+
+def read_calibrations(settings: GatewaySettings) -> dict[int, NodeCalibration]:
+    """Load the calibrations of all aircraft."""
+    try:
+        return load_calibrations(Path(settings.calibration_folder).expanduser())
     except ConfigError as error:
         refuse(str(error))
 

@@ -121,9 +121,7 @@ async def test_unplugged_and_plugged_again(
     bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = SerialSettings(port=str(bench.link))
-    link = SerialLink(
-        settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42
-    )
+    link = SerialLink(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
     link.start()
     assert not link.connected
     bench.plug()

@@ -1,0 +1,1 @@
+"""Who gets which MAVLink frame: endpoints, clients, filters, rates, queues; no I/O."""

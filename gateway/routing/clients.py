@@ -1,0 +1,138 @@
+"""What is known of each client, and which clients of a listening port are still there.
+
+A UDP port knows its clients only by what they send. A client is dropped after a silence; one that
+comes back on another port (a ground station that was started again) takes the place of its old
+self as soon as that has missed a few heartbeats, so that nobody is served twice; and a port never
+serves more than a bounded number, whoever knocks.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.units import US_PER_S
+
+SILENT_AFTER_US: Final = 3 * US_PER_S
+"""Three missed heartbeats: a client so silent may be replaced."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientStats:
+    """One client at one moment, for the live view, the status command and the metrics."""
+
+    client_id: int
+    name: str
+    endpoint: str
+    remote: str
+    """Where the peer is; empty while unknown."""
+    state: str
+    """`open`, or why nothing goes out: `refused`, `unreachable`, `connecting`, `resolving`."""
+    trusted: bool
+    systems: tuple[tuple[int, int], ...]
+    """System and component ids that were heard from it."""
+    sent: int
+    """Frames handed to the network."""
+    dropped: int
+    """Frames given up: refused, unreachable, or older than newer ones in a full queue."""
+    bytes_sent: int
+    received: int
+    bytes_received: int
+    bytes_garbage: int
+    """Bytes from it that were no MAVLink."""
+    queued: int
+    """Frames that wait for a slow link."""
+    since_us: int
+    heard_us: int | None
+    round_trip_us: int | None
+
+
+@dataclass(slots=True)
+class Presence:
+    """A client of a listening port."""
+
+    client_id: int
+    address: tuple[str, int]
+    """Host and port of the peer."""
+    heard_us: int
+    identity: tuple[int, int] | None = None
+    """System and component of its first frame."""
+
+
+class ClientTable:
+    """Who speaks to one listening port.
+
+    Parameters
+    ----------
+    max_clients : int
+        Most clients at once.
+    idle_timeout_us : int
+        Silence after which a client is gone.
+    """
+
+    def __init__(self, max_clients: int, idle_timeout_us: int) -> None:
+        self.max_clients = max_clients
+        self.idle_timeout_us = idle_timeout_us
+        self.refused = 0
+        self._by_address: dict[tuple[str, int], Presence] = {}
+
+    def __len__(self) -> int:
+        return len(self._by_address)
+
+    def find(self, address: tuple[str, int]) -> Presence | None:
+        """Return the client at an address."""
+        return self._by_address.get(address)
+
+    def admit(
+        self, address: tuple[str, int], client_id: int, now_us: int
+    ) -> tuple[Presence | None, Presence | None]:
+        """Take in a client at a new address.
+
+        Returns
+        -------
+        tuple
+            The client, or None if the table is full of clients that are alive; and the silent
+            client that had to go for it, if any.
+        """
+        leaver = None
+        if len(self._by_address) >= self.max_clients:
+            leaver = min(self._by_address.values(), key=lambda presence: presence.heard_us)
+            if now_us - leaver.heard_us < SILENT_AFTER_US:
+                self.refused += 1
+                return None, None
+            self.remove(leaver)
+        presence = Presence(client_id, address, now_us)
+        self._by_address[address] = presence
+        return presence, leaver
+
+    def remove(self, presence: Presence) -> None:
+        """Forget a client."""
+        self._by_address.pop(presence.address, None)
+
+    def expire(self, now_us: int) -> list[Presence]:
+        """Remove and return the clients that have gone or have come back elsewhere."""
+        newest: dict[tuple[str, tuple[int, int]], Presence] = {}
+        for presence in self._by_address.values():
+            if presence.identity:
+                key = (presence.address[0], presence.identity)
+                if key not in newest or presence.heard_us > newest[key].heard_us:
+                    newest[key] = presence
+        gone = [
+            presence
+            for presence in self._by_address.values()
+            if self._has_gone(presence, newest, now_us)
+        ]
+        for presence in gone:
+            self.remove(presence)
+        return gone
+
+    def _has_gone(
+        self,
+        presence: Presence,
+        newest: dict[tuple[str, tuple[int, int]], Presence],
+        now_us: int,
+    ) -> bool:
+        silent_us = now_us - presence.heard_us
+        if silent_us >= self.idle_timeout_us:
+            return True
+        if silent_us < SILENT_AFTER_US or presence.identity is None:
+            return False
+        return newest[presence.address[0], presence.identity] is not presence

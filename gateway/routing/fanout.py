@@ -1,0 +1,185 @@
+"""Which outlet gets which frame, in which order and with which sequence number.
+
+Theory of operation. The first frame of each (system, component, message) makes a plan: the outlets
+that take it at every time, those that take it at a limited rate, and those that do not take it.
+Plans are thrown away when an outlet or a wish changes, so the usual frame costs one dictionary
+look-up and one call per outlet.
+
+A frame that one outlet does not get (filtered, limited, or an answer to another client) leaves a
+gap in the sequence numbers there, which ground stations show as loss of the radio. So our own
+frames are numbered anew for those outlets: each outlet remembers how many it was not given, and
+all outlets that lack the same number share one restamped copy. Frames of other vehicles and signed
+frames are never touched; a filter on those does show as loss.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Final
+
+from gateway.records import ClientInterval
+from gateway.routing.endpoint import NO_MESSAGES, Endpoint
+from gateway.wire.mavlink_splitter import START_V2, key_of, message_id_of, origin_of, restamp
+
+Transmit = Callable[[bytes, int], None]
+"""Hands a frame and its message id to a transport."""
+
+SEQUENCE_MASK: Final = 0xFF
+SLACK_SHIFT: Final = 2
+"""A limited frame may come a quarter of its interval early, or jitter would halve the rate."""
+
+COPIES: Final = 16
+"""Restamped copies kept while one frame goes round the outlets."""
+MAX_PLANS: Final = 4096
+"""A vehicle sends some fifty kinds of message; forged headers must not fill the memory."""
+
+
+@dataclass(slots=True)
+class _Stamp:
+    """How many frames of one component an outlet was not given, modulo 256."""
+
+    skipped: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Outlet:
+    client_id: int
+    transmit: Transmit
+    endpoint: Endpoint
+    wishes: dict[tuple[int, int], int] = field(default_factory=dict)
+    stamps: dict[tuple[int, int], _Stamp] = field(default_factory=dict)
+
+    def stamp_of(self, origin: tuple[int, int]) -> _Stamp:
+        if len(self.stamps) >= MAX_PLANS:
+            self.stamps.clear()
+        return self.stamps.setdefault(origin, _Stamp())
+
+    def interval_us(self, system: int, message_id: int) -> int:
+        """Return the least time between two frames; the settings bound what a client wishes."""
+        if not self.endpoint.passes(message_id):
+            return NO_MESSAGES
+        limit = self.endpoint.interval_us.get(message_id, 0)
+        wish = self.wishes.get((system, message_id), 0)
+        return NO_MESSAGES if NO_MESSAGES in (limit, wish) else max(limit, wish)
+
+
+@dataclass(slots=True, eq=False)
+class _Lane:
+    """One kind of frame on its way to one outlet."""
+
+    client_id: int
+    transmit: Transmit
+    stamp: _Stamp
+    interval_us: int
+    due_us: int = 0
+
+    def is_due(self, now_us: int) -> bool:
+        slack_us = self.interval_us >> SLACK_SHIFT
+        if now_us < self.due_us - slack_us:
+            return False
+        self.due_us = max(self.due_us, now_us - slack_us) + self.interval_us
+        return True
+
+
+@dataclass(slots=True)
+class _Plan:
+    message_id: int
+    open: list[_Lane] = field(default_factory=list)
+    limited: list[_Lane] = field(default_factory=list)
+    closed: list[_Stamp] = field(default_factory=list)
+
+
+class Fanout:
+    """Give frames to outlets by their filters, rates and addresses."""
+
+    def __init__(self) -> None:
+        self._outlets: dict[int, _Outlet] = {}
+        self._plans: dict[bytes, _Plan] = {}
+
+    def add(self, client_id: int, transmit: Transmit, endpoint: Endpoint) -> None:
+        """Let an outlet take part from the next frame on."""
+        self._outlets[client_id] = _Outlet(client_id, transmit, endpoint)
+        self._plans.clear()
+
+    def remove(self, client_id: int) -> None:
+        """Forget an outlet; unknown ids are ignored."""
+        if self._outlets.pop(client_id, None):
+            self._plans.clear()
+
+    def set_interval(self, wish: ClientInterval) -> None:
+        """Take a client's wish for a rate; a wish of a client that has gone is ignored."""
+        if outlet := self._outlets.get(wish.client_id):
+            outlet.wishes[wish.system_id, wish.message_id] = wish.interval_us
+            self._plans.clear()
+
+    def publish(self, frame: bytes, now_us: int) -> None:
+        """Send one of our own frames to every outlet that takes it."""
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        message_id = plan.message_id
+        for lane in plan.open:
+            skipped = lane.stamp.skipped
+            lane.transmit(_shifted(frame, skipped) if skipped else frame, message_id)
+        for lane in plan.limited:
+            if lane.is_due(now_us):
+                lane.transmit(_shifted(frame, lane.stamp.skipped), message_id)
+            else:
+                _skip(lane.stamp)
+        for stamp in plan.closed:
+            _skip(stamp)
+
+    def answer(self, frame: bytes, client_id: int) -> None:
+        """Send one of our own frames to one outlet only, past its filters."""
+        origin = origin_of(frame)
+        for outlet in self._outlets.values():
+            stamp = outlet.stamp_of(origin)
+            if outlet.client_id == client_id:
+                outlet.transmit(_shifted(frame, stamp.skipped), message_id_of(frame))
+            else:
+                _skip(stamp)
+
+    def forward(self, frame: bytes, source_id: int, now_us: int) -> None:
+        """Pass another system's broadcast on to all outlets but the one it came from."""
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        for lane in plan.open:
+            if lane.client_id != source_id:
+                lane.transmit(frame, plan.message_id)
+        for lane in plan.limited:
+            if lane.client_id != source_id and lane.is_due(now_us):
+                lane.transmit(frame, plan.message_id)
+
+    def deliver(self, frame: bytes, client_ids: Iterable[int]) -> None:
+        """Pass a frame on to some outlets, past their filters, untouched."""
+        message_id = message_id_of(frame)
+        for client_id in client_ids:
+            if outlet := self._outlets.get(client_id):
+                outlet.transmit(frame, message_id)
+
+    def _make_plan(self, frame: bytes) -> _Plan:
+        if len(self._plans) >= MAX_PLANS:
+            self._plans.clear()
+        plan = _Plan(message_id_of(frame))
+        origin = origin_of(frame)
+        for outlet in self._outlets.values():
+            stamp = outlet.stamp_of(origin)
+            interval_us = outlet.interval_us(origin[0], plan.message_id)
+            lane = _Lane(outlet.client_id, outlet.transmit, stamp, interval_us)
+            if interval_us == NO_MESSAGES:
+                plan.closed.append(stamp)
+            elif interval_us:
+                plan.limited.append(lane)
+            else:
+                plan.open.append(lane)
+        self._plans[key_of(frame)] = plan
+        return plan
+
+
+def _skip(stamp: _Stamp) -> None:
+    stamp.skipped = (stamp.skipped + 1) & SEQUENCE_MASK
+
+
+@lru_cache(maxsize=COPIES)
+def _shifted(frame: bytes, skipped: int) -> bytes:
+    if not skipped:
+        return frame
+    sequence = frame[4] if frame[0] == START_V2 else frame[2]
+    return restamp(frame, (sequence - skipped) & SEQUENCE_MASK)

@@ -1,0 +1,38 @@
+"""Settings of the hub."""
+
+from typing import Annotated
+
+from gateway.routing.endpoint import parse_endpoint
+from gateway.settings import Settings, setting
+
+
+class HubSettings(Settings, frozen=True):
+    """Where MAVLink goes to and comes from."""
+
+    endpoints: Annotated[
+        tuple[str, ...],
+        setting(
+            "Endpoint URLs: udp:HOST:PORT, udp-listen:HOST:PORT, udp-broadcast:HOST:PORT, "
+            "udp-multicast:GROUP:PORT, tcp:HOST:PORT, tcp-listen:HOST:PORT, serial:DEVICE:BAUD; "
+            "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
+        ),
+    ] = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
+    max_clients: Annotated[
+        int,
+        setting("Most clients that a listening endpoint serves at once.", ge=1, le=1000),
+    ] = 32
+    idle_timeout_s: Annotated[
+        float,
+        setting(
+            "A client of a listening UDP port is dropped after this silence. Ground stations "
+            "send a heartbeat every second.",
+            "s",
+            ge=2,
+            le=3600,
+        ),
+    ] = 30.0
+
+    def __post_init__(self) -> None:
+        """Refuse a wrong endpoint when the settings are read, not when they are used."""
+        for url in self.endpoints:
+            parse_endpoint(url)

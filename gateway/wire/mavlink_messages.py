@@ -1,0 +1,47 @@
+"""What a router must know of each MAVLink message: checksum seed, addressee, name.
+
+The widest dialect serves here, since frames of any vehicle pass through; what is not in it is
+forwarded unchecked.
+"""
+
+import struct
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as dialect
+
+PROTOCOL_VERSION_ID: Final = 300
+PROTOCOL_VERSION_CRC_EXTRA: Final = 217
+"""The generated dialects dropped this message; ground stations still ask for it."""
+
+NO_TARGET: Final = -1
+
+
+def _offset_of(message: Any, field: str) -> int:
+    """Find where a one-byte field stands in the payload, or `NO_TARGET`."""
+    offset = 0
+    for name, code, length in zip(
+        message.ordered_fieldnames, message.native_format[1:], message.array_lengths, strict=True
+    ):
+        if name == field:
+            return offset
+        offset += struct.calcsize("<" + chr(code)) * max(1, length)
+    return NO_TARGET
+
+
+CRC_EXTRA: Final[dict[int, bytes]] = {
+    message_id: bytes((message.crc_extra,)) for message_id, message in dialect.mavlink_map.items()
+} | {PROTOCOL_VERSION_ID: bytes((PROTOCOL_VERSION_CRC_EXTRA,))}
+"""The byte that closes each message's checksum, as the checksum function wants it."""
+
+TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
+    message_id: (system, _offset_of(message, "target_component"))
+    for message_id, message in dialect.mavlink_map.items()
+    if (system := _offset_of(message, "target_system")) != NO_TARGET
+}
+"""Payload offsets of target system and target component (`NO_TARGET` if it has none)."""
+
+MESSAGE_NAMES: Final[dict[int, str]] = {
+    message_id: message.msgname for message_id, message in dialect.mavlink_map.items()
+} | {PROTOCOL_VERSION_ID: "PROTOCOL_VERSION"}
+
+MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}

@@ -1,0 +1,199 @@
+"""Frames are cut out byte for byte, whatever surrounds them and however the bytes arrive."""
+
+import random
+
+import pytest
+from pymavlink.dialects.v10 import common as dialect_v1
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import (
+    MAX_FALSE_STARTS,
+    MavlinkSplitter,
+    SplitFault,
+    SplitFaultKind,
+    is_signed,
+    key_of,
+    message_id_of,
+    origin_of,
+    restamp,
+    split_datagram,
+    target_of,
+)
+
+
+def link(system: int = 7, component: int = 1, *, signed: bool = False) -> dialect.MAVLink:
+    sender = dialect.MAVLink(None, system, component)
+    if signed:
+        sender.signing.secret_key = bytes(32)
+        sender.signing.link_id = 1
+        sender.signing.timestamp = 1
+        sender.signing.sign_outgoing = True
+    return sender
+
+
+HEARTBEAT = dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
+COMMAND = dialect.MAVLink_command_long_message(9, 3, 512, 0, 1, 2, 3, 4, 5, 6, 7)
+V2 = bytes(HEARTBEAT.pack(link()))
+V2_SIGNED = bytes(HEARTBEAT.pack(link(signed=True)))
+V2_COMMAND = bytes(COMMAND.pack(link()))
+V1 = bytes(
+    dialect_v1.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(dialect_v1.MAVLink(None, 7, 1))
+)
+UNKNOWN = b"\xfd\x02\x00\x00\x05\x07\x01\xff\xff\x7f\x01\x02\xaa\xbb"
+FRAMES = {
+    "version 2": V2,
+    "signed": V2_SIGNED,
+    "command": V2_COMMAND,
+    "version 1": V1,
+    "unknown": UNKNOWN,
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES.values(), ids=FRAMES.keys())
+class TestOneFrame:
+    def test_datagram_with_one_frame(self, frame: bytes) -> None:
+        assert split_datagram(frame) == [frame]
+
+    def test_stream_whole_and_byte_by_byte(self, frame: bytes) -> None:
+        assert MavlinkSplitter().feed(frame) == [frame]
+        splitter = MavlinkSplitter()
+        events = [event for byte in frame for event in splitter.feed(bytes((byte,)))]
+        assert events == [frame]
+
+    def test_next_frame_follows_at_once(self, frame: bytes) -> None:
+        assert split_datagram(frame + V2) == [frame, V2]
+        assert MavlinkSplitter().feed(frame + V2 + V1[:5]) == [frame, V2]
+
+    def test_garbage_before_is_one_fault(self, frame: bytes) -> None:
+        events = split_datagram(b"hello" + frame)
+        assert events == [SplitFault(SplitFaultKind.GARBAGE, 5), frame]
+
+    def test_a_cut_frame_does_not_swallow_the_next(self, frame: bytes) -> None:
+        checked = len(frame) - 13 if frame is V2_SIGNED else len(frame)
+        for cut in range(1, checked):
+            events = MavlinkSplitter().feed(frame[:cut] + V2_COMMAND + V2 * 30)
+            frames = [event for event in events if isinstance(event, bytes)]
+            assert V2_COMMAND in frames
+            assert frames.count(V2) == 30
+
+
+def test_damaged_frame_is_a_crc_fault() -> None:
+    damaged = V2[:-1] + bytes((V2[-1] ^ 1,))
+    assert split_datagram(damaged) == [SplitFault(SplitFaultKind.CRC, len(V2))]
+
+
+def test_unknown_frame_in_garbage_is_not_believed() -> None:
+    assert split_datagram(UNKNOWN + b"xyz" + V2)[-1] == V2
+    assert UNKNOWN not in split_datagram(UNKNOWN + b"xyz" + V2)
+
+
+def test_unknown_incompatibility_flag_is_refused() -> None:
+    flagged = V2[:2] + b"\x02" + V2[3:]
+    assert all(isinstance(event, SplitFault) for event in split_datagram(flagged))
+
+
+def test_empty_datagram_is_nothing() -> None:
+    assert split_datagram(b"") == []
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_gives_only_genuine_frames_and_counts_every_byte(seed: int) -> None:
+    rng = random.Random(seed)
+    pieces = [V2, V1, V2_SIGNED, V2_COMMAND]
+    sent, data = [], b""
+    for _ in range(50):
+        frame = rng.choice(pieces)
+        data += bytes(rng.choices(range(0xF0), k=rng.randrange(6))) + frame
+        sent.append(frame)
+    splitter, events, position = MavlinkSplitter(), [], 0
+    while position < len(data):
+        size = rng.randrange(1, 40)
+        events += splitter.feed(data[position : position + size])
+        position += size
+    assert [event for event in events if isinstance(event, bytes)] == sent
+    sizes = [event.size if isinstance(event, SplitFault) else len(event) for event in events]
+    assert sum(sizes) == len(data)
+
+
+def test_hostile_datagram_costs_a_bounded_number_of_checksums() -> None:
+    data = (b"\xfe" * 65507)[: -len(V2)] + V2
+    events = split_datagram(data)
+    assert events == [SplitFault(SplitFaultKind.CRC, len(data))]
+    assert len(data) > MAX_FALSE_STARTS
+
+
+def test_reset_forgets_a_half_frame() -> None:
+    splitter = MavlinkSplitter()
+    splitter.feed(V2[:7])
+    splitter.reset()
+    assert splitter.feed(V2) == [V2]
+
+
+@pytest.mark.parametrize("frame", [V2, V1, V2_SIGNED], ids=["v2", "v1", "signed"])
+def test_header_fields(frame: bytes) -> None:
+    assert origin_of(frame) == (7, 1)
+    assert message_id_of(frame) == 0
+    assert target_of(frame) == (0, 0)
+    assert is_signed(frame) == (frame is V2_SIGNED)
+
+
+def test_keys_differ_by_system_component_message_and_version() -> None:
+    others = [
+        bytes(HEARTBEAT.pack(link(8))),
+        bytes(HEARTBEAT.pack(link(7, 2))),
+        V2_COMMAND,
+        V1,
+        V2,
+    ]
+    assert len({key_of(frame) for frame in others}) == len(others)
+
+
+class TestTarget:
+    def test_addressee_of_a_command(self) -> None:
+        assert target_of(V2_COMMAND) == (9, 3)
+
+    def test_cut_zeros_mean_everybody(self) -> None:
+        command = dialect.MAVLink_command_long_message(0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0)
+        assert target_of(bytes(command.pack(link()))) == (0, 0)
+
+    def test_no_component_field(self) -> None:
+        mode = dialect.MAVLink_set_mode_message(9, 1, 77)
+        assert target_of(bytes(mode.pack(link()))) == (9, 0)
+
+    @pytest.mark.parametrize(
+        "name", ["PARAM_REQUEST_LIST", "MISSION_ITEM_INT", "FILE_TRANSFER_PROTOCOL"]
+    )
+    def test_against_pymavlink(self, name: str) -> None:
+        message_class = dialect.mavlink_map[MESSAGE_IDS[name]]
+        values = {
+            field: 5
+            if field == "target_system"
+            else 6
+            if field == "target_component"
+            else [1] * 251
+            if field == "payload"
+            else 1
+            for field in message_class.fieldnames
+        }
+        assert target_of(bytes(message_class(**values).pack(link()))) == (5, 6)
+
+
+class TestRestamp:
+    @pytest.mark.parametrize("frame", [V2, V1, V2_COMMAND], ids=["v2", "v1", "command"])
+    def test_result_is_a_valid_frame_with_the_new_number(self, frame: bytes) -> None:
+        stamped = restamp(frame, 200)
+        assert split_datagram(stamped) == [stamped]
+        decoded = dialect.MAVLink(None).parse_buffer(stamped)[0]
+        assert decoded.get_seq() == 200
+        assert restamp(stamped, frame[4] if frame[0] == 0xFD else frame[2]) == frame
+
+    @pytest.mark.parametrize("frame", [V2_SIGNED, UNKNOWN], ids=["signed", "unknown"])
+    def test_signed_and_unknown_frames_stay(self, frame: bytes) -> None:
+        assert restamp(frame, 200) == frame
+
+
+def test_catalog_knows_the_message_that_the_dialects_dropped() -> None:
+    assert CRC_EXTRA[300] == bytes((217,))
+    assert MESSAGE_NAMES[300] == "PROTOCOL_VERSION"
+    assert MESSAGE_IDS["HEARTBEAT"] == 0
