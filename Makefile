@@ -1,0 +1,46 @@
+# make demo   the gateway on its built-in simulated receiver, until interrupted
+# make test   every test, the firmware's included
+# make lint   formatting, lint and types
+# make lock   write the lock files anew from pyproject.toml
+
+.PHONY: demo test lint lock firmware clean
+
+FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck
+
+demo: .venv/.run
+	.venv/bin/mavgate demo
+
+# Tests that need the AVR tool chain skip, and say so, where it could not be installed.
+test: .venv/.dev
+	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
+	.venv/bin/pytest -q -n 2 --dist loadgroup
+
+lint: .venv/.dev
+	.venv/bin/pre-commit run --all-files
+
+lock: .venv/.dev
+	$(COMPILE) --output-file requirements.lock pyproject.toml
+	$(COMPILE) --all-extras --constraint requirements.lock $(HEADLESS) \
+		--output-file requirements-dev.lock pyproject.toml
+
+COMPILE = .venv/bin/uv pip compile --quiet --upgrade --universal --no-header \
+	--no-emit-index-url --no-emit-find-links --group build
+
+# What MAVProxy draws windows and maps with: half a gigabyte that a test never opens.
+HEADLESS := $(foreach package,opencv-python vtk wxpython quantized-mesh-tile shapely, \
+	--no-emit-package $(package))
+
+firmware:
+	tools/apt_install.sh $(FIRMWARE_PACKAGES)
+	$(MAKE) -C firmware
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+
+.venv/.run: requirements.lock pyproject.toml
+	@tools/set_up.sh requirements.lock
+	@touch $@
+
+.venv/.dev: requirements-dev.lock pyproject.toml
+	@tools/set_up.sh requirements-dev.lock
+	@touch .venv/.run $@
