@@ -53,7 +53,8 @@ class Encoder:
             frame = message.pack(self._mav)
         # pack() leaves the sequence number to its caller.
         self._mav.seq = (self._mav.seq + 1) % 256
-        return Outgoing(frame, message.id, client_id)
+        # Not message.id: HIGHRES_IMU and others have a field of that name.
+        return Outgoing(frame, message.get_msgId(), client_id)
 
 
 def _saturate(message: Any) -> None:

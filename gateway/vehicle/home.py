@@ -1,5 +1,6 @@
 """Where home is: the first good fix of a flight, unless somebody sets it."""
 
+import math
 from dataclasses import dataclass
 
 from gateway.records import GpsFix, GpsFixType
@@ -33,7 +34,10 @@ def is_3d(fix: GpsFix) -> bool:
 
 def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
     """Tell whether a fix may set home; an accuracy that is not known does not forbid it."""
-    return is_3d(fix) and fix.satellites >= satellites and not fix.h_acc_m > accuracy_m
+    # Some receivers vouch for latitude 0, longitude 0 before they know better.
+    somewhere = (fix.lat_dege7, fix.lon_dege7) != (0, 0) and math.isfinite(fix.alt_amsl_m)
+    accurate = fix.satellites >= satellites and not fix.h_acc_m > accuracy_m
+    return is_3d(fix) and somewhere and accurate
 
 
 def place_of(fix: GpsFix) -> Place:

@@ -1,0 +1,45 @@
+import math
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.vehicle.encoder import Encoder
+from tests.vehicle.samples import decode
+
+
+def test_frames_are_numbered_in_one_sequence_per_system() -> None:
+    first, second = Encoder(1), Encoder(2)
+    message = mavlink.MAVLink_ping_message(1, 2, 0, 0)
+    frames = [first.encode(message) for _ in range(300)] + [second.encode(message)]
+    found = decode(frames)
+    assert [m.get_seq() for m in found[:300]] == [n % 256 for n in range(300)]
+    assert (found[300].get_seq(), found[300].get_srcSystem()) == (0, 2)
+    assert {m.get_srcComponent() for m in found} == {1}
+
+
+def test_frames_are_mavlink_2_and_cut_short() -> None:
+    frame = Encoder(1).encode(mavlink.MAVLink_ping_message(7, 0, 0, 0), client_id=9)
+    assert frame.frame[0] == 0xFD
+    assert frame.frame[1] == 1
+    assert (frame.message_id, frame.client_id) == (4, 9)
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, 1e300, -1e300, math.nan])
+def test_no_number_stops_the_telemetry(value: float) -> None:
+    huge = 10**30 if value > 0 else -(10**30)
+    message = mavlink.MAVLink_global_position_int_message(*[huge] * 9)
+    [found] = decode([Encoder(1).encode(message)])
+    assert found.lat == (2**31 - 1 if value > 0 else -(2**31))
+    assert found.hdg == (65535 if value > 0 else 0)
+    [hud] = decode([Encoder(1).encode(mavlink.MAVLink_vfr_hud_message(*[value] * 6))])
+    assert math.isnan(hud.alt) if math.isnan(value) else abs(hud.alt) > 3e38
+
+
+def test_arrays_are_saturated_item_by_item() -> None:
+    message = mavlink.MAVLink_home_position_message(
+        0, 0, 0, 0.0, 0.0, 0.0, [1e300, -1e300, 0.5, math.nan], 0.0, 0.0, 0.0
+    )
+    [found] = decode([Encoder(1).encode(message)])
+    assert found.q[0] == pytest.approx(3.4028234e38)
+    assert found.q[1] == pytest.approx(-3.4028234e38)
+    assert found.q[2] == 0.5

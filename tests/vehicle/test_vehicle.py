@@ -1,0 +1,204 @@
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import NavFlags, Outgoing
+from gateway.vehicle.settings import RateSettings, VehicleSettings
+from gateway.vehicle.vehicle import Vehicle
+from tests.vehicle.samples import (
+    BARO,
+    GPS_NODE,
+    NO_FIX,
+    NOTHING,
+    decode,
+    fix_at,
+    link,
+    names,
+    report,
+    sample_at,
+    state_at,
+    texts,
+)
+
+ONE_S = 1_000_000
+
+
+def make(**changes: Any) -> Vehicle:
+    return Vehicle(VehicleSettings(**changes), system_id=1)
+
+
+def fly(vehicle: Vehicle, start_s: int, seconds: int, **state: Any) -> list[Outgoing]:
+    """Feed IMU at 200 Hz, GPS at 5 Hz and the barometer at 20 Hz, polling as asked to."""
+    found = []
+    for time_us in range(start_s * ONE_S, (start_s + seconds) * ONE_S, 5_000):
+        found += vehicle.on_state(state_at(time_us, **state), sample_at(time_us), time_us)
+        if time_us % 50_000 == 0:
+            found += vehicle.on_baro(replace(BARO, time_us=time_us), time_us)
+        if time_us % 200_000 == 0:
+            found += vehicle.on_gps(fix_at(time_us), time_us)
+        if vehicle.next_due_us() <= time_us:
+            found += vehicle.poll(time_us)
+    return found
+
+
+def test_every_message_at_its_own_rate() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    counted = Counter(names(fly(vehicle, 2, 10)))
+    expected = {
+        "ATTITUDE_QUATERNION": 500,
+        "ATTITUDE": 500,
+        "GLOBAL_POSITION_INT": 100,
+        "VFR_HUD": 100,
+        "HIGHRES_IMU": 100,
+        "GPS_RAW_INT": 50,
+        "SCALED_PRESSURE": 50,
+        "SYS_STATUS": 20,
+        "EXTENDED_SYS_STATE": 20,
+        "HEARTBEAT": 10,
+        "SYSTEM_TIME": 10,
+        "HOME_POSITION": 10,
+        "ESTIMATOR_STATUS": 10,
+        "RADIO_STATUS": 10,
+    }
+    assert {name: counted[name] for name in expected} == pytest.approx(expected, abs=1)
+
+
+def test_a_rate_of_zero_is_silence() -> None:
+    vehicle = make(rates=RateSettings(attitude_hz=0.0, gps_raw_int_hz=0.0, sys_status_hz=0.0))
+    found = set(names(fly(vehicle, 0, 2)))
+    assert not found & {"ATTITUDE", "GPS_RAW_INT", "SYS_STATUS"}
+
+
+def test_attitude_goes_on_without_any_position_and_no_place_is_made_up() -> None:
+    vehicle = make()
+    found = []
+    for time_us in range(0, 10 * ONE_S, 5_000):
+        state = replace(NOTHING, time_us=time_us)
+        found += vehicle.on_state(state, sample_at(time_us, mag_b_ut=None), time_us)
+        found += vehicle.poll(time_us)
+    counted = Counter(names(found))
+    assert counted["ATTITUDE_QUATERNION"] == pytest.approx(500, abs=1)
+    assert counted["VFR_HUD"] == pytest.approx(100, abs=1)
+    assert not {"GLOBAL_POSITION_INT", "HOME_POSITION"} & set(counted)
+    assert counted["GPS_RAW_INT"] == counted["HEARTBEAT"] == 10
+    gps = [m for m in decode(found) if m.get_type() == "GPS_RAW_INT"]
+    assert {m.fix_type for m in gps} == {mavlink.GPS_FIX_TYPE_NO_GPS}
+
+
+def test_position_goes_on_while_dead_reckoned() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    flags = NavFlags.ATTITUDE_VALID | NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
+    found = []
+    for time_us in range(2 * ONE_S, 12 * ONE_S, 5_000):
+        found += vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)
+    assert names(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
+
+
+def test_home_is_the_first_good_fix() -> None:
+    vehicle = make()
+    vehicle.on_gps(replace(NO_FIX, time_us=0), 0)
+    vehicle.on_gps(fix_at(200_000, satellites=5), 200_000)
+    vehicle.on_gps(fix_at(400_000, h_acc_m=20.0), 400_000)
+    vehicle.on_gps(fix_at(500_000, lat_dege7=0, lon_dege7=0), 500_000)
+    assert vehicle.telemetry.home is None
+    found = vehicle.on_gps(fix_at(600_000), 600_000)
+    [home] = [m for m in decode(found) if m.get_type() == "HOME_POSITION"]
+    assert (home.latitude, home.longitude, home.altitude) == (471_234_567, -87_654_321, 520_250)
+    assert "Home set by GPS" in texts(found)
+    found = vehicle.on_gps(fix_at(800_000, lat_dege7=0), 800_000)
+    assert "HOME_POSITION" not in names(found)
+
+
+def test_relative_altitude_refers_to_home() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    found = [m for m in decode(fly(vehicle, 2, 1)) if m.get_type() == "GLOBAL_POSITION_INT"]
+    assert {m.relative_alt for m in found} == {523_456 - 520_250}
+
+
+@pytest.mark.parametrize(
+    ("rule", "recording", "speed", "armed"),
+    [
+        ("flying", True, 0.0, False),
+        ("flying", False, 20.0, True),
+        ("recording", True, 0.0, True),
+        ("recording", False, 20.0, False),
+        ("flying_or_recording", True, 0.0, True),
+        ("flying_or_recording", False, 20.0, True),
+        ("flying_or_recording", False, 0.0, False),
+        ("always", False, 0.0, True),
+        ("never", True, 20.0, False),
+    ],
+)
+def test_the_armed_bit_follows_the_rule(
+    rule: str, recording: bool, speed: float, armed: bool
+) -> None:
+    vehicle = make(armed_when=rule)
+    vehicle.set_recording(recording)
+    found = fly(vehicle, 0, 4, vel_n_mps=(speed, 0.0, 0.0), alt_amsl_m=521.0)
+    last = [m for m in decode(found) if m.get_type() == "HEARTBEAT"][-1]
+    assert bool(last.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED) is armed
+    assert last.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
+    assert last.type == mavlink.MAV_TYPE_FIXED_WING
+    flying = speed > 0.0
+    expected = mavlink.MAV_STATE_ACTIVE if flying else mavlink.MAV_STATE_STANDBY
+    assert last.system_status == expected
+
+
+def test_heartbeats_go_on_when_everything_is_silent() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    found = [o for now in range(2 * ONE_S, 12 * ONE_S, 20_000) for o in vehicle.poll(now)]
+    beats = [m for m in decode(found) if m.get_type() == "HEARTBEAT"]
+    assert len(beats) == 10
+    assert beats[-1].system_status == mavlink.MAV_STATE_CRITICAL
+    assert "GPS fix lost" in texts(found)
+
+
+def test_link_and_nodes_are_told() -> None:
+    vehicle = make()
+    both = link(), link(GPS_NODE)
+    assert texts(vehicle.on_link(report(*both), ONE_S)) == ["Receiver connected: /dev/ttyUSB0"]
+    found = vehicle.on_link(report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), 9 * ONE_S)
+    assert texts(found) == ["Node 1 silent"]
+    found = vehicle.on_link(report(*both, connected=False), 20 * ONE_S)
+    assert texts(found) == ["Receiver lost: /dev/ttyUSB0"]
+    alive = link(last_time_us=30 * ONE_S), link(GPS_NODE, last_time_us=30 * ONE_S)
+    found = vehicle.on_link(report(*alive), 30 * ONE_S)
+    assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "Node 1 is back"]
+
+
+def test_flags_of_the_estimator_are_told_and_cannot_flood() -> None:
+    vehicle = make()
+    told = texts(fly(vehicle, 0, 2))
+    assert {"Attitude valid", "Heading valid", "GPS fix"} <= set(told)
+    flood = []
+    for n in range(2000):
+        time_us = 2 * ONE_S + n * 5_000
+        flags = NavFlags.MAG_DISTURBED if n % 2 else NavFlags(0)
+        state = state_at(time_us, flags=state_at(0).flags | flags)
+        flood += vehicle.on_state(state, sample_at(time_us), time_us)
+    assert "Magnetic field disturbed" in texts(flood)
+    assert len(texts(flood)) <= 4
+
+
+def test_system_time_follows_gps() -> None:
+    vehicle = make()
+    before = [m for m in decode(vehicle.poll(0)) if m.get_type() == "SYSTEM_TIME"]
+    assert before[0].time_unix_usec == 0
+    vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
+    after = [m for m in decode(vehicle.poll(3 * ONE_S)) if m.get_type() == "SYSTEM_TIME"]
+    assert after[0].time_unix_usec == 1_790_000_002_000_000
+
+
+def test_two_aircraft_keep_apart() -> None:
+    one, two = make(), Vehicle(VehicleSettings(), system_id=2)
+    fly(one, 0, 2)
+    found = decode(two.poll(0))
+    assert {m.get_srcSystem() for m in found} == {2}
+    assert two.telemetry.home is None
