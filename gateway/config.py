@@ -131,18 +131,31 @@ def _load(path: Path, kind: type[Kind]) -> Kind:
 
 def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Iterator[str]:
     fields = {field.name: field for field in fields_of(kind)}
+    sound = True
     for key, value in table.items():
-        path = f"{prefix}{key}"
-        field = fields.get(key)
-        if field is None:
-            yield _unknown_key(path, key, fields)
-        elif field.section and isinstance(value, dict):
-            yield from _check(value, field.section, f"{path}.")
-        else:
-            try:
-                msgspec.convert(value, field.type)
-            except msgspec.ValidationError as error:
-                yield _wrong_value(path, value, field, error)
+        for error in _check_key(key, value, fields, prefix):
+            sound = False
+            yield error
+    if sound:
+        # Key by key it is right; what is left is a rule between several keys.
+        try:
+            msgspec.convert(table, kind)
+        except msgspec.ValidationError as error:
+            yield f"{prefix.rstrip('.')}: {str(error).partition(' - at `$')[0]}"
+
+
+def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -> Iterator[str]:
+    path = f"{prefix}{key}"
+    field = fields.get(key)
+    if field is None:
+        yield _unknown_key(path, key, fields)
+    elif field.section and isinstance(value, dict):
+        yield from _check(value, field.section, f"{path}.")
+    else:
+        try:
+            msgspec.convert(value, field.type)
+        except msgspec.ValidationError as error:
+            yield _wrong_value(path, value, field, error)
 
 
 def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
