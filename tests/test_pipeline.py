@@ -1,0 +1,139 @@
+"""The stages joined: bytes in, actions out, several aircraft, a source that comes and goes."""
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import Action, Pipeline, PipelineSettings
+from gateway.records import FusedSample, GpsFixType, ImuFlags, NodeId, Outgoing
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings
+from gateway.vehicle.settings import VehicleSettings
+from gateway.wire import payloads
+from gateway.wire.framing import encode_frame
+
+LEVEL = payloads.ImuPayload(
+    accel=(0, 0, 4096),
+    gyro=(0, 0, 0),
+    mag=(218, 0, 431),
+    temperature=-3920,
+    flags=ImuFlags.MAG_NEW,
+    accel_range=2,
+    gyro_range=2,
+    mag_gain=1,
+)
+FIX = payloads.GpsFixPayload(
+    1000, -77_656_000, 1_103_728_000, 110_000, (0, 0, 0), GpsFixType.FIX_3D, True, 12
+)
+QUALITY = payloads.GpsQualityPayload(1000, 120, 200, 20, 500, 110, 2_300, None)
+
+
+class Tracker:
+    """One aircraft's nodes and the receiver's framing of them."""
+
+    def __init__(self, vehicle_id: int = 1) -> None:
+        self.vehicle_id = vehicle_id
+        self.seq = [0, 0]
+
+    def frame(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
+        header = payloads.Header(NodeId(self.vehicle_id, node), self.seq[node], time_us)
+        self.seq[node] += 1
+        packet = payloads.encode_payload(header, payload)
+        return encode_frame(payloads.encode_radio(0, node, time_us, packet))
+
+
+@pytest.fixture
+def pipeline() -> Pipeline:
+    tilted = NodeCalibration(mounting=((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
+    settings = PipelineSettings(
+        SensingSettings(), EstimationSettings(), VehicleSettings(), {2: tilted}
+    )
+    return Pipeline(settings)
+
+
+def decode(actions: list[Action]) -> list[mavlink.MAVLink_message]:
+    parser = mavlink.MAVLink(None)
+    frames = [action.frame for action in actions if isinstance(action, Outgoing)]
+    return [parser.decode(bytearray(frame)) for frame in frames]
+
+
+def named(actions: list[Action], name: str) -> list[mavlink.MAVLink_message]:
+    return [message for message in decode(actions) if message.get_type() == name]
+
+
+def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
+    actions = pipeline.feed(Tracker().frame(0, LEVEL), 5_000)
+    (message,) = named(actions, "ATTITUDE_QUATERNION")
+    assert message.get_srcSystem() == 1
+    assert message.time_boot_ms == 5
+    (attitude,) = named(actions, "ATTITUDE")
+    assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_frames_are_sent_before_the_sample_is_recorded(pipeline: Pipeline) -> None:
+    actions = pipeline.feed(Tracker().frame(0, LEVEL), 5_000)
+    assert isinstance(actions[-1], FusedSample)
+    assert all(isinstance(action, Outgoing) for action in actions[:-1])
+
+
+def test_fused_sample_carries_all_that_went_in_once(pipeline: Pipeline) -> None:
+    tracker = Tracker()
+    pipeline.feed(tracker.frame(0, payloads.BaroPayload(10_000_000, 250)), 0)
+    pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
+    first, second = (
+        action
+        for time_us in (10_000, 20_000)
+        for action in pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
+        if isinstance(action, FusedSample)
+    )
+    assert first.baro is not None
+    assert first.baro.pressure_pa == 100_000.0
+    assert first.gps is not None
+    assert first.gps.h_acc_m == pytest.approx(1.2)
+    assert (second.baro, second.gps) == (None, None)
+    assert first.state.lat_deg == pytest.approx(-7.7656)
+
+
+def test_two_aircraft_are_two_systems_with_their_own_calibration(pipeline: Pipeline) -> None:
+    nose_up = payloads.ImuPayload(
+        (2048, 0, 3547), (0, 0, 0), (0, 0, 0), 0, ImuFlags.MAG_ABSENT, 2, 2, 1
+    )
+    attitudes = {}
+    for vehicle_id in (1, 2):
+        actions = pipeline.feed(Tracker(vehicle_id).frame(0, nose_up), 0)
+        (message,) = named(actions, "ATTITUDE")
+        attitudes[message.get_srcSystem()] = (message.roll, message.pitch)
+    assert attitudes[1] == pytest.approx((0.0, 0.5236), abs=2e-3)
+    assert attitudes[2] == pytest.approx((-0.5236, 0.0), abs=2e-3)
+
+
+def test_heartbeats_keep_coming_while_the_receiver_is_away(pipeline: Pipeline) -> None:
+    pipeline.feed(Tracker().frame(0, LEVEL), 0)
+    pipeline.disconnect("/dev/ttyUSB0")
+    beats = [
+        len(named(pipeline.poll(time_us), "HEARTBEAT")) for time_us in range(0, 10_000_000, 50_000)
+    ]
+    assert 9 <= sum(beats) <= 11
+
+
+def test_loss_of_the_receiver_is_told(pipeline: Pipeline) -> None:
+    pipeline.connect("/dev/ttyUSB0")
+    pipeline.feed(Tracker().frame(0, LEVEL), 0)
+    pipeline.poll(1_000)
+    pipeline.disconnect("/dev/ttyUSB0")
+    texts = [
+        message.text
+        for time_us in range(1_000_000, 10_000_000, 100_000)
+        for message in named(pipeline.poll(time_us), "STATUSTEXT")
+    ]
+    assert sum("/dev/ttyUSB0" in text for text in texts) == 1
+    assert not pipeline.report.connected
+
+
+def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> None:
+    assert pipeline.poll(0) == []
+    assert pipeline.next_due_us() == 1_000_000
+    pipeline.feed(b"\x05garbage\x00" * 100, 0)
+    assert pipeline.aircraft == {}
+    assert pipeline.poll(1_000_000) == []
+    assert dict(pipeline.report.faults)
