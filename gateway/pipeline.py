@@ -37,7 +37,8 @@ from gateway.wire.link import Link
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
-Action = Outgoing | FusedSample
+Action = Outgoing | FusedSample | BaroRaw | GpsFix
+"""Frames to send, and what a recording keeps, in the order in which the estimator took it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +62,6 @@ class Aircraft:
         self.vehicle = Vehicle(settings.vehicle, vehicle_id)
         self._chain = SensorChain(settings.sensing, calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
-        self._baro: BaroRaw | None = None
-        self._fix: GpsFix | None = None
 
     def take(self, record: RawRecord, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
@@ -70,22 +69,19 @@ class Aircraft:
             case ImuRaw():
                 return self._take_imu(record, now_us)
             case BaroRaw():
-                self._baro = record
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
-                return [*self.vehicle.on_baro(baro, now_us)]
+                return [*self.vehicle.on_baro(baro, now_us), record]
             case GpsFix():
-                self._fix = record
                 self._estimator.update_gps(record)
-                return [*self.vehicle.on_gps(record, now_us)]
+                return [*self.vehicle.on_gps(record, now_us), record]
             case NodeStatus():
                 return [*self.vehicle.on_node_status(record, now_us)]
 
     def _take_imu(self, raw: ImuRaw, now_us: int) -> list[Action]:
         sample = self._chain.imu(raw)
         self.state = self._estimator.update_imu(sample)
-        fused = FusedSample(self.vehicle_id, raw, sample, self._baro, self._fix, self.state)
-        self._baro = self._fix = None
+        fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
         return [*self.vehicle.on_state(self.state, sample, now_us), fused]
 

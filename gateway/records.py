@@ -233,15 +233,15 @@ class NavState:
 
 @dataclass(frozen=True, slots=True)
 class FusedSample:
-    """One IMU sample with all that went into its state: what a recording keeps of it."""
+    """One IMU sample and the state it led to.
+
+    With the `BaroRaw` and `GpsFix` records that came between two of these, in their order, it is
+    all that a recording needs to be fused again to the same bits.
+    """
 
     vehicle_id: int
     imu: ImuRaw
     sample: ImuSample
-    baro: BaroRaw | None
-    """The barometer payload since the previous IMU sample, if any."""
-    gps: GpsFix | None
-    """The fix since the previous IMU sample, if any."""
     state: NavState
 
 

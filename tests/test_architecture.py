@@ -20,7 +20,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sensing": FOUNDATION,
     "estimation": FOUNDATION,
     "vehicle": FOUNDATION,
-    "flightlog": FOUNDATION,
+    "flightlog": FOUNDATION | {"wire"},
     "routing": FOUNDATION | {"wire"},
     "simulator": FOUNDATION | {"wire"},
     "pipeline": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},

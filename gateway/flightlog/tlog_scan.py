@@ -1,0 +1,200 @@
+"""Find the records of a tlog in bytes, at memory speed.
+
+Theory of operation. A tlog is a row of records: eight bytes of time, most significant first, then
+one MAVLink frame, whose own length byte tells where the next record begins. While the file is
+sound, each record is confirmed by the look of the next one, and no checksum is needed:
+
+| state     | the record here                                      | what is done                |
+| --------- | ---------------------------------------------------- | --------------------------- |
+| in step   | is followed by another record's header or the end    | kept                        |
+| in step   | is not, but its checksum holds                       | kept: the damage comes next |
+| in step   | neither                                              | damage begins: out of step  |
+| out of step | has a good checksum, or (unknown message) a successor | kept: in step again      |
+| out of step | has not                                            | one byte on                 |
+
+A header is a time before the year 4253 (its first byte is zero) followed by a frame's first byte.
+A strict scan checks every checksum, also in step.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.compiled import compiled
+from gateway.wire.mavlink_messages import CRC_EXTRA
+
+ByteArray = NDArray[np.uint8]
+IntArray = NDArray[np.int64]
+ExtraArray = NDArray[np.int16]
+
+TIME_SIZE: Final = 8
+HEADER_SIZE: Final = 9
+"""The time and the frame's first byte: what is looked at of the next record."""
+SMALLEST_RECORD: Final = 16
+LARGEST_RECORD: Final = 8 + 12 + 255 + 13
+
+COLUMNS: Final = 5
+"""Start, size of the frame, time in µs, origin (system << 8 | component), message id."""
+
+_KNOWN_IDS: Final = 1 << 16
+_UNKNOWN: Final = -1
+_YES: Final = 1
+_NO: Final = 0
+_WAIT: Final = -1
+
+
+def crc_extra_table() -> ExtraArray:
+    """Lay the messages' checksum seeds out as an array by message id, -1 where unknown."""
+    table = np.full(_KNOWN_IDS, _UNKNOWN, np.int16)
+    for message_id, extra in CRC_EXTRA.items():
+        if message_id < _KNOWN_IDS:
+            table[message_id] = extra[0]
+    return table
+
+
+@compiled
+def _is_header(data: ByteArray, at: int, final: bool) -> int:
+    if at + HEADER_SIZE > data.size:
+        return _NO if final else _WAIT
+    first = data[at + TIME_SIZE]
+    return _YES if data[at] == 0 and (first == 0xFD or first == 0xFE) else _NO
+
+
+@compiled
+def _frame_size(data: ByteArray, at: int) -> int:
+    """Tell a frame's size from its first three bytes; 0 for flags nobody knows."""
+    if data[at] == 0xFE:
+        return int(data[at + 1]) + 8
+    flags = data[at + 2]
+    if flags > 1:
+        return 0
+    return int(data[at + 1]) + 12 + 13 * int(flags)
+
+
+@compiled
+def _message_id(data: ByteArray, at: int) -> int:
+    if data[at] == 0xFE:
+        return int(data[at + 5])
+    return int(data[at + 7]) | int(data[at + 8]) << 8 | int(data[at + 9]) << 16
+
+
+@compiled
+def _crc_step(crc: int, byte: int) -> int:
+    """CRC-16/MCRF4XX, one byte, without a table."""
+    tmp = (byte ^ crc) & 0xFF
+    tmp = (tmp ^ (tmp << 4)) & 0xFF
+    return (crc >> 8) ^ (tmp << 8) ^ (tmp << 3) ^ (tmp >> 4)
+
+
+@compiled
+def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
+    """Tell whether a complete frame's checksum holds: yes, no, or an unknown message."""
+    message_id = _message_id(data, at)
+    seed = int(extra[message_id]) if message_id < extra.size else -1
+    if seed < 0:
+        return _WAIT
+    end = at + int(data[at + 1]) + (6 if data[at] == 0xFE else 10)
+    crc = 0xFFFF
+    for i in range(at + 1, end):
+        crc = _crc_step(crc, int(data[i]))
+    crc = _crc_step(crc, seed)
+    return _YES if crc == int(data[end]) | int(data[end + 1]) << 8 else _NO
+
+
+@compiled
+def _judge(
+    data: ByteArray, at: int, final: bool, strict: bool, in_step: bool, extra: ExtraArray
+) -> int:
+    """Return the size of the frame of the record at `at`, 0 for none, -1 if more must be seen."""
+    header = _is_header(data, at, final)
+    if header != _YES:
+        return header
+    frame = at + TIME_SIZE
+    if frame + 3 > data.size:
+        return 0 if final else _WAIT
+    size = _frame_size(data, frame)
+    following = frame + size
+    if size == 0:
+        return 0
+    if following > data.size:
+        return 0 if final else _WAIT
+    successor = _is_header(data, following, final)
+    if successor == _WAIT:
+        return _WAIT
+    if in_step and not strict and (successor == _YES or following == data.size):
+        return size
+    checksum = _checksum(data, frame, extra)
+    if checksum == _YES:
+        return size
+    return size if checksum == _WAIT and (successor == _YES or in_step) else 0
+
+
+@compiled
+def scan(
+    data: ByteArray,
+    final: bool,
+    strict: bool,
+    in_step: bool,
+    extra: ExtraArray,
+    records: IntArray,
+    damage: IntArray,
+) -> tuple[int, int, int, bool]:
+    """Walk over bytes that begin at a record, or anywhere when out of step.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        The bytes.
+    final : bool
+        Whether the file ends here; otherwise the last, undecided bytes are left over.
+    strict : bool
+        Check every checksum.
+    in_step : bool
+        Whether a record is known to begin at the first byte.
+    extra : ndarray, shape (n,)
+        From `crc_extra_table`.
+    records : ndarray, shape (COLUMNS, m)
+        Filled; `m` at least `data.size // SMALLEST_RECORD + 1`.
+    damage : ndarray, shape (2, m + 1)
+        Filled with begin and end of each run of bytes that belong to no record.
+
+    Returns
+    -------
+    position : int
+        First byte that was not consumed.
+    count, damaged : int
+        Columns filled of `records` and of `damage`.
+    in_step : bool
+        To be handed to the next call.
+    """
+    at = count = damaged = 0
+    bad_from = -1
+    while at < data.size:
+        size = _judge(data, at, final, strict, in_step, extra)
+        if size == _WAIT:
+            break
+        if size == 0:
+            bad_from = at if bad_from < 0 else bad_from
+            in_step = False
+            at += 1
+            continue
+        if bad_from >= 0:
+            damage[0, damaged], damage[1, damaged] = bad_from, at
+            damaged += 1
+            bad_from = -1
+        frame = at + TIME_SIZE
+        time_us = 0
+        for i in range(at, frame):
+            time_us = time_us << 8 | int(data[i])
+        origin = frame + (3 if data[frame] == 0xFE else 5)
+        records[0, count], records[1, count], records[2, count] = at, size, time_us
+        records[3, count] = int(data[origin]) << 8 | int(data[origin + 1])
+        records[4, count] = _message_id(data, frame)
+        count += 1
+        in_step = True
+        at = frame + size
+    if bad_from >= 0:
+        damage[0, damaged], damage[1, damaged] = bad_from, at
+        damaged += 1
+    return (at, count, damaged, in_step)
