@@ -11,7 +11,7 @@ from gateway.edges.clock import GatewayClock
 from gateway.edges.hub import Hub
 from gateway.edges.serial_link import SerialLink
 from gateway.pipeline import Action, Pipeline, PipelineSettings
-from gateway.records import FusedSample, Incoming, Outgoing
+from gateway.records import BaroRaw, FusedSample, GpsFix, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
@@ -98,5 +98,5 @@ class Daemon:
                 case Outgoing():
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
-                case FusedSample():
+                case FusedSample() | BaroRaw() | GpsFix():
                     pass

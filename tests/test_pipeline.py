@@ -1,11 +1,13 @@
 """The stages joined: bytes in, actions out, several aircraft, a source that comes and goes."""
 
+import math
+
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Action, Pipeline, PipelineSettings
-from gateway.records import FusedSample, GpsFixType, ImuFlags, NodeId, Outgoing
+from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, NodeId, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.settings import VehicleSettings
@@ -76,22 +78,21 @@ def test_frames_are_sent_before_the_sample_is_recorded(pipeline: Pipeline) -> No
     assert all(isinstance(action, Outgoing) for action in actions[:-1])
 
 
-def test_fused_sample_carries_all_that_went_in_once(pipeline: Pipeline) -> None:
+def test_records_come_out_in_the_order_of_their_fusion(pipeline: Pipeline) -> None:
     tracker = Tracker()
-    pipeline.feed(tracker.frame(0, payloads.BaroPayload(10_000_000, 250)), 0)
-    pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
-    first, second = (
-        action
-        for time_us in (10_000, 20_000)
-        for action in pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
-        if isinstance(action, FusedSample)
-    )
-    assert first.baro is not None
-    assert first.baro.pressure_pa == 100_000.0
-    assert first.gps is not None
-    assert first.gps.h_acc_m == pytest.approx(1.2)
-    assert (second.baro, second.gps) == (None, None)
-    assert first.state.lat_deg == pytest.approx(-7.7656)
+    actions = pipeline.feed(tracker.frame(0, LEVEL), 0)
+    actions += pipeline.feed(tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250)), 5_000)
+    actions += pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 8_000)
+    actions += pipeline.feed(tracker.frame(10_000, LEVEL), 10_000)
+    first, baro, fix, second = (a for a in actions if not isinstance(a, Outgoing))
+    assert isinstance(first, FusedSample)
+    assert isinstance(baro, BaroRaw)
+    assert isinstance(fix, GpsFix)
+    assert isinstance(second, FusedSample)
+    assert baro.pressure_pa == 100_000.0
+    assert fix.h_acc_m == pytest.approx(1.2)
+    assert math.isnan(first.state.lat_deg)
+    assert second.state.lat_deg == pytest.approx(-7.7656)
 
 
 def test_two_aircraft_are_two_systems_with_their_own_calibration(pipeline: Pipeline) -> None:
