@@ -1,0 +1,120 @@
+"""The live view: what an operator reads, and that nothing unknown looks like a figure."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from gateway.edges.live_view import LiveView, summary_line
+from gateway.geometry.quaternion import from_euler
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    LinkReport,
+    NavFlags,
+    NavState,
+    NodeId,
+    NodeLink,
+    PipeCounters,
+    ReceiverStatus,
+)
+from gateway.routing.clients import ClientStats
+from gateway.status import Snapshot
+
+NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
+RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)
+REPORT = LinkReport(
+    10_000_000, True, "/dev/ttyUSB0", 40_000, 1000, 2, (("crc", 7),), (NODE,), RECEIVER
+)
+FLYING = NavState(
+    time_us=9_990_000,
+    q_nb=from_euler(math.radians(-12.0), math.radians(3.0), math.radians(-90.0)),
+    rate_b_radps=(0.0, 0.0, 0.0),
+    lat_deg=-7.765612,
+    lon_deg=110.372834,
+    alt_amsl_m=171.5,
+    vel_n_mps=(3.0, -4.0, -1.5),
+    attitude_std_rad=UNKNOWN_VEC3,
+    vel_std_mps=UNKNOWN_VEC3,
+    pos_std_m=UNKNOWN_VEC3,
+    flags=NavFlags.ATTITUDE_VALID | NavFlags.POSITION_VALID | NavFlags.GPS_REJECTED,
+)
+LOST = replace(FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3)
+CLIENT = ClientStats(
+    client_id=1,
+    name="",
+    endpoint="udp:127.0.0.1:14550",
+    remote="127.0.0.1:14550",
+    state="open",
+    trusted=True,
+    systems=((255, 190),),
+    sent=1200,
+    dropped=3,
+    bytes_sent=50_000,
+    received=9,
+    bytes_received=200,
+    bytes_garbage=0,
+    queued=0,
+    since_us=0,
+    heard_us=9_500_000,
+    round_trip_us=None,
+)
+SNAPSHOT = Snapshot(10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)))
+
+
+def text_of(*snapshots: Snapshot) -> str:
+    view = LiveView()
+    for snapshot in snapshots:
+        drawn = view.draw(snapshot)
+    console = Console(width=100, no_color=True)
+    with console.capture() as captured:
+        console.print(drawn)
+    return captured.get()
+
+
+def test_link_node_aircraft_and_client_are_shown() -> None:
+    text = text_of(SNAPSHOT)
+    for part in (
+        "/dev/ttyUSB0 connected",
+        "1000 frames, 2 lost on the line, 7 crc faults",
+        "channel 76, noise 4 %",
+        "1.0",
+        "1.00",
+        "-12.0",
+        "270.0",
+        "-7.765612",
+        "5.0",
+        "+1.5",
+        "GPS rejected",
+        "127.0.0.1:14550",
+    ):
+        assert part in text
+
+
+def test_rates_are_those_since_the_previous_view() -> None:
+    later = replace(SNAPSHOT, time_us=12_000_000, sent=((0, 12), (31, 600)))
+    text = text_of(SNAPSHOT, later)
+    assert "ATTITUDE_QUATERNION" in text
+    assert "50.0" in text
+    assert "1.0" in text
+
+
+@pytest.mark.parametrize("word", ["nan", "None"])
+def test_unknown_is_a_dash(word: str) -> None:
+    assert word not in text_of(replace(SNAPSHOT, states=((1, LOST),)))
+    assert word not in summary_line(replace(SNAPSHOT, states=((1, LOST),)))
+
+
+def test_an_empty_gateway_can_be_drawn() -> None:
+    report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
+    text = text_of(Snapshot(0, report, (), (), ()))
+    assert "auto not connected" in text
+    assert "no aircraft heard yet" in text
+
+
+def test_summary_line() -> None:
+    assert summary_line(SNAPSHOT) == (
+        "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
+        "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 clients"
+    )
