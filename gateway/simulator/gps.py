@@ -1,0 +1,189 @@
+"""The u-blox M8N: five fixes a second, late, wandering, and sometimes none."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from gateway.geometry.geodesy import radii_m
+from gateway.records import GpsFixType
+from gateway.simulator.noise import FloatArray, Wander, White
+from gateway.simulator.sensors import BoolArray, IntArray
+from gateway.simulator.settings import GpsOutages, SimulatorSettings
+from gateway.simulator.trajectory import FLIGHT_S, Trajectory
+
+GPS_RATE_HZ: Final = 5
+EPOCH_US: Final = 1_000_000 // GPS_RATE_HZ
+TIME_KNOWN_EARLIER_S: Final = 2.0
+"""The time is known from fewer satellites than a fix, so this much sooner."""
+
+POSITION_WANDER_M: Final[FloatArray] = np.array([0.8, 0.8, 1.5])
+POSITION_NOISE_M: Final[FloatArray] = np.array([0.10, 0.10, 0.20])
+VELOCITY_WANDER_MPS: Final[FloatArray] = np.array([0.04, 0.04, 0.08])
+VELOCITY_NOISE_MPS: Final[FloatArray] = np.array([0.05, 0.05, 0.10])
+WANDER_S: Final = 45.0
+VELOCITY_WANDER_S: Final = 4.0
+
+SATELLITES: Final = 14.0
+SATELLITES_SPREAD: Final = 1.2
+H_ACC_M: Final = 1.2
+V_ACC_M: Final = 1.8
+SPEED_ACC_MPS: Final = 0.12
+PDOP: Final = 1.4
+BLIND: Final = 99.99
+"""What the receiver reports of a fix that it does not have."""
+SETTLING_S: Final = 3.0
+"""Accuracies come back to their usual values this fast after an outage."""
+SETTLING_FACTOR: Final = 4.0
+
+GPS_EPOCH_UNIX_US: Final = 315_964_800_000_000
+LEAP_US: Final = 18_000_000
+WEEK_MS: Final = 604_800_000
+
+
+@dataclass(frozen=True, slots=True)
+class GpsSamples:
+    """N messages of the GPS receiver; arrays of shape (N,) or (N, 3)."""
+
+    time_s: FloatArray
+    """Arrival at the node, true time since the start."""
+    valid_time_s: FloatArray
+    """When the fix was true; earlier than `time_s` by the latency."""
+    itow_ms: IntArray
+    unix_us: IntArray
+    """UTC of the fix."""
+    time_valid: BoolArray
+    has_fix: BoolArray
+    satellites: IntArray
+    lat_deg: FloatArray
+    lon_deg: FloatArray
+    alt_amsl_m: FloatArray
+    vel_n_mps: FloatArray
+    h_acc_m: FloatArray
+    v_acc_m: FloatArray
+    speed_acc_mps: FloatArray
+    course_acc_deg: FloatArray
+    pdop: FloatArray
+
+    @property
+    def fix_type(self) -> IntArray:
+        """`GpsFixType` of each message."""
+        return np.where(self.has_fix, GpsFixType.FIX_3D, GpsFixType.NONE)
+
+
+class GpsSampler:
+    """Let the receiver run along a trajectory.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+    trajectory : Trajectory
+    rng : numpy.random.Generator
+    start_unix_us : int
+        UTC at the start of the simulation.
+    """
+
+    def __init__(
+        self,
+        settings: SimulatorSettings,
+        trajectory: Trajectory,
+        rng: np.random.Generator,
+        start_unix_us: int,
+    ) -> None:
+        self._settings = settings
+        self._trajectory = trajectory
+        self._start_unix_us = start_unix_us
+        self._epoch = -(-start_unix_us // EPOCH_US)
+        place, noise, speed, speed_noise, sky, self._latency = rng.spawn(6)
+        interval_s = 1.0 / GPS_RATE_HZ
+        self._position_wander = Wander(place, 1.0, WANDER_S, interval_s)
+        self._position_noise = White(noise, 1.0)
+        self._velocity_wander = Wander(speed, 1.0, VELOCITY_WANDER_S, interval_s)
+        self._velocity_noise = White(speed_noise, 1.0)
+        self._sky = Wander(sky, 1.0, WANDER_S, interval_s)
+
+    def take(self, until_s: float) -> GpsSamples:
+        """Run on to a time.
+
+        Parameters
+        ----------
+        until_s : float
+            True time; every message of a fix that was valid before it comes out, though some
+            arrive after it.
+
+        Returns
+        -------
+        GpsSamples
+        """
+        end_epoch = math.ceil((self._start_unix_us + until_s * 1e6) / EPOCH_US)
+        unix_us = np.arange(self._epoch, max(end_epoch, self._epoch)) * EPOCH_US
+        self._epoch = max(end_epoch, self._epoch)
+        valid_s = (unix_us - self._start_unix_us).astype(np.float64) * 1e-6
+        size, s = len(unix_us), self._settings
+        jitter_s = s.gps_latency_jitter_s * self._latency.uniform(-1.0, 1.0, size)
+        has_fix = _sees_sky(valid_s, s.gps_first_fix_s, s.gps_outages_s)
+        satellites = np.rint(SATELLITES + SATELLITES_SPREAD * self._sky.draw(size)[:, 0])
+        satellites = np.where(has_fix, np.maximum(satellites, 6.0), 2.0)
+        lat_deg, lon_deg, alt_amsl_m, vel_n_mps = self._measure(valid_s)
+        worse = SATELLITES / satellites * _settling(valid_s, s.gps_first_fix_s, s.gps_outages_s)
+        speed_acc_mps = SPEED_ACC_MPS * worse
+        ground_mps = np.maximum(np.hypot(vel_n_mps[:, 0], vel_n_mps[:, 1]), 1e-3)
+        return GpsSamples(
+            time_s=valid_s + s.gps_latency_s + jitter_s,
+            valid_time_s=valid_s,
+            itow_ms=(unix_us - GPS_EPOCH_UNIX_US + LEAP_US) // 1000 % WEEK_MS,
+            unix_us=unix_us,
+            time_valid=valid_s >= s.gps_first_fix_s - TIME_KNOWN_EARLIER_S,
+            has_fix=has_fix,
+            satellites=satellites.astype(np.int64),
+            lat_deg=np.where(has_fix, lat_deg, 0.0),
+            lon_deg=np.where(has_fix, lon_deg, 0.0),
+            alt_amsl_m=np.where(has_fix, alt_amsl_m, 0.0),
+            vel_n_mps=np.where(has_fix[:, np.newaxis], vel_n_mps, 0.0),
+            h_acc_m=np.where(has_fix, H_ACC_M * worse, BLIND),
+            v_acc_m=np.where(has_fix, V_ACC_M * worse, BLIND),
+            speed_acc_mps=np.where(has_fix, speed_acc_mps, BLIND),
+            course_acc_deg=np.where(
+                has_fix, np.minimum(np.degrees(speed_acc_mps / ground_mps), 180.0), 180.0
+            ),
+            pdop=np.where(has_fix, PDOP * SATELLITES / satellites, BLIND),
+        )
+
+    def _measure(
+        self, valid_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Measure latitude, longitude, height and velocity with their errors."""
+        size = len(valid_s)
+        truth = self._trajectory.truth_at(valid_s)
+        off_m = POSITION_WANDER_M * self._position_wander.draw(size)
+        off_m += POSITION_NOISE_M * self._position_noise.draw(size)
+        vel = truth.vel_n_mps + VELOCITY_WANDER_MPS * self._velocity_wander.draw(size)
+        vel += VELOCITY_NOISE_MPS * self._velocity_noise.draw(size)
+        meridian_m, parallel_m = radii_m(self._settings.home_lat_deg, self._settings.home_alt_m)
+        return (
+            truth.lat_deg + np.degrees(off_m[:, 0] / meridian_m),
+            truth.lon_deg + np.degrees(off_m[:, 1] / parallel_m),
+            truth.alt_amsl_m - off_m[:, 2],
+            vel,
+        )
+
+
+def _sees_sky(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) -> BoolArray:
+    seen = valid_s >= first_fix_s
+    phase_s = valid_s % FLIGHT_S
+    for start_s, length_s in outages_s:
+        seen &= (phase_s < start_s) | (phase_s >= start_s + length_s)
+    return seen
+
+
+def _settling(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) -> FloatArray:
+    """Tell by what factor the accuracies are worse since the fix came back."""
+    factor = 1.0 + SETTLING_FACTOR * _decay(valid_s - first_fix_s)
+    for start_s, length_s in outages_s:
+        factor += SETTLING_FACTOR * _decay(valid_s % FLIGHT_S - start_s - length_s)
+    return factor
+
+
+def _decay(since_s: FloatArray) -> FloatArray:
+    return np.where(since_s >= 0.0, np.exp(-np.maximum(since_s, 0.0) / SETTLING_S), 0.0)

@@ -1,0 +1,252 @@
+"""The chips of the tracker: true motion in, counts and messages out.
+
+Sensor axes are those of the chips on a level board: x forward, y left, z up; a body vector (FRD)
+has the components `FACE_UP * v_b` in them, and the other way round. An inertial or magnetic sensor
+reads `matrix @ v_s + bias` plus noise; `SensorErrors` tells the calibration that undoes it.
+
+References
+----------
+.. [1] InvenSense, "MPU-6000 and MPU-6050 Product Specification", rev. 3.4, sections 6.1 and 6.2.
+.. [2] Honeywell, "3-Axis Digital Compass IC HMC5883L", 2010.
+.. [3] Bosch Sensortec, "BMP180 Digital pressure sensor", rev. 2.5.
+.. [4] u-blox, "NEO-M8 Data Sheet": 2.5 m CEP, 0.05 m/s.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.geometry.geomagnetism import magnetic_field
+from gateway.records import Vec3
+from gateway.simulator.noise import FloatArray, Walk, Wander, White
+from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.trajectory import CRUISE_MPS, Truth, rotate_inverse
+from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Matrix3 = tuple[Vec3, Vec3, Vec3]
+
+FACE_UP: Final = np.array([1.0, -1.0, -1.0])
+
+ACCEL_RANGE: Final = 2
+"""+-8 g."""
+GYRO_RANGE: Final = 2
+"""+-1000 deg/s."""
+MAG_GAIN: Final = 1
+GYRO_LSB_PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
+INT16_MIN: Final = -32768
+INT16_MAX: Final = 32767
+
+ACCEL_DENSITY: Final = 400e-6 * STANDARD_GRAVITY_MPS2
+"""m/s2 per root hertz [1]_."""
+GYRO_DENSITY: Final = math.radians(0.005)
+"""rad/s per root hertz [1]_."""
+FILTER_HZ: Final = 94.0
+"""Noise bandwidth of the chip's own low-pass in the firmware's setting."""
+ACCEL_BIAS_MPS2: Final = 0.10
+GYRO_BIAS_RADPS: Final = math.radians(1.5)
+"""Spread of the constant biases; those left after the user has picked a usable chip."""
+ACCEL_WALK: Final = 0.001
+GYRO_WALK: Final = math.radians(0.004)
+"""Bias random walks, per root second."""
+SCALE_SPREAD: Final = 0.006
+MISALIGNMENT_RAD: Final = math.radians(0.4)
+GYRO_SHAKING: Final = 0.02
+"""rad/s of shaking for each m/s2 of it."""
+START_DEGC: Final = 29.0
+WARMING_DEGC: Final = 7.0
+WARMING_S: Final = 240.0
+
+MAG_RATE_HZ: Final = 75
+MAG_NOISE_UT: Final = 0.25
+HARD_IRON_UT: Final = 14.0
+SOFT_IRON_SPREAD: Final = 0.05
+MAG_LIMIT: Final = 2047
+MAG_OVERFLOW: Final = -4096
+UT_PER_GAUSS: Final = 100.0
+FIELD_YEAR: Final = 2026.5
+
+SEA_LEVEL_PA: Final = 101_325.0
+SEA_LEVEL_SPREAD_PA: Final = 300.0
+BARO_NOISE_PA: Final = 3.0
+BARO_DRIFT_PA: Final = 8.0
+BARO_DRIFT_S: Final = 300.0
+ISA_KELVIN: Final = 288.15
+ISA_LAPSE_KELVIN_PER_M: Final = 0.0065
+ISA_EXPONENT: Final = 5.255_876
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """The calibration that undoes the constant errors: `v_b = FACE_UP * (matrix @ (s - bias))`."""
+
+    accel_bias_mps2: Vec3
+    accel_matrix: Matrix3
+    gyro_bias_radps: Vec3
+    mag_hard_iron_ut: Vec3
+    mag_soft_iron: Matrix3
+
+
+@dataclass(frozen=True, slots=True)
+class InertialCounts:
+    """What the MPU6050's registers hold at N samples."""
+
+    accel: IntArray
+    """Shape (N, 3), sensor axes."""
+    gyro: IntArray
+    temperature: IntArray
+    """Shape (N,)."""
+    accel_clipped: BoolArray
+    gyro_clipped: BoolArray
+
+
+class Mpu6050:
+    """Accelerometer and gyroscope."""
+
+    def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
+        rate_hz = settings.imu_rate_hz
+        noise_hz = min(0.5 * rate_hz, FILTER_HZ)
+        accel, gyro, shaking, accel_walk, gyro_walk = rng.spawn(5)
+        self.accel_bias_mps2 = ACCEL_BIAS_MPS2 * rng.standard_normal(3)
+        self.gyro_bias_radps = GYRO_BIAS_RADPS * rng.standard_normal(3)
+        self.accel_matrix = _imperfect(rng)
+        self.gyro_matrix = _imperfect(rng)
+        self._accel_noise = White(accel, ACCEL_DENSITY * math.sqrt(noise_hz))
+        self._gyro_noise = White(gyro, GYRO_DENSITY * math.sqrt(noise_hz))
+        self._accel_shaking = White(shaking, settings.vibration_mps2)
+        self._gyro_shaking = White(shaking.spawn(1)[0], settings.vibration_mps2 * GYRO_SHAKING)
+        self._accel_walk = Walk(accel_walk, ACCEL_WALK, 1.0 / rate_hz)
+        self._gyro_walk = Walk(gyro_walk, GYRO_WALK, 1.0 / rate_hz)
+
+    def sample(self, truth: Truth) -> InertialCounts:
+        """Read the registers at the truth's times, which follow those of the call before."""
+        size = len(truth.time_s)
+        power = (np.minimum(truth.airspeed_mps / CRUISE_MPS, 1.0) ** 2)[:, np.newaxis]
+        accel = (truth.accel_b_mps2 * FACE_UP) @ self.accel_matrix.T + self.accel_bias_mps2
+        accel += self._accel_walk.draw(size) + self._accel_noise.draw(size)
+        accel += power * self._accel_shaking.draw(size)
+        gyro = (truth.rate_b_radps * FACE_UP) @ self.gyro_matrix.T + self.gyro_bias_radps
+        gyro += self._gyro_walk.draw(size) + self._gyro_noise.draw(size)
+        gyro += power * self._gyro_shaking.draw(size)
+        accel_lsb = -INT16_MIN / (ACCEL_RANGES_G[ACCEL_RANGE] * STANDARD_GRAVITY_MPS2)
+        accel_counts, accel_clipped = to_int16(accel * accel_lsb)
+        gyro_counts, gyro_clipped = to_int16(np.degrees(gyro) * GYRO_LSB_PER_DPS[GYRO_RANGE])
+        return InertialCounts(
+            accel=accel_counts,
+            gyro=gyro_counts,
+            temperature=temperature_counts(warm_degc(truth.time_s)),
+            accel_clipped=accel_clipped,
+            gyro_clipped=gyro_clipped,
+        )
+
+
+class Hmc5883l:
+    """Magnetometer in the field of the Earth and of the aircraft's own iron."""
+
+    def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
+        field = magnetic_field(
+            settings.home_lat_deg, settings.home_lon_deg, settings.home_alt_m, FIELD_YEAR
+        )
+        level = math.cos(field.inclination_rad)
+        self.field_n_ut: FloatArray = field.strength_ut * np.array(
+            [
+                level * math.cos(field.declination_rad),
+                level * math.sin(field.declination_rad),
+                math.sin(field.inclination_rad),
+            ]
+        )
+        direction = rng.standard_normal(3)
+        self.hard_iron_ut: FloatArray = HARD_IRON_UT * direction / np.linalg.norm(direction)
+        spread = SOFT_IRON_SPREAD * rng.standard_normal((3, 3))
+        self.soft_iron: FloatArray = np.eye(3) + 0.5 * (spread + spread.T)
+        self._noise = White(rng.spawn(1)[0], MAG_NOISE_UT)
+
+    def sample(self, q_nb: FloatArray) -> IntArray:
+        """Read the registers at attitudes of shape (N, 4), which follow those of the call before.
+
+        Returns
+        -------
+        ndarray, shape (N, 3)
+            Counts; an axis beyond its range reads `MAG_OVERFLOW`.
+        """
+        field_s = rotate_inverse(q_nb, self.field_n_ut) * FACE_UP
+        measured_ut = field_s @ self.soft_iron.T + self.hard_iron_ut + self._noise.draw(len(q_nb))
+        return mag_counts(measured_ut, MAG_GAIN)
+
+
+class Bmp180:
+    """Barometer in the standard atmosphere of a day with its own sea-level pressure."""
+
+    def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
+        self.sea_level_pa = SEA_LEVEL_PA + SEA_LEVEL_SPREAD_PA * float(rng.standard_normal())
+        noise, drift = rng.spawn(2)
+        self._noise = White(noise, BARO_NOISE_PA)
+        self._drift = Wander(drift, BARO_DRIFT_PA, BARO_DRIFT_S, 1.0 / settings.baro_rate_hz)
+
+    def sample(self, truth: Truth) -> tuple[FloatArray, FloatArray]:
+        """Read pressure in whole pascals and temperature in tenths of a degree, shapes (N,)."""
+        size = len(truth.time_s)
+        pressure_pa = pressure_at(truth.alt_amsl_m, self.sea_level_pa)
+        pressure_pa += self._noise.draw(size)[:, 0] + self._drift.draw(size)[:, 0]
+        return np.rint(pressure_pa), np.round(warm_degc(truth.time_s), 1)
+
+
+def errors_of(imu: Mpu6050, mag: Hmc5883l) -> SensorErrors:
+    """Tell the ideal calibration of two sensors."""
+    return SensorErrors(
+        accel_bias_mps2=_vec3(imu.accel_bias_mps2),
+        accel_matrix=_inverse(imu.accel_matrix),
+        gyro_bias_radps=_vec3(imu.gyro_bias_radps),
+        mag_hard_iron_ut=_vec3(mag.hard_iron_ut),
+        mag_soft_iron=_inverse(mag.soft_iron),
+    )
+
+
+def pressure_at(alt_m: FloatArray, sea_level_pa: float) -> FloatArray:
+    """Compute the ICAO standard atmosphere's pressure at heights in the troposphere."""
+    ratio = 1.0 - ISA_LAPSE_KELVIN_PER_M * alt_m / ISA_KELVIN
+    return np.asarray(sea_level_pa * ratio**ISA_EXPONENT)
+
+
+def warm_degc(time_s: FloatArray) -> FloatArray:
+    """Warm the closed fuselage after switching on."""
+    return np.asarray(START_DEGC + WARMING_DEGC * (1.0 - np.exp(-time_s / WARMING_S)))
+
+
+def temperature_counts(temperature_degc: FloatArray) -> IntArray:
+    """Convert deg C to the MPU6050's temperature word."""
+    return np.rint((temperature_degc - 36.53) * 340.0).astype(np.int64)
+
+
+def to_int16(values: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Round to 16-bit words of shape (N, 3), and tell which rows touched an end."""
+    counts = np.clip(np.rint(values), INT16_MIN, INT16_MAX).astype(np.int64)
+    return counts, np.any((counts == INT16_MIN) | (counts == INT16_MAX), axis=1)
+
+
+def mag_counts(field_ut: FloatArray, gain: int) -> IntArray:
+    """Convert uT to the HMC5883L's words; its overflow mark where an axis is out of range."""
+    counts = np.rint(field_ut * (MAG_LSB_PER_GAUSS[gain] / UT_PER_GAUSS)).astype(np.int64)
+    return np.where(np.abs(counts) > MAG_LIMIT, MAG_OVERFLOW, counts)
+
+
+def _imperfect(rng: np.random.Generator) -> FloatArray:
+    """Draw a scale and misalignment matrix."""
+    matrix = MISALIGNMENT_RAD * rng.standard_normal((3, 3))
+    np.fill_diagonal(matrix, 1.0 + SCALE_SPREAD * rng.standard_normal(3))
+    return matrix
+
+
+def _vec3(values: FloatArray) -> Vec3:
+    x, y, z = values.tolist()
+    return (x, y, z)
+
+
+def _inverse(matrix: FloatArray) -> Matrix3:
+    a, b, c = np.linalg.inv(matrix).astype(np.float64)
+    return (_vec3(a), _vec3(b), _vec3(c))

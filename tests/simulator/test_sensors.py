@@ -1,0 +1,144 @@
+"""Each chip errs by what its data sheet says, and the told calibration undoes it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.simulator.noise import Walk, Wander
+from gateway.simulator.sensors import (
+    FACE_UP,
+    MAG_OVERFLOW,
+    Bmp180,
+    Hmc5883l,
+    Mpu6050,
+    errors_of,
+    mag_counts,
+    pressure_at,
+    temperature_counts,
+    to_int16,
+)
+from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.trajectory import Truth
+
+SETTINGS = SimulatorSettings()
+SIZE = 20_000
+
+
+def still(size: int = SIZE, accel: tuple[float, ...] = (0.0, 0.0, -9.80665)) -> Truth:
+    time_s = np.arange(size) / SETTINGS.imu_rate_hz
+    zeros, vectors = np.zeros(size), np.zeros((size, 3))
+    return Truth(
+        time_s=time_s,
+        lat_deg=zeros,
+        lon_deg=zeros,
+        alt_amsl_m=zeros + 110.0,
+        pos_n_m=vectors,
+        vel_n_mps=vectors,
+        accel_n_mps2=vectors,
+        q_nb=np.tile([1.0, 0.0, 0.0, 0.0], (size, 1)),
+        rate_b_radps=vectors,
+        accel_b_mps2=np.tile(accel, (size, 1)),
+        airspeed_mps=zeros,
+    )
+
+
+class TestMpu6050:
+    def test_calibrated_rest_reads_gravity(self, rng: np.random.Generator) -> None:
+        imu = Mpu6050(SETTINGS, rng)
+        errors = errors_of(imu, Hmc5883l(SETTINGS, rng))
+        counts = imu.sample(still(2000))
+        accel_s = counts.accel * (8 * 9.80665 / 32768)
+        accel_b = (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix) * FACE_UP
+        np.testing.assert_allclose(accel_b.mean(axis=0), [0.0, 0.0, -9.80665], atol=0.01)
+        gyro_s = np.radians(counts.gyro / 32.8)
+        np.testing.assert_allclose(gyro_s.mean(axis=0), errors.gyro_bias_radps, atol=3e-3)
+
+    def test_noise_has_its_density(self, rng: np.random.Generator) -> None:
+        counts = Mpu6050(SETTINGS, rng).sample(still(3000))
+        # 100 Hz see 50 Hz of noise; the walk adds little in 30 s, rounding 0.3 counts.
+        accel_sigma = np.diff(counts.accel, axis=0).std(axis=0) / np.sqrt(2.0)
+        gyro_sigma = np.diff(counts.gyro, axis=0).std(axis=0) / np.sqrt(2.0)
+        np.testing.assert_allclose(accel_sigma, 400e-6 * np.sqrt(50.0) * 4096, rtol=0.05)
+        np.testing.assert_allclose(gyro_sigma, 0.005 * np.sqrt(50.0) * 32.8, rtol=0.08)
+
+    def test_clips_at_its_range(self, rng: np.random.Generator) -> None:
+        counts = Mpu6050(SETTINGS, rng).sample(still(100, (200.0, 0.0, -9.8)))
+        assert (counts.accel[:, 0] == 32767).all()
+        assert counts.accel_clipped.all()
+        assert not counts.gyro_clipped.any()
+
+    def test_warms_up(self, rng: np.random.Generator) -> None:
+        counts = Mpu6050(SETTINGS, rng).sample(still())
+        degc = counts.temperature / 340 + 36.53
+        assert degc[0] == pytest.approx(29.0, abs=0.01)
+        assert degc[-1] > 32.0
+
+
+class TestHmc5883l:
+    def test_calibration_brings_the_field_back(self, rng: np.random.Generator) -> None:
+        mag = Hmc5883l(SETTINGS, rng)
+        errors = errors_of(Mpu6050(SETTINGS, rng), mag)
+        attitudes = Rotation.random(2000, rng=rng)
+        counts = mag.sample(attitudes.as_quat(scalar_first=True))
+        measured_ut = counts * (100.0 / 1090)
+        field_b = (measured_ut - errors.mag_hard_iron_ut) @ np.transpose(errors.mag_soft_iron)
+        off = field_b * FACE_UP - attitudes.inv().apply(mag.field_n_ut)
+        assert np.abs(off.mean(axis=0)).max() < 0.05
+        assert 0.2 < off.std() < 0.35
+
+    def test_field_is_that_of_java(self, rng: np.random.Generator) -> None:
+        north, east, down = Hmc5883l(SETTINGS, rng).field_n_ut
+        assert np.degrees(np.arctan2(east, north)) == pytest.approx(0.8, abs=0.3)
+        assert down < -15.0, "the field points up south of the magnetic equator"
+        assert np.linalg.norm([north, east, down]) == pytest.approx(45.0, abs=1.5)
+
+    def test_marks_an_overflow(self) -> None:
+        assert mag_counts(np.array([[187.0, -190.0, 190.0]]), 1).tolist() == [
+            [2038, MAG_OVERFLOW, MAG_OVERFLOW]
+        ]
+
+
+class TestBmp180:
+    def test_reads_the_height(self, rng: np.random.Generator) -> None:
+        baro = Bmp180(SETTINGS, rng)
+        pressure_pa, temperature_degc = baro.sample(still(2000))
+        expected = pressure_at(np.array([110.0]), baro.sea_level_pa)[0]
+        assert pressure_pa.mean() == pytest.approx(expected, abs=25.0)
+        assert 2.5 < np.diff(pressure_pa).std() / np.sqrt(2.0) < 3.5
+        assert (pressure_pa == np.rint(pressure_pa)).all()
+        assert temperature_degc[0] == 29.0
+
+    @pytest.mark.parametrize(
+        ("alt_m", "pressure_pa"), [(0, 101325), (1000, 89874.6), (5000, 54019.9)]
+    )
+    def test_standard_atmosphere(self, alt_m: float, pressure_pa: float) -> None:
+        assert pressure_at(np.array([alt_m]), 101325.0)[0] == pytest.approx(pressure_pa, rel=2e-5)
+
+
+def test_words() -> None:
+    counts, clipped = to_int16(np.array([[0.4, -0.6, 1.0], [40000.0, 0.0, 0.0]]))
+    assert counts.tolist() == [[0, -1, 1], [32767, 0, 0]]
+    assert clipped.tolist() == [False, True]
+    assert temperature_counts(np.array([36.53, 25.0])).tolist() == [0, -3920]
+
+
+class TestNoise:
+    def test_wander_keeps_its_spread_and_memory(self, rng: np.random.Generator) -> None:
+        values = Wander(rng, 2.0, 10.0, 0.1).draw(200_000)
+        np.testing.assert_allclose(values.std(axis=0), 2.0, rtol=0.1)
+        lag = 100
+        memory = (values[lag:] * values[:-lag]).mean() / values.var()
+        assert memory == pytest.approx(np.exp(-1.0), abs=0.05)
+
+    def test_walk_grows_with_the_root_of_time(self) -> None:
+        ends = [Walk(np.random.default_rng(seed), 0.5, 0.01).draw(400)[-1] for seed in range(300)]
+        assert np.std(ends) == pytest.approx(0.5 * 2.0, rel=0.1)
+
+    @pytest.mark.parametrize(
+        "make", [lambda r: Wander(r, 1.0, 5.0, 0.1), lambda r: Walk(r, 1.0, 0.1)]
+    )
+    def test_pieces_equal_the_whole(self, make) -> None:  # type: ignore[no-untyped-def]
+        whole = make(np.random.default_rng(3)).draw(1000)
+        source = make(np.random.default_rng(3))
+        pieces = np.vstack([source.draw(size) for size in (1, 0, 399, 600)])
+        np.testing.assert_array_equal(pieces, whole)
