@@ -38,6 +38,7 @@ class Daemon:
         self, settings: GatewaySettings, calibrations: Mapping[int, NodeCalibration]
     ) -> None:
         self.now_us = GatewayClock()
+        self._settings = settings
         self._pipeline = Pipeline(
             PipelineSettings(settings.sensing, settings.estimation, settings.vehicle, calibrations)
         )
@@ -51,6 +52,7 @@ class Daemon:
     def start(self) -> None:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
         self._hub.start()
+        self._pipeline.disconnect(self._settings.serial.port)
         self._serial.start()
         self._poll()
 

@@ -116,6 +116,7 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
 
 async def _live_view(daemon: Daemon, stopped: asyncio.Event) -> None:
     view = LiveView()
+    logging.getLogger().handlers[:] = [view.log]
     # No thread of rich's own: it draws when it is told to, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
         while not await _is_set_within(stopped, VIEW_INTERVAL_S):

@@ -1,6 +1,8 @@
 """The live view in the terminal: link, aircraft and clients at a glance."""
 
+import logging
 import math
+from collections import deque
 from typing import Final
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -17,6 +19,7 @@ from gateway.units import US_PER_S
 
 SILENT_US: Final = 2 * US_PER_S
 UNKNOWN: Final = "—"
+LOG_LINES: Final = 5
 RATE_COLUMNS: Final = 3
 """Message rates stand side by side: the view must fit a terminal of 80 by 40."""
 
@@ -33,10 +36,25 @@ FLAG_WORDS: Final = (
 )
 
 
+class RecentLog(logging.Handler):
+    """Keep the newest log lines: on the view's screen they have no other place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+        self.lines: deque[tuple[str, str]] = deque(maxlen=LOG_LINES)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one line and its style."""
+        style = "yellow" if record.levelno >= logging.WARNING else ""
+        self.lines.append((self.format(record), style))
+
+
 class LiveView:
     """Draw snapshots; keeps the previous one to tell rates."""
 
     def __init__(self) -> None:
+        self.log = RecentLog()
         self._previous: Snapshot | None = None
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
@@ -53,11 +71,16 @@ class LiveView:
             To be shown by a rich `Live` or `Console`.
         """
         previous, self._previous = self._previous or snapshot, snapshot
-        parts: list[RenderableType] = [_link_line(snapshot), _nodes(snapshot.report)]
+        parts: list[RenderableType] = [_link_line(snapshot), Text()]
+        if snapshot.report.nodes:
+            parts.append(_nodes(snapshot.report))
         parts += [_aircraft(vehicle_id, state) for vehicle_id, state in snapshot.states]
         if not snapshot.states:
-            parts.append(Text("no aircraft heard yet", style="dim"))
-        parts += [_rates(snapshot, previous), _clients(snapshot)]
+            parts.append(Text("No aircraft heard yet.\n", style="dim"))
+        if snapshot.sent:
+            parts.append(_rates(snapshot, previous))
+        parts.append(_clients(snapshot))
+        parts += [Text(line, style=style) for line, style in self.log.lines]
         return Group(*parts)
 
 

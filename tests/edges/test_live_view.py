@@ -1,5 +1,6 @@
 """The live view: what an operator reads, and that nothing unknown looks like a figure."""
 
+import logging
 import math
 from dataclasses import replace
 
@@ -110,7 +111,19 @@ def test_an_empty_gateway_can_be_drawn() -> None:
     report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
     text = text_of(Snapshot(0, report, (), (), ()))
     assert "auto not connected" in text
-    assert "no aircraft heard yet" in text
+    assert "No aircraft heard yet" in text
+
+
+def test_the_newest_log_lines_are_on_the_screen() -> None:
+    view = LiveView()
+    for number in range(20):
+        record = logging.LogRecord("x", logging.WARNING, "", 0, "trouble %d", (number,), None)
+        view.log.handle(record)
+    console = Console(width=100, no_color=True)
+    with console.capture() as captured:
+        console.print(view.draw(SNAPSHOT))
+    assert "trouble 19" in captured.get()
+    assert "trouble 14" not in captured.get()
 
 
 def test_summary_line() -> None:
