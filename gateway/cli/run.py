@@ -103,20 +103,21 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    view = None if plain or not sys.stdout.isatty() else LiveView()
+    if view is not None:
+        logging.getLogger().handlers[:] = [view.log]
     daemon = daemon_of()
     daemon.start()
     try:
-        if plain or not sys.stdout.isatty():
+        if view is None:
             await _log_lines(daemon, stopped)
         else:
-            await _live_view(daemon, stopped)
+            await _live_view(daemon, view, stopped)
     finally:
         daemon.close()
 
 
-async def _live_view(daemon: Daemon, stopped: asyncio.Event) -> None:
-    view = LiveView()
-    logging.getLogger().handlers[:] = [view.log]
+async def _live_view(daemon: Daemon, view: LiveView, stopped: asyncio.Event) -> None:
     # No thread of rich's own: it draws when it is told to, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
         while not await _is_set_within(stopped, VIEW_INTERVAL_S):
