@@ -1,40 +1,75 @@
-"""The hub: every frame of ours goes to every client, and what clients say comes in."""
+"""The hub: every frame of ours goes to every client, and what clients say finds its way."""
 
 import asyncio
+import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
-from gateway.edges.hub_link import Link
-from gateway.edges.hub_udp import UdpLink, UdpListener
+from gateway.edges.hub_group import GroupLink
+from gateway.edges.hub_link import Link, Listener
+from gateway.edges.hub_serial import SerialLink
+from gateway.edges.hub_stream import TcpLink, TcpListener
+from gateway.edges.hub_udp import UdpLink
+from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.clients import ClientStats
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
+from gateway.routing.probe import RoundTrip
 from gateway.routing.settings import HubSettings
+from gateway.routing.table import LoopGuard, Origin, RoutingTable
+from gateway.routing.vehicles import GREETING, HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import origin_of
+from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of, target_of
+
+log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
 
-HEARTBEAT_ID: Final = 0
-HOME_POSITION_ID: Final = 242
-GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
-"""What a new client is told at once, in this order: that there is a vehicle, and its home."""
-MAX_SYSTEMS: Final = 255
+LINKS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Link]]] = {
+    EndpointKind.UDP: UdpLink,
+    EndpointKind.UDP_BROADCAST: GroupLink,
+    EndpointKind.UDP_MULTICAST: GroupLink,
+    EndpointKind.TCP: TcpLink,
+    EndpointKind.SERIAL: SerialLink,
+}
+LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener]]] = {
+    EndpointKind.UDP_LISTEN: UdpListener,
+    EndpointKind.TCP_LISTEN: TcpListener,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class HubCounters:
+    """What the hub as a whole has seen since it started."""
+
+    published: int
+    """Frames of ours."""
+    forwarded: int
+    """Frames of other systems that were passed on."""
+    duplicates: int
+    """Copies that came a second way."""
+    looped: int
+    """Frames of ours that came back."""
+    unroutable: int
+    """Frames for a system that nobody has heard, or from one who may not."""
 
 
 class Hub:
-    """Send MAVLink to many clients and take theirs.
+    """Send MAVLink to many clients, take theirs, and pass between them what concerns them.
 
     Parameters
     ----------
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame that a client sends to us.
+        Called with every frame for our vehicles, and every broadcast.
     now_us : callable
         The gateway clock.
+    on_foreign : callable, optional
+        Called with every frame of another system, once, byte for byte, as for a recorder.
     """
 
     def __init__(
@@ -42,22 +77,29 @@ class Hub:
         settings: HubSettings,
         on_frame: Callable[[Incoming], None],
         now_us: Callable[[], int],
+        on_foreign: Callable[[bytes], None] | None = None,
     ) -> None:
-        self._settings = settings
+        self.settings = settings
+        self.now_us = now_us
         self._on_frame = on_frame
-        self._clock = now_us
+        self._on_foreign = on_foreign
         self._fanout = Fanout()
+        self._table = RoutingTable()
+        self._guard = LoopGuard()
+        self._probe = RoundTrip()
         self._links: dict[int, Link] = {}
-        self._fixed: dict[int, Link] = {}
-        self._listeners: list[UdpListener] = []
+        self._endpoints: dict[str, Link | Listener] = {}
         self._next_id = 1
-        self._greetings: dict[tuple[int, int], dict[int, bytes]] = {}
+        self._vehicles = OwnVehicles()
+        self._ping_us = 0
         self._timer: asyncio.TimerHandle | None = None
+        self._published = self._forwarded = self._duplicates = 0
+        self._looped = self._unroutable = 0
 
     def start(self) -> None:
         """Open the endpoints; needs a running event loop. What fails is tried again."""
-        for url in self._settings.endpoints:
-            self._open(parse_endpoint(url))
+        for url in self.settings.endpoints:
+            self.add(url)
         self._tick()
 
     def close(self) -> None:
@@ -65,76 +107,213 @@ class Hub:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        for listener in self._listeners:
-            listener.close()
-        self._listeners.clear()
-        for link in list(self._links.values()):
-            self.vanish(link)
+        for place in list(self._endpoints):
+            self.remove(place)
 
     def send(self, outgoing: Outgoing) -> None:
         """Send one of our own frames to every client that takes it, or to the one it answers."""
         frame = outgoing.frame
+        self._published += 1
+        if self._vehicles.has_newcomers:
+            self._welcome(frame)
         if outgoing.client_id is not None:
             self._fanout.answer(frame, outgoing.client_id)
             return
-        if outgoing.message_id in GREETING and len(self._greetings) < MAX_SYSTEMS:
-            self._greetings.setdefault(origin_of(frame), {})[outgoing.message_id] = frame
-        self._fanout.publish(frame, self._clock())
+        if outgoing.message_id in GREETING:
+            self._vehicles.note(frame, outgoing.message_id, self.now_us())
+        self._fanout.publish(frame, self.now_us())
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
         self._fanout.set_interval(wish)
 
+    def add(self, url: str) -> None:
+        """Open one more endpoint.
+
+        Raises
+        ------
+        ValueError
+            If the URL is not understood, or the same endpoint is there already.
+        """
+        endpoint = parse_endpoint(url)
+        if endpoint.place in self._endpoints:
+            raise ValueError(f"endpoint {endpoint.place!r} is there already")
+        if listen := LISTENERS.get(endpoint.kind):
+            self._endpoints[endpoint.place] = listen(self, endpoint)
+            return
+        link = LINKS[endpoint.kind](self, self.new_client_id(), endpoint)
+        self._endpoints[endpoint.place] = link
+        self.appear(link)
+
+    def remove(self, name: str) -> None:
+        """Close an endpoint.
+
+        Parameters
+        ----------
+        name : str
+            Its URL, with or without options, or its name.
+
+        Raises
+        ------
+        ValueError
+            If there is none such.
+        """
+        for place, opened in self._endpoints.items():
+            if name in (place, opened.endpoint.name, opened.endpoint.url):
+                break
+        else:
+            raise ValueError(f"no endpoint is called {name!r}")
+        gone = self._endpoints.pop(place)
+        if isinstance(gone, Link):
+            self.vanish(gone)
+        else:
+            gone.close()
+
+    def apply(self, settings: HubSettings) -> None:
+        """Take over changed settings; endpoints that stay keep their clients.
+
+        Those whose options changed are changed in place, those added at run time stay.
+        """
+        before = {parse_endpoint(url).place for url in self.settings.endpoints}
+        after = {parse_endpoint(url).place: url for url in settings.endpoints}
+        self.settings = settings
+        for place in before - after.keys():
+            if place in self._endpoints:
+                self.remove(place)
+        for place, url in after.items():
+            if place not in self._endpoints:
+                self.add(url)
+            elif (opened := self._endpoints[place]).endpoint.url != url:
+                opened.reconfigure(parse_endpoint(url))
+
     def clients(self) -> tuple[ClientStats, ...]:
         """Describe every client at this moment, in the order of their ids."""
-        return tuple(self._links[key].stats() for key in sorted(self._links))
+        return tuple(
+            self._links[key].stats(self._table.origins(key)) for key in sorted(self._links)
+        )
+
+    def endpoints(self) -> tuple[str, ...]:
+        """Return the URLs of all endpoints."""
+        return tuple(opened.endpoint.url for opened in self._endpoints.values())
+
+    def counters(self) -> HubCounters:
+        """Return the totals since the start."""
+        return HubCounters(
+            published=self._published,
+            forwarded=self._forwarded,
+            duplicates=self._duplicates,
+            looped=self._looped,
+            unroutable=self._unroutable,
+        )
 
     def listening_ports(self) -> tuple[int, ...]:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
-        return tuple(listener.port for listener in self._listeners)
-
-    def now_us(self) -> int:
-        """Return the gateway time."""
-        return self._clock()
+        return tuple(
+            endpoint.port for endpoint in self._endpoints.values() if not isinstance(endpoint, Link)
+        )
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
         self._next_id += 1
         return self._next_id - 1
 
+    def is_own(self, origin: Origin) -> bool:
+        """Tell whether a system and component is one of our vehicles."""
+        return self._vehicles.is_own(origin, self.now_us())
+
     def deliver(self, link: Link, frame: bytes) -> None:
-        """Take one frame that a link received."""
-        self._on_frame(Incoming(link.client_id, frame, link.trusted))
+        """Take one frame that a link received, and pass it on to whom it concerns."""
+        origin = origin_of(frame)
+        if self.is_own(origin):
+            self._looped += 1
+            return
+        now_us = self.now_us()
+        self._table.hear(link.client_id, origin, now_us)
+        message_id = message_id_of(frame)
+        if message_id == HEARTBEAT_ID:
+            self._table.note_kind(origin, is_station=is_station_heartbeat(frame))
+        round_trip_us = self._probe.read(frame, now_us)
+        if round_trip_us is not None:
+            link.round_trip_us = round_trip_us
+            return
+        if self._guard.is_copy(frame, link.client_id, now_us):
+            self._duplicates += 1
+            return
+        self._route(link, frame, now_us)
 
     def appear(self, link: Link) -> None:
-        """Let a link take part, and tell it at once which vehicles there are and their homes."""
+        """Let a link take part."""
         self._links[link.client_id] = link
         self._fanout.add(link.client_id, link.transmit, link.endpoint)
-        for frames in self._greetings.values():
-            for message_id in GREETING:
-                if message_id in frames:
-                    link.transmit(frames[message_id], message_id)
+        log.info("client %s: %s", link.client_id, link.remote)
+
+    def greet(self, link: Link) -> None:
+        """Tell a peer that has just come which vehicles there are, and their homes."""
+        self._vehicles.await_greeting(link.client_id)
+
+    def reconfigure(self, link: Link) -> None:
+        """Let a link's changed lists and rates hold from the next frame on."""
+        self._fanout.reconfigure(link.client_id, link.endpoint)
 
     def vanish(self, link: Link) -> None:
         """Close a link and forget it."""
         self._fanout.remove(link.client_id)
-        self._links.pop(link.client_id, None)
+        self._table.forget(link.client_id)
+        if self._links.pop(link.client_id, None):
+            log.info("client %s has gone: %s", link.client_id, link.remote)
         link.close()
 
-    def _open(self, endpoint: Endpoint) -> None:
-        settings = self._settings
-        if endpoint.kind is EndpointKind.UDP:
-            self.appear(UdpLink(self, self.new_client_id(), endpoint))
-        elif endpoint.kind is EndpointKind.UDP_LISTEN:
-            idle_us = round(settings.idle_timeout_s * US_PER_S)
-            self._listeners.append(UdpListener(self, endpoint, settings.max_clients, idle_us))
+    def _route(self, link: Link, frame: bytes, now_us: int) -> None:
+        target = target_of(frame)
+        ours = target[0] in self._vehicles.systems(now_us)
+        if ours or not target[0]:
+            self._on_frame(Incoming(link.client_id, frame, link.trusted))
+        if not link.trusted:
+            self._unroutable += not ours and target[0] != 0
+            return
+        if self._on_foreign is not None:
+            self._on_foreign(frame)
+        if target[0]:
+            ways = self._table.ways_to(target, link.client_id, now_us)
+        elif self._table.is_station(origin_of(frame)):
+            ways = self._table.ways_to_vehicles(link.client_id)
         else:
-            raise ValueError(f"endpoint {endpoint.url!r}: {endpoint.kind} is not offered yet")
+            self._forwarded += 1
+            self._fanout.forward(frame, link.client_id, now_us)
+            return
+        if ways:
+            self._forwarded += 1
+            self._fanout.deliver(frame, ways)
+        elif target[0] and not ours:
+            self._unroutable += 1
+
+    def _welcome(self, frame: bytes) -> None:
+        clients, greeting = self._vehicles.greet(frame)
+        for client_id in clients:
+            if link := self._links.get(client_id):
+                for greeting_frame, message_id in greeting:
+                    link.transmit(greeting_frame, message_id)
 
     def _tick(self) -> None:
-        now_us = self._clock()
+        now_us = self.now_us()
+        for endpoint in list(self._endpoints.values()):
+            if not isinstance(endpoint, Link):
+                endpoint.tick(now_us)
         for link in list(self._links.values()):
             link.tick(now_us)
-        for listener in self._listeners:
-            listener.tick(now_us)
+        interval_us = round(self.settings.ping_interval_s * US_PER_S)
+        if interval_us and now_us - self._ping_us >= interval_us:
+            self._ping_us = now_us
+            self._ask_round_trips(now_us)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _ask_round_trips(self, now_us: int) -> None:
+        """Ask every client that speaks; one that does not listens to nothing but telemetry."""
+        asked = [link for link in self._links.values() if link.heard_us is not None]
+        systems = self._vehicles.systems(now_us)
+        if not asked or not systems:
+            return
+        questions = self._probe.ask(systems[0], now_us)
+        for link in asked:
+            for frame, message_id in questions:
+                link.transmit(frame, message_id)

@@ -1,16 +1,25 @@
 """What all transports to a client share: identity, counters, and how received bytes go on."""
 
+import asyncio
 import ipaddress
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 from gateway.routing.clients import ClientStats
-from gateway.routing.endpoint import Endpoint
-from gateway.wire.mavlink_splitter import SplitFault, origin_of
+from gateway.routing.endpoint import Endpoint, EndpointKind
+from gateway.routing.settings import HubSettings
+from gateway.routing.table import Origin
+from gateway.wire.mavlink_splitter import SplitFault
 
-MAX_SYSTEMS: Final = 32
-"""Origins remembered per client, for the display and for routing."""
+OPEN_TO_ALL: Final = frozenset(
+    {
+        EndpointKind.UDP_LISTEN,
+        EndpointKind.TCP_LISTEN,
+        EndpointKind.UDP_BROADCAST,
+        EndpointKind.UDP_MULTICAST,
+    }
+)
+"""Kinds whose peers nobody has named."""
 
 
 @dataclass(slots=True)
@@ -32,14 +41,21 @@ class Link:
     client_id: int
     endpoint: Endpoint
     remote: str
-    trusted: bool
-    since_us: int
-    name: str
+    context: "HubContext"
+    name: str = ""
     state: str = "open"
+    trusted: bool = False
+    since_us: int = 0
     heard_us: int | None = None
     round_trip_us: int | None = None
-    systems: dict[tuple[int, int], None] = field(default_factory=dict)
     counters: LinkCounters = field(default_factory=LinkCounters)
+    loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
+
+    def __post_init__(self) -> None:
+        """Take the rest from the surroundings."""
+        self.trusted = _is_trusted(self.endpoint, self.remote)
+        self.name = self.name or self.endpoint.name
+        self.since_us = self.context.now_us()
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Send one frame now or queue it; never block, never raise."""
@@ -47,6 +63,12 @@ class Link:
 
     def close(self) -> None:
         """Let go of the transport."""
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options of the same place."""
+        self.endpoint = endpoint
+        self.trusted = _is_trusted(endpoint, self.remote)
+        self.context.reconfigure(self)
 
     def tick(self, now_us: int) -> None:
         """Do what is due a few times a second: connect again, expire."""
@@ -56,24 +78,20 @@ class Link:
         """Frames that wait for a slow link."""
         return 0
 
-    def receive(
-        self, events: list[bytes | SplitFault], size: int, now_us: int, deliver: "Deliver"
-    ) -> None:
+    def receive(self, events: list[bytes | SplitFault], size: int) -> None:
         """Count what came in and pass the frames on."""
-        counters = self.counters
+        counters, context = self.counters, self.context
         counters.bytes_received += size
         for event in events:
             if isinstance(event, SplitFault):
                 counters.bytes_garbage += event.size
-                continue
-            counters.received += 1
-            self.heard_us = now_us
-            if len(self.systems) < MAX_SYSTEMS:
-                self.systems[origin_of(event)] = None
-            deliver(self, event)
+            else:
+                counters.received += 1
+                self.heard_us = context.now_us()
+                context.deliver(self, event)
 
-    def stats(self) -> ClientStats:
-        """Describe the link at this moment."""
+    def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
+        """Describe the link at this moment; the hub knows which systems are behind it."""
         counters = self.counters
         return ClientStats(
             client_id=self.client_id,
@@ -82,7 +100,7 @@ class Link:
             remote=self.remote,
             state=self.state,
             trusted=self.trusted,
-            systems=tuple(self.systems),
+            systems=systems,
             sent=counters.sent,
             dropped=counters.dropped,
             bytes_sent=counters.bytes_sent,
@@ -96,13 +114,70 @@ class Link:
         )
 
 
-Deliver = Callable[[Link, bytes], None]
-"""Takes one frame that a link received."""
+class HubContext(Protocol):
+    """What a transport asks of the hub."""
+
+    @property
+    def settings(self) -> HubSettings:
+        """The settings of this moment."""
+
+    def now_us(self) -> int:
+        """Return the gateway time."""
+
+    def new_client_id(self) -> int:
+        """Return an id that no client had before."""
+
+    def is_own(self, origin: Origin) -> bool:
+        """Tell whether a system and component is one of our vehicles."""
+
+    def deliver(self, link: Link, frame: bytes) -> None:
+        """Take one received frame."""
+
+    def appear(self, link: Link) -> None:
+        """Let a link take part."""
+
+    def greet(self, link: Link) -> None:
+        """Tell a peer that has just come which vehicles there are."""
+
+    def reconfigure(self, link: Link) -> None:
+        """Let a link's changed lists and rates hold."""
+
+    def vanish(self, link: Link) -> None:
+        """Forget a link and close it."""
 
 
-def is_loopback(host: str) -> bool:
-    """Tell whether an address is on this machine; a name never is."""
+class Listener(Protocol):
+    """An endpoint that makes a link of everyone who calls."""
+
+    endpoint: Endpoint
+
+    @property
+    def port(self) -> int:
+        """The port that is bound, or 0."""
+
+    def tick(self, now_us: int) -> None:
+        """Do what is due a few times a second."""
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options of the same place, for the clients that are there too."""
+
+    def close(self) -> None:
+        """Part from all clients and close the port."""
+
+
+def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
+    """Tell whether a peer may change state: as the URL says, else if named or on this machine."""
+    if endpoint.trusted is not None:
+        return endpoint.trusted
+    if endpoint.kind in OPEN_TO_ALL:
+        return _is_loopback(remote.rpartition(":")[0])
+    return True
+
+
+def _is_loopback(host: str) -> bool:
     try:
-        return ipaddress.ip_address(host.partition("%")[0]).is_loopback
+        address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
         return False
+    mapped = getattr(address, "ipv4_mapped", None)
+    return (mapped or address).is_loopback

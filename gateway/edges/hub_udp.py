@@ -1,21 +1,21 @@
-"""UDP to clients: one connected socket for each that is configured, one port for all that call.
+"""UDP to one peer each, on a connected socket.
 
-A connected socket costs a fifth less per datagram than an addressed one, and the kernel reports an
-ICMP refusal on exactly the socket that it concerns.
+A connected socket costs a fifth less per datagram than an addressed one, the kernel reports an
+ICMP refusal on exactly the socket that it concerns, and a send buffer of its own keeps a peer
+behind a slow interface from filling everybody's.
 """
 
 import asyncio
-import logging
 import socket
-from typing import Final, Protocol
+from collections import deque
+from collections.abc import Callable
+from typing import Final
 
-from gateway.edges.hub_link import Link, is_loopback
-from gateway.routing.clients import ClientTable, Presence
+from gateway.edges.hub_link import HubContext, Link
 from gateway.routing.endpoint import Endpoint
+from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import SplitFault, origin_of, split_datagram
-
-log = logging.getLogger(__name__)
+from gateway.wire.mavlink_splitter import split_datagram
 
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
@@ -24,96 +24,237 @@ RETRY_US: Final = US_PER_S
 """Between attempts to open a socket again: soon for a person, never spinning."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """The default holds only about 256 small datagrams; a parameter upload bursts more."""
+BACKLOG_DATAGRAMS: Final = 256
+"""Waiting behind a full socket buffer; what is older is of no use to a ground station."""
+PACK_DELAY_S: Final = 0.02
+"""How long a packed frame waits for company: one frame of the fastest stream."""
+
+Write = Callable[[bytes], object]
 
 
-class HubContext(Protocol):
-    """What a transport asks of the hub."""
-
-    def now_us(self) -> int:
-        """Return the gateway time."""
-
-    def deliver(self, link: Link, frame: bytes) -> None:
-        """Take one received frame."""
-
-    def appear(self, link: Link) -> None:
-        """Let a link take part and greet it."""
-
-    def vanish(self, link: Link) -> None:
-        """Forget a link."""
-
-    def new_client_id(self) -> int:
-        """Return an id that no client had before."""
+def _not_open(data: bytes) -> int:
+    raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
 
 
-class UdpLink(Link):
-    """A UDP peer at a fixed address."""
+class DatagramLink(Link):
+    """A peer behind a datagram socket; what is common to unicast, broadcast and multicast."""
 
-    __slots__ = ("_context", "_failing", "_loop", "_port", "_retry_us", "_socket", "_task")
+    __slots__ = (
+        "_backlog",
+        "_direct",
+        "_flush_timer",
+        "_packer",
+        "_socket",
+        "_write",
+        "refused_us",
+    )
 
-    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
-        super().__init__(
-            client_id=client_id,
-            endpoint=endpoint,
-            remote=f"{endpoint.host}:{endpoint.port}",
-            trusted=endpoint.trusted is not False,
-            since_us=context.now_us(),
-            name=endpoint.name,
-            state="resolving",
-        )
-        self._context = context
-        self._loop = asyncio.get_running_loop()
+    def __init__(
+        self,
+        context: HubContext,
+        client_id: int,
+        endpoint: Endpoint,
+        *,
+        remote: str,
+        name: str = "",
+    ) -> None:
+        super().__init__(client_id, endpoint, remote, context, name, state="resolving")
+        self.refused_us: int | None = None
         self._socket: socket.socket | None = None
-        self._port = 0
-        self._retry_us = 0
-        self._failing = False
-        self._task: asyncio.Task[None] | None = None
-        self.tick(context.now_us())
+        self._write: Write = _not_open
+        self._direct: Write = _not_open
+        self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
+        self._packer = Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
+        self._flush_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def queued(self) -> int:
+        """Datagrams that wait for room in the socket buffer."""
+        return len(self._backlog)
 
     def transmit(self, frame: bytes, message_id: int) -> None:  # noqa: ARG002
         """Send one frame; count it as dropped if the network does not take it."""
-        sock = self._socket
-        counters = self.counters
-        if sock is None:
-            counters.dropped += 1
+        if self._packer is not None:
+            self._pack(frame)
             return
         try:
-            sock.send(frame)
+            self._write(frame)
         except OSError as error:
-            if not self._sent_after_all(sock, frame, error):
-                counters.dropped += 1
-                return
+            self._recover(frame, 1, error)
+            return
+        counters = self.counters
         counters.sent += 1
         counters.bytes_sent += len(frame)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._write = _not_open
+        self.counters.dropped += len(self._backlog)
+        self._backlog.clear()
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+        if self._socket is not None:
+            self.loop.remove_reader(self._socket)
+            self.loop.remove_writer(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options, packing included."""
+        self._flush()
+        self._packer = Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
+        super().reconfigure(endpoint)
+
+    def adopt(self, sock: socket.socket, write: Write) -> None:
+        """Use an open socket from now on."""
+        self._socket = sock
+        self._write = self._direct = write
+        self.state = "open"
+        self.refused_us = None
+        self.loop.add_reader(sock, self._on_readable, sock)
+
+    def accept(self, data: bytes) -> None:
+        """Take one datagram that this peer sent."""
+        self.state = "open"
+        self.refused_us = None
+        self.receive(split_datagram(data), len(data))
+
+    def _pack(self, frame: bytes) -> None:
+        assert self._packer is not None
+        self._send_packed(self._packer.add(frame))
+        if self._flush_timer is None:
+            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+
+    def _flush(self) -> None:
+        self._flush_timer = None
+        if self._packer is not None:
+            self._send_packed(self._packer.flush())
+
+    def _send_packed(self, frames: list[bytes]) -> None:
+        if not frames:
+            return
+        data = b"".join(frames)
+        try:
+            self._write(data)
+        except OSError as error:
+            self._recover(data, len(frames), error)
+            return
+        self._count_sent(data, len(frames))
+
+    def _count_sent(self, data: bytes, frames: int) -> None:
+        self.counters.sent += frames
+        self.counters.bytes_sent += len(data)
+
+    def _recover(self, data: bytes, frames: int, error: OSError) -> None:
+        """Judge a failed send: wait for room, try again, or give the frames up."""
+        if isinstance(error, BlockingIOError) and self._socket is not None:
+            self._write = self._wait
+            self.loop.add_writer(self._socket, self._on_writable, self._socket)
+            self._wait(data)
+            self._count_sent(data, frames)
+            return
+        if isinstance(error, ConnectionRefusedError) and self._sends_after_refusal(data):
+            self._count_sent(data, frames)
+            return
+        if self._socket is not None and not isinstance(error, ConnectionRefusedError):
+            self.state = "unreachable"
+        self.counters.dropped += frames
+
+    def _sends_after_refusal(self, data: bytes) -> bool:
+        """Send again: a refusal that is told now belongs to an earlier datagram."""
+        self._note_refusal()
+        try:
+            self._write(data)
+        except OSError:
+            return False
+        return True
+
+    def _note_refusal(self) -> None:
+        self.state = "refused"
+        self.refused_us = self.context.now_us()
+
+    def _wait(self, data: bytes) -> None:
+        """Take the place of the socket while its buffer is full; the oldest makes room."""
+        if len(self._backlog) == BACKLOG_DATAGRAMS:
+            self.counters.dropped += 1
+            self.counters.sent -= 1
+        self._backlog.append(data)
+
+    def _on_writable(self, sock: socket.socket) -> None:
+        while self._backlog:
+            try:
+                self._direct(self._backlog[0])
+            except BlockingIOError:
+                return
+            except OSError:
+                self.counters.dropped += 1
+                self.counters.sent -= 1
+            self._backlog.popleft()
+        self.loop.remove_writer(sock)
+        self._write = self._direct
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        for _ in range(READ_BUDGET):
+            try:
+                data = sock.recv(MAX_DATAGRAM)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                self._note_refusal()
+                return
+            except OSError:
+                self.state = "unreachable"
+                return
+            self.accept(data)
+            if self._socket is not sock:
+                return
+
+
+class UdpLink(DatagramLink):
+    """A UDP peer at a configured place, which may be a name that resolves only later."""
+
+    __slots__ = ("_port", "_retry_us", "_task")
+
+    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
+        super().__init__(
+            context,
+            client_id,
+            endpoint,
+            remote=f"{endpoint.host}:{endpoint.port}",
+        )
+        self._port = 0
+        self._retry_us = 0
+        self._task: asyncio.Task[None] | None = None
+        self.tick(context.now_us())
 
     def tick(self, now_us: int) -> None:
         """Open the socket again if it failed; call a refusal off that was not repeated."""
         if now_us < self._retry_us:
             return
         self._retry_us = now_us + RETRY_US
-        if self._failing:
-            self._failing = False
-            if self.state == "unreachable":
-                self._drop_socket()
-        elif self._socket is not None:
+        if self.state == "unreachable":
+            super().close()
+        if self.refused_us is not None and now_us - self.refused_us >= RETRY_US:
+            self.refused_us = None
             self.state = "open"
         if self._socket is None and self._task is None:
-            self._task = self._loop.create_task(self._open())
+            self._task = self.loop.create_task(self._open())
 
     def close(self) -> None:
         """Close the socket and stop resolving."""
         if self._task is not None:
             self._task.cancel()
-        self._drop_socket()
+        super().close()
 
     async def _open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
         try:
-            found = await self._loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+            found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
             family, _, _, _, address = found[0]
-            self._socket = self._connected(family, address)
-            self.state = "open"
+            sock = self._connected(family, address)
             self.remote = f"{address[0]!s}:{address[1]!s}"
-            self._loop.add_reader(self._socket, self._on_readable)
+            self.adopt(sock, sock.send)
         except socket.gaierror:
             self.state = "resolving"
         except OSError:
@@ -135,182 +276,3 @@ class UdpLink(Link):
             raise
         self._port = sock.getsockname()[1]
         return sock
-
-    def _drop_socket(self) -> None:
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def _sent_after_all(self, sock: socket.socket, frame: bytes, error: OSError) -> bool:
-        """Judge a failed send; a refusal belongs to an earlier datagram, so this one may go."""
-        if isinstance(error, BlockingIOError):
-            return False
-        self._failing = True
-        if not isinstance(error, ConnectionRefusedError):
-            self.state = "unreachable"
-            return False
-        self.state = "refused"
-        try:
-            sock.send(frame)
-        except OSError:
-            return False
-        return True
-
-    def _on_readable(self) -> None:
-        sock = self._socket
-        for _ in range(READ_BUDGET):
-            if sock is None:
-                return
-            try:
-                data = sock.recv(MAX_DATAGRAM)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                self._failing = True
-                refused = isinstance(error, ConnectionRefusedError)
-                self.state = "refused" if refused else "unreachable"
-                return
-            self.state = "open"
-            now_us = self._context.now_us()
-            self.receive(split_datagram(data), len(data), now_us, self._context.deliver)
-
-
-class UdpPeer(Link):
-    """A client of a listening port."""
-
-    __slots__ = ("_address", "_socket")
-
-    def __init__(
-        self,
-        context: HubContext,
-        presence: Presence,
-        listener: Endpoint,
-        sock: socket.socket,
-        address: tuple[str | int, ...],
-    ) -> None:
-        host, port = presence.address
-        super().__init__(
-            client_id=presence.client_id,
-            endpoint=listener,
-            remote=f"{host}:{port}",
-            trusted=is_loopback(host) if listener.trusted is None else listener.trusted,
-            since_us=context.now_us(),
-            name=f"{host}:{port}",
-        )
-        self._socket = sock
-        self._address = address
-
-    def transmit(self, frame: bytes, message_id: int) -> None:  # noqa: ARG002
-        """Send one frame; count it as dropped if the network does not take it."""
-        counters = self.counters
-        try:
-            self._socket.sendto(frame, self._address)
-        except OSError as error:
-            counters.dropped += 1
-            if not isinstance(error, BlockingIOError):
-                self.state = "unreachable"
-            return
-        counters.sent += 1
-        counters.bytes_sent += len(frame)
-
-    def tick(self, now_us: int) -> None:  # noqa: ARG002
-        """Believe in the network again until the next failure."""
-        self.state = "open"
-
-
-class UdpListener:
-    """A port that serves everybody who speaks MAVLink to it."""
-
-    def __init__(
-        self, context: HubContext, endpoint: Endpoint, max_clients: int, idle_timeout_us: int
-    ) -> None:
-        self.endpoint = endpoint
-        self.table = ClientTable(max_clients, idle_timeout_us)
-        self._context = context
-        self._loop = asyncio.get_running_loop()
-        self._links: dict[int, UdpPeer] = {}
-        self._socket: socket.socket | None = None
-        self._retry_us = 0
-        self.tick(context.now_us())
-
-    @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-        return self._socket.getsockname()[1] if self._socket else 0
-
-    def tick(self, now_us: int) -> None:
-        """Bind again if that failed, and part from clients that have gone."""
-        if self._socket is None and now_us >= self._retry_us:
-            self._retry_us = now_us + RETRY_US
-            self._bind()
-        for presence in self.table.expire(now_us):
-            self._leave(presence)
-
-    def close(self) -> None:
-        """Part from all clients and close the port."""
-        for link in self._links.values():
-            self._context.vanish(link)
-        self._links.clear()
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def _bind(self) -> None:
-        host, port = self.endpoint.host, self.endpoint.port
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        sock = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            sock.setblocking(False)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            sock.bind((host, port))
-        except OSError as error:
-            sock.close()
-            log.warning("cannot listen at %s: %s", self.endpoint.name, error)
-            return
-        self._socket = sock
-        self._loop.add_reader(sock, self._on_readable, sock)
-
-    def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(READ_BUDGET):
-            try:
-                data, address = sock.recvfrom(MAX_DATAGRAM)
-            except OSError:
-                return
-            self._take(sock, data, address)
-
-    def _take(self, sock: socket.socket, data: bytes, address: tuple[str | int, ...]) -> None:
-        events = split_datagram(data)
-        place = (str(address[0]), int(address[1]))
-        now_us = self._context.now_us()
-        presence = self.table.find(place) or self._admit(sock, events, address, place, now_us)
-        if presence is not None:
-            presence.heard_us = now_us
-            link = self._links[presence.client_id]
-            link.receive(events, len(data), now_us, self._context.deliver)
-
-    def _admit(
-        self,
-        sock: socket.socket,
-        events: list[bytes | SplitFault],
-        address: tuple[str | int, ...],
-        place: tuple[str, int],
-        now_us: int,
-    ) -> Presence | None:
-        """Take in a new client if what it says is MAVLink and there is room."""
-        first = next((event for event in events if isinstance(event, bytes)), None)
-        if first is None:
-            return None
-        presence, leaver = self.table.admit(place, self._context.new_client_id(), now_us)
-        if leaver is not None:
-            self._leave(leaver)
-        if presence is not None:
-            presence.identity = origin_of(first)
-            link = UdpPeer(self._context, presence, self.endpoint, sock, address)
-            self._links[presence.client_id] = link
-            self._context.appear(link)
-        return presence
-
-    def _leave(self, presence: Presence) -> None:
-        self._context.vanish(self._links.pop(presence.client_id))

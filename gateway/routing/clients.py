@@ -77,6 +77,10 @@ class ClientTable:
     def __len__(self) -> int:
         return len(self._by_address)
 
+    def presences(self) -> tuple[Presence, ...]:
+        """Return all clients."""
+        return tuple(self._by_address.values())
+
     def find(self, address: tuple[str, int]) -> Presence | None:
         """Return the client at an address."""
         return self._by_address.get(address)

@@ -52,8 +52,10 @@ class Endpoint:
     """Address or name without brackets; the device of a serial port."""
     port: int
     """Port number; the baud rate of a serial port."""
+    place: str
+    """The URL without options; no two endpoints share one."""
     name: str
-    """What the operator calls it; the URL without options unless given."""
+    """What the operator calls it; the place unless given."""
     allow: frozenset[int] = frozenset()
     """Only these messages pass; empty lets all pass."""
     deny: frozenset[int] = frozenset()
@@ -102,6 +104,7 @@ def parse_endpoint(url: str) -> Endpoint:
             kind=kind,
             host=host,
             port=port,
+            place=address,
             name=options.get("name", address)[:MAX_NAME],
             allow=_messages(options.get("allow", "")),
             deny=_messages(options.get("deny", "")),

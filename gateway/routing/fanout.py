@@ -106,6 +106,12 @@ class Fanout:
         if self._outlets.pop(client_id, None):
             self._plans.clear()
 
+    def reconfigure(self, client_id: int, endpoint: Endpoint) -> None:
+        """Let changed lists and rates hold from the next frame on."""
+        if outlet := self._outlets.get(client_id):
+            outlet.endpoint = endpoint
+            self._plans.clear()
+
     def set_interval(self, wish: ClientInterval) -> None:
         """Take a client's wish for a rate; a wish of a client that has gone is ignored."""
         if outlet := self._outlets.get(wish.client_id):

@@ -19,7 +19,7 @@ class HubSettings(Settings, frozen=True):
     ] = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
     max_clients: Annotated[
         int,
-        setting("Most clients that a listening endpoint serves at once.", ge=1, le=1000),
+        setting("Most clients that a listening endpoint serves at once.", ge=1, le=500),
     ] = 32
     idle_timeout_s: Annotated[
         float,
@@ -31,6 +31,33 @@ class HubSettings(Settings, frozen=True):
             le=3600,
         ),
     ] = 30.0
+    queue_bytes: Annotated[
+        int,
+        setting(
+            "What may wait for a slow or stalled TCP client; beyond it the oldest telemetry goes. "
+            "Small: fresh data after a stall. Large: fewer gaps.",
+            "byte",
+            ge=1024,
+            le=16_777_216,
+        ),
+    ] = 65_536
+    ping_interval_s: Annotated[
+        float,
+        setting("How often each client's round trip is measured; 0 never.", "s", ge=0, le=3600),
+    ] = 5.0
+    metrics_port: Annotated[
+        int,
+        setting("Loopback port that serves Prometheus text; 0 serves none.", ge=0, le=65535),
+    ] = 0
+    realtime_priority: Annotated[
+        int,
+        setting(
+            "SCHED_RR priority of the process, which keeps latency low on a busy machine; needs "
+            "the right CAP_SYS_NICE. 0 leaves the scheduler alone.",
+            ge=0,
+            le=99,
+        ),
+    ] = 0
 
     def __post_init__(self) -> None:
         """Refuse a wrong endpoint when the settings are read, not when they are used."""

@@ -31,6 +31,8 @@ OVERHEAD_V1: Final = 8
 OVERHEAD_V2: Final = 12
 SIGNATURE_SIZE: Final = 13
 MAX_FRAME: Final = OVERHEAD_V2 + 255 + SIGNATURE_SIZE
+HEARTBEAT_TYPE_OFFSET: Final = 4
+MAV_TYPE_GCS: Final = 6
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
 
@@ -118,6 +120,12 @@ def message_id_of(frame: bytes) -> int:
     if frame[0] == START_V2:
         return frame[7] | frame[8] << 8 | frame[9] << 16
     return frame[5]
+
+
+def is_station_heartbeat(frame: bytes) -> bool:
+    """Tell whether a HEARTBEAT says that its sender is a ground station."""
+    at = (10 if frame[0] == START_V2 else 6) + HEARTBEAT_TYPE_OFFSET
+    return frame[at] == MAV_TYPE_GCS
 
 
 def is_signed(frame: bytes) -> bool:

@@ -1,0 +1,203 @@
+"""A UDP port that serves everybody who speaks MAVLink to it.
+
+The port's own socket hears only strangers: each new client gets a connected socket on the same
+port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allows that, and is set
+only after the bind, so that a second gateway on the same port still fails loudly.
+"""
+
+import asyncio
+import logging
+import socket
+import struct
+from typing import Final
+
+from gateway.edges.hub_link import HubContext
+from gateway.edges.hub_udp import (
+    MAX_DATAGRAM,
+    READ_BUDGET,
+    RECEIVE_BUFFER_BYTES,
+    RETRY_US,
+    DatagramLink,
+)
+from gateway.routing.clients import SILENT_AFTER_US, ClientTable, Presence
+from gateway.routing.endpoint import Endpoint
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import origin_of, split_datagram
+
+log = logging.getLogger(__name__)
+
+IP_PKTINFO: Final = 8
+"""Not exported by `socket` before Python 3.14; tells to which of our addresses a client spoke."""
+ANCILLARY_BYTES: Final = 64
+
+Address = tuple[str | int, ...]
+
+
+class UdpPeer(DatagramLink):
+    """A client of a listening port."""
+
+    __slots__ = ()
+
+    def __init__(self, context: HubContext, client_id: int, listener: Endpoint, peer: str) -> None:
+        super().__init__(context, client_id, listener, remote=peer, name=peer)
+
+    def tick(self, now_us: int) -> None:
+        """Call trouble off that was not repeated."""
+        if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
+            self.state = "open"
+
+    def has_died(self, now_us: int) -> bool:
+        """Tell whether the client is silent and its machine says that nobody listens."""
+        heard_us = self.heard_us if self.heard_us is not None else self.since_us
+        return self.refused_us is not None and now_us - heard_us >= SILENT_AFTER_US
+
+
+class UdpListener:
+    """The listening port and its clients."""
+
+    def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        settings = context.settings
+        self.table = ClientTable(settings.max_clients, round(settings.idle_timeout_s * US_PER_S))
+        self._context = context
+        self._loop = asyncio.get_running_loop()
+        self._links: dict[int, UdpPeer] = {}
+        self._socket: socket.socket | None = None
+        self._retry_us = 0
+        self.tick(context.now_us())
+
+    @property
+    def port(self) -> int:
+        """The port that is bound, or 0."""
+        return self._socket.getsockname()[1] if self._socket else 0
+
+    def tick(self, now_us: int) -> None:
+        """Bind again if that failed, and part from clients that have gone."""
+        settings = self._context.settings
+        self.table.max_clients = settings.max_clients
+        self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
+        if self._socket is None and now_us >= self._retry_us:
+            self._retry_us = now_us + RETRY_US
+            self._bind()
+        self._note_speakers()
+        for presence in self.table.presences():
+            if self._links[presence.client_id].has_died(now_us):
+                self.table.remove(presence)
+                self._leave(presence)
+        for presence in self.table.expire(now_us):
+            self._leave(presence)
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options of the same place, for the clients that are there too."""
+        self.endpoint = endpoint
+        for link in self._links.values():
+            link.reconfigure(endpoint)
+
+    def close(self) -> None:
+        """Part from all clients and close the port."""
+        for link in self._links.values():
+            self._context.vanish(link)
+        self._links.clear()
+        if self._socket is not None:
+            self._loop.remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def _bind(self) -> None:
+        sock = _bound((self.endpoint.host, self.endpoint.port), shared=False)
+        if sock is None:
+            log.warning("cannot listen at %s", self.endpoint.name)
+            return
+        if sock.family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_RECVPKTINFO, 1)
+        else:
+            sock.setsockopt(socket.IPPROTO_IP, IP_PKTINFO, 1)
+        self._socket = sock
+        self._loop.add_reader(sock, self._on_readable, sock)
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        for _ in range(READ_BUDGET):
+            try:
+                data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
+            except OSError:
+                return
+            self._take(data, address, _local_host(ancillary))
+
+    def _take(self, data: bytes, address: Address, local_host: str) -> None:
+        presence = self.table.find((str(address[0]), int(address[1])))
+        if presence is None:
+            presence = self._admit(data, address, local_host)
+        if presence is not None:
+            self._links[presence.client_id].accept(data)
+
+    def _admit(self, data: bytes, address: Address, local_host: str) -> Presence | None:
+        """Take in a new client if what it says is MAVLink and there is room."""
+        first = next((event for event in split_datagram(data) if isinstance(event, bytes)), None)
+        if first is None:
+            return None
+        now_us = self._context.now_us()
+        host, port = str(address[0]), int(address[1])
+        self._note_speakers()
+        presence, leaver = self.table.admit((host, port), self._context.new_client_id(), now_us)
+        if leaver is not None:
+            self._leave(leaver)
+        if presence is None:
+            return None
+        sock = _bound((local_host, self.port), shared=True)
+        if sock is None:
+            self.table.remove(presence)
+            return None
+        presence.identity = origin_of(first)
+        link = UdpPeer(self._context, presence.client_id, self.endpoint, f"{host}:{port}")
+        self._links[presence.client_id] = link
+        sock.connect(address)
+        link.adopt(sock, sock.send)
+        self._context.appear(link)
+        self._context.greet(link)
+        self._return_strays(sock, address, local_host)
+        return presence
+
+    def _note_speakers(self) -> None:
+        """Tell the table when its clients, which have sockets of their own, were last heard."""
+        for presence in self.table.presences():
+            presence.heard_us = self._links[presence.client_id].heard_us or presence.heard_us
+
+    def _return_strays(self, sock: socket.socket, peer: Address, local_host: str) -> None:
+        """Take what others sent between the bind and the connect of a client's socket."""
+        for _ in range(READ_BUDGET):
+            try:
+                data, address = sock.recvfrom(MAX_DATAGRAM)
+            except OSError:
+                return
+            self._take(data, address or peer, local_host)
+
+    def _leave(self, presence: Presence) -> None:
+        self._context.vanish(self._links.pop(presence.client_id))
+
+
+def _bound(place: tuple[str, int], *, shared: bool) -> socket.socket | None:
+    family = socket.AF_INET6 if ":" in place[0] else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if shared:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        sock.bind(place)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    except OSError:
+        sock.close()
+        return None
+    return sock
+
+
+def _local_host(ancillary: list[tuple[int, int, bytes]]) -> str:
+    """Return the address of ours that a datagram was sent to."""
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.IPPROTO_IP, IP_PKTINFO):
+            return socket.inet_ntoa(struct.unpack("=I4s4s", data[:12])[1])
+        if (level, kind) == (socket.IPPROTO_IPV6, socket.IPV6_PKTINFO):
+            host = socket.inet_ntop(socket.AF_INET6, data[:16])
+            interface = struct.unpack("=I", data[16:20])[0]
+            return f"{host}%{interface}" if host.startswith("fe80:") else host
+    return ""

@@ -1,0 +1,196 @@
+"""What waits for a slow link: bounded, the urgent first, numbered as it leaves.
+
+Three queues. The attitude and the answers a person waits for are urgent; other telemetry is usual;
+parameters, missions and files are bulk. An urgent frame goes first, but after a few of them one of
+the others gets its turn, so that a parameter list is slow on a slow radio and yet ends. When the
+bound is reached the oldest telemetry goes, usual before urgent, and bulk last: telemetry comes
+again, an answer does not.
+
+Frames leave in another order than they came, and some do not leave at all; the numbers of our own
+are therefore given at the exit. Loss that a ground station shows is then the link's alone.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from gateway.routing.table import MAX_ORIGINS, Origin
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import START_V2, origin_of, restamp
+
+URGENT_IDS: Final = frozenset({0, 30, 31, 61, 69, 70, 75, 76, 77, 253})
+"""HEARTBEAT, the attitudes, manual control and overrides, commands and answers, STATUSTEXT."""
+BULK_IDS: Final = frozenset(
+    {20, 21, 22, 23, 36, 110, 148, 300, 320, 321, 322, 323, 324, 395, 396, 397, 410}
+    | set(range(37, 52))
+    | {73}
+    | set(range(117, 123))
+)
+"""Parameters, mission transfers, files, logs, versions: asked for, and waited for."""
+
+URGENT_RUN: Final = 4
+"""Urgent frames in a row before one of another queue has its turn."""
+
+BITS_PER_BYTE: Final = 10
+"""Start bit, eight data bits, stop bit."""
+
+
+class Numbering:
+    """Give our own frames consecutive sequence numbers on one link.
+
+    Parameters
+    ----------
+    is_own : callable
+        Tells whether an origin is one of our vehicles; frames of others are never touched.
+    """
+
+    def __init__(self, is_own: Callable[[Origin], bool]) -> None:
+        self._is_own = is_own
+        self._next: dict[Origin, int] = {}
+
+    def number(self, frame: bytes) -> bytes:
+        """Return the frame as it shall leave."""
+        origin = origin_of(frame)
+        if not self._is_own(origin):
+            return frame
+        sequence = frame[4] if frame[0] == START_V2 else frame[2]
+        wanted = self._next.get(origin, sequence)
+        if len(self._next) < MAX_ORIGINS or origin in self._next:
+            self._next[origin] = wanted + 1 & 0xFF
+        return frame if wanted == sequence else restamp(frame, wanted)
+
+
+class Outbox:
+    """A bounded queue in front of one slow link.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Most bytes that wait; the newest frame is always taken.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.size = 0
+        """Bytes that wait."""
+        self._urgent: deque[bytes] = deque()
+        self._usual: deque[bytes] = deque()
+        self._bulk: deque[bytes] = deque()
+        self._run = 0
+        self._bulk_turn = False
+
+    def __len__(self) -> int:
+        return len(self._urgent) + len(self._usual) + len(self._bulk)
+
+    def push(self, frame: bytes, message_id: int) -> int:
+        """Take a frame in.
+
+        Parameters
+        ----------
+        frame : bytes
+            A complete frame.
+        message_id : int
+            Tells the queue.
+
+        Returns
+        -------
+        int
+            How many older frames had to go for it.
+        """
+        if message_id in URGENT_IDS:
+            queue = self._urgent
+        else:
+            queue = self._bulk if message_id in BULK_IDS else self._usual
+        dropped = 0
+        while self and self.size + len(frame) > self.max_bytes:
+            self.size -= len((self._usual or self._urgent or self._bulk).popleft())
+            dropped += 1
+        queue.append(frame)
+        self.size += len(frame)
+        return dropped
+
+    def pop(self) -> bytes | None:
+        """Return the frame that leaves next, or None if nothing waits."""
+        others = bool(self._usual or self._bulk)
+        if self._urgent and not (others and self._run >= URGENT_RUN):
+            self._run += 1
+            frame = self._urgent.popleft()
+        elif others:
+            self._run = 0
+            self._bulk_turn = not self._bulk_turn
+            first, second = self._usual, self._bulk
+            if self._bulk_turn:
+                first, second = second, first
+            frame = (first or second).popleft()
+        else:
+            return None
+        self.size -= len(frame)
+        return frame
+
+    def clear(self) -> int:
+        """Forget all that waits; return how many frames that were."""
+        count = len(self)
+        for queue in (self._urgent, self._usual, self._bulk):
+            queue.clear()
+        self.size = 0
+        return count
+
+
+class Packer:
+    """Gather frames into datagrams.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Largest datagram; a single longer frame still goes, alone.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._frames: list[bytes] = []
+        self._size = 0
+
+    def add(self, frame: bytes) -> list[bytes]:
+        """Take a frame in; return the frames of the datagram that is full now, or none."""
+        full: list[bytes] = []
+        if self._size + len(frame) > self._max_bytes:
+            full = self.flush()
+        self._frames.append(frame)
+        self._size += len(frame)
+        return full
+
+    def flush(self) -> list[bytes]:
+        """Return what has been gathered."""
+        frames, self._frames = self._frames, []
+        self._size = 0
+        return frames
+
+
+class Pacer:
+    """Keep the buffer of a serial line short, so that the urgent need not wait behind it.
+
+    A driver takes kilobytes at once, which at 57600 Bd is most of a second. The pacer reckons when
+    the line will have sent what it was given and lets the next frame in just before.
+
+    Parameters
+    ----------
+    baud : int
+        Line rate.
+    ahead_us : int
+        How much may lie in the driver's buffer.
+    """
+
+    def __init__(self, baud: int, ahead_us: int) -> None:
+        self._baud = baud
+        self._ahead_us = ahead_us
+        self._free_us = 0
+
+    def delay_us(self, now_us: int) -> int:
+        """Return how long to wait until the next frame may be written; 0 is now."""
+        return max(0, self._free_us - self._ahead_us - now_us)
+
+    def wrote(self, size: int, now_us: int) -> None:
+        """Note that bytes were given to the driver."""
+        busy_us = math.ceil(size * BITS_PER_BYTE * US_PER_S / self._baud)
+        self._free_us = max(self._free_us, now_us) + busy_us

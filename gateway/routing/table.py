@@ -1,0 +1,121 @@
+"""Where systems are, and which frames have been here before.
+
+Routing follows the MAVLink guide: a frame that names nobody goes to everybody but its sender; a
+frame that names a system goes only where that system (and component, if it was ever heard) speaks.
+Two ways to one system, or a cable that leads back, bring the same bytes twice; the second copy is
+dropped if it comes from elsewhere.
+
+One deviation: what a ground station says to everybody goes only where there are vehicles. Stations
+have nothing to tell each other, and scripts take the first heartbeat they hear for the vehicle's.
+"""
+
+from typing import Final
+
+from gateway.units import US_PER_S
+
+Origin = tuple[int, int]
+"""System and component id."""
+
+MAX_ORIGINS: Final = 32
+"""Remembered per client; more are forged, or a network beyond what this table is for."""
+ROUTE_FRESH_US: Final = 10 * US_PER_S
+"""A way on which a system has spoken so lately is preferred to ways on which it fell silent."""
+MAX_STATIONS: Final = 256
+MEMORY_US: Final = US_PER_S
+"""Copies on a second way come within a radio's delay; sequence numbers recur later than this."""
+MEMORY_FRAMES: Final = 8192
+"""Per generation: a second of a fast link, at most 2.3 MB."""
+
+
+class RoutingTable:
+    """Which client has spoken for which system."""
+
+    def __init__(self) -> None:
+        self._heard: dict[int, dict[Origin, int]] = {}
+        self._stations: set[Origin] = set()
+
+    def hear(self, client_id: int, origin: Origin, now_us: int) -> None:
+        """Note that a client has brought a frame of a system."""
+        origins = self._heard.setdefault(client_id, {})
+        if origin in origins or len(origins) < MAX_ORIGINS:
+            origins[origin] = now_us
+
+    def note_kind(self, origin: Origin, *, is_station: bool) -> None:
+        """Note what a heartbeat says of its sender."""
+        if not is_station:
+            self._stations.discard(origin)
+        elif len(self._stations) < MAX_STATIONS:
+            self._stations.add(origin)
+
+    def is_station(self, origin: Origin) -> bool:
+        """Tell whether a system and component is a ground station."""
+        return origin in self._stations
+
+    def ways_to_vehicles(self, source_id: int) -> list[int]:
+        """Return the clients, but the source, behind which there is more than ground stations."""
+        return [
+            client_id
+            for client_id, origins in self._heard.items()
+            if client_id != source_id and not origins.keys() <= self._stations
+        ]
+
+    def forget(self, client_id: int) -> None:
+        """Drop what a client has said."""
+        self._heard.pop(client_id, None)
+
+    def origins(self, client_id: int) -> tuple[Origin, ...]:
+        """Return the systems and components heard from a client, first heard first."""
+        return tuple(self._heard.get(client_id, ()))
+
+    def ways_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
+        """Find the clients behind which a target is.
+
+        Parameters
+        ----------
+        target : tuple of int
+            System and component; component 0 is all of the system.
+        source_id : int
+            The client that asks; never part of the answer.
+        now_us : int
+            Gateway time.
+
+        Returns
+        -------
+        list of int
+            Clients heard lately with exactly this component, else with this system; silent ones
+            only if there is no other. Empty if the target is unknown.
+        """
+        system, component = target
+        of_system: dict[int, int] = {}
+        exact: dict[int, int] = {}
+        for client_id, origins in self._heard.items():
+            if client_id == source_id:
+                continue
+            times = [at for (its_system, _), at in origins.items() if its_system == system]
+            if times:
+                of_system[client_id] = max(times)
+            if target in origins:
+                exact[client_id] = origins[target]
+        ways = exact if component and exact else of_system
+        fresh = [way for way, at in ways.items() if now_us - at <= ROUTE_FRESH_US]
+        return fresh or list(ways)
+
+
+class LoopGuard:
+    """Remember the frames of the last second and tell copies from elsewhere."""
+
+    def __init__(self) -> None:
+        self._recent: dict[bytes, int] = {}
+        self._older: dict[bytes, int] = {}
+        self._turned_us = 0
+
+    def is_copy(self, frame: bytes, client_id: int, now_us: int) -> bool:
+        """Note a frame; tell whether another client has brought the same bytes before."""
+        if now_us - self._turned_us >= MEMORY_US or len(self._recent) >= MEMORY_FRAMES:
+            self._older, self._recent = self._recent, {}
+            self._turned_us = now_us
+        first = self._recent.get(frame) or self._older.get(frame)
+        if first is None:
+            self._recent[frame] = client_id
+            return False
+        return first != client_id

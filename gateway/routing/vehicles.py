@@ -1,0 +1,73 @@
+"""Which systems are ours, and what a new client is told of them at once."""
+
+from typing import Final
+
+from gateway.routing.table import Origin
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import START_V2, origin_of, restamp
+
+HEARTBEAT_ID: Final = 0
+HOME_POSITION_ID: Final = 242
+GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
+"""In this order: that there is a vehicle, and its home."""
+OWN_FRESH_US: Final = 5 * US_PER_S
+"""A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
+
+
+class OwnVehicles:
+    """Remember the newest greeting frames of our vehicles and who waits for them.
+
+    A newcomer is greeted just before the next frame of a vehicle, with the two sequence numbers
+    before it, so that its stream begins without a gap.
+    """
+
+    def __init__(self) -> None:
+        self._seen_us: dict[Origin, int] = {}
+        self._frames: dict[Origin, dict[int, bytes]] = {}
+        self._newcomers: dict[Origin, list[int]] = {}
+
+    @property
+    def has_newcomers(self) -> bool:
+        """Whether any newcomer waits."""
+        return bool(self._newcomers)
+
+    def note(self, frame: bytes, message_id: int, now_us: int) -> None:
+        """Remember a frame of ours that belongs to the greeting."""
+        origin = origin_of(frame)
+        self._seen_us[origin] = now_us
+        self._frames.setdefault(origin, {})[message_id] = frame
+
+    def is_own(self, origin: Origin, now_us: int) -> bool:
+        """Tell whether a system and component is one of our vehicles."""
+        seen_us = self._seen_us.get(origin)
+        return seen_us is not None and now_us - seen_us <= OWN_FRESH_US
+
+    def systems(self, now_us: int) -> list[int]:
+        """Return the system ids of our vehicles, oldest first."""
+        return [origin[0] for origin in self._seen_us if self.is_own(origin, now_us)]
+
+    def await_greeting(self, client_id: int) -> None:
+        """Let a newcomer be greeted by every vehicle."""
+        for origin in self._frames:
+            self._newcomers.setdefault(origin, []).append(client_id)
+
+    def greet(self, frame: bytes) -> tuple[list[int], list[tuple[bytes, int]]]:
+        """Return who waits for the sender of a frame, and what to tell them before it.
+
+        Returns
+        -------
+        tuple
+            Client ids, and frames with their message ids.
+        """
+        origin = origin_of(frame)
+        clients = self._newcomers.pop(origin, [])
+        if not clients:
+            return [], []
+        known = self._frames[origin]
+        ids = [message_id for message_id in GREETING if message_id in known]
+        sequence = frame[4] if frame[0] == START_V2 else frame[2]
+        first = sequence - len(ids)
+        return clients, [
+            (restamp(known[message_id], first + place & 0xFF), message_id)
+            for place, message_id in enumerate(ids)
+        ]

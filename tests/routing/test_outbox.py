@@ -1,0 +1,124 @@
+"""Queues in front of slow links: order, bounds, numbers, on the manual clock."""
+
+import random
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.routing.outbox import URGENT_RUN, Numbering, Outbox, Pacer, Packer
+from gateway.wire.mavlink_splitter import split_datagram
+
+ATTITUDE, RAW_IMU, PARAM_VALUE = 30, 27, 22
+
+
+def drain(outbox: Outbox) -> list[bytes]:
+    frames = []
+    while (frame := outbox.pop()) is not None:
+        frames.append(frame)
+    return frames
+
+
+class TestOutbox:
+    def test_urgent_first_yet_bulk_ends(self) -> None:
+        outbox = Outbox(10_000)
+        for n in range(8):
+            outbox.push(b"b%d" % n, PARAM_VALUE)
+        for n in range(20):
+            outbox.push(b"a%02d" % n, ATTITUDE)
+        order = drain(outbox)
+        assert order[:URGENT_RUN] == [b"a00", b"a01", b"a02", b"a03"]
+        assert order[URGENT_RUN] == b"b0"
+        assert [f for f in order if f[:1] == b"a"] == [b"a%02d" % n for n in range(20)]
+        assert [f for f in order if f[:1] == b"b"] == [b"b%d" % n for n in range(8)]
+        assert outbox.size == 0
+
+    def test_bulk_and_usual_take_turns(self) -> None:
+        outbox = Outbox(10_000)
+        for n in range(3):
+            outbox.push(b"u%d" % n, RAW_IMU)
+            outbox.push(b"b%d" % n, PARAM_VALUE)
+        assert drain(outbox) == [b"b0", b"u0", b"b1", b"u1", b"b2", b"u2"]
+
+    def test_oldest_telemetry_goes_first_and_answers_last(self) -> None:
+        outbox = Outbox(30)
+        outbox.push(b"b" * 10, PARAM_VALUE)
+        outbox.push(b"a" * 10, ATTITUDE)
+        outbox.push(b"1" * 10, RAW_IMU)
+        assert outbox.push(b"2" * 10, RAW_IMU) == 1
+        assert outbox.push(b"A" * 10, ATTITUDE) == 1
+        assert outbox.push(b"B" * 10, PARAM_VALUE) == 1
+        assert sorted(drain(outbox)) == [b"A" * 10, b"B" * 10, b"b" * 10]
+
+    @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, PARAM_VALUE])
+    def test_the_newest_is_always_taken(self, message_id: int) -> None:
+        outbox = Outbox(30)
+        for n in range(3):
+            outbox.push(bytes((n,)) * 10, (ATTITUDE, RAW_IMU, PARAM_VALUE)[n])
+        assert outbox.push(b"n" * 30, message_id) == 3
+        assert drain(outbox) == [b"n" * 30]
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_every_frame_leaves_or_is_counted_and_the_bound_holds(self, seed: int) -> None:
+        rng = random.Random(seed)
+        outbox, pushed, dropped, left = Outbox(500), 0, 0, 0
+        for _ in range(2000):
+            if rng.random() < 0.6:
+                frame = bytes(rng.randrange(8, 60))
+                dropped += outbox.push(frame, rng.choice((ATTITUDE, RAW_IMU, PARAM_VALUE)))
+                pushed += 1
+            elif outbox.pop() is not None:
+                left += 1
+            assert outbox.size <= 500
+        assert pushed == dropped + left + len(outbox)
+        assert outbox.clear() == pushed - dropped - left
+        assert (len(outbox), outbox.size, outbox.pop()) == (0, 0, None)
+
+
+def heartbeat(system: int, sequence: int) -> bytes:
+    link = dialect.MAVLink(None, system, 1)
+    link.seq = sequence
+    return bytes(dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(link))
+
+
+class TestNumbering:
+    def test_gaps_in_our_own_are_closed(self) -> None:
+        numbering = Numbering(lambda origin: origin == (1, 1))
+        frames = [numbering.number(heartbeat(1, sequence)) for sequence in (254, 3, 9)]
+        assert [frame[4] for frame in frames] == [254, 255, 0]
+        assert all(split_datagram(frame) == [frame] for frame in frames)
+
+    def test_frames_of_others_stay(self) -> None:
+        numbering = Numbering(lambda origin: origin == (1, 1))
+        for sequence in (5, 9):
+            frame = heartbeat(2, sequence)
+            assert numbering.number(frame) is frame
+
+
+class TestPacker:
+    def test_full_datagrams_leave_and_the_rest_waits(self) -> None:
+        packer = Packer(100)
+        assert packer.add(b"a" * 60) == []
+        assert packer.add(b"b" * 40) == []
+        assert packer.add(b"c" * 1) == [b"a" * 60, b"b" * 40]
+        assert packer.flush() == [b"c"]
+        assert packer.flush() == []
+
+    def test_an_overlong_frame_goes_alone(self) -> None:
+        packer = Packer(100)
+        assert packer.add(b"a" * 200) == []
+        assert packer.add(b"b") == [b"a" * 200]
+
+
+def test_pacer_keeps_the_line_busy_but_its_buffer_short() -> None:
+    pacer, now_us, written = Pacer(baud=57600, ahead_us=20_000), 0, 0
+    while now_us < 10_000_000:
+        delay_us = pacer.delay_us(now_us)
+        if delay_us:
+            now_us += delay_us
+            continue
+        pacer.wrote(50, now_us)
+        written += 50
+        sent = now_us * 57600 // 10_000_000
+        assert written - sent <= 57600 * 20_000 // 10_000_000 + 51
+    assert written >= 57600
+    assert Pacer(57600, 20_000).delay_us(0) == 0
