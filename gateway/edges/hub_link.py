@@ -66,6 +66,8 @@ class Link:
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Take over changed options of the same place."""
+        if self.name == self.endpoint.name:
+            self.name = endpoint.name
         self.endpoint = endpoint
         self.trusted = _is_trusted(endpoint, self.remote)
         self.context.reconfigure(self)

@@ -1,0 +1,189 @@
+"""The hub between many endpoints: routing, loops, changes at run time, round trips."""
+
+from typing import Any
+
+import msgspec
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+async def world(rig: Any) -> Any:
+    """One listening port; an autopilot, a station on each of two further clients."""
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    port = hub.listening_ports()[0]
+    rig.autopilot, rig.first, rig.second = (rig.station(port) for _ in range(3))
+    rig.autopilot.sender = rig.sender(42, 1)
+    rig.second.sender = rig.sender(254, 190)
+    rig.world = hub
+    for station in (rig.first, rig.second, rig.autopilot):
+        before = len(rig.incoming)
+        station.say(station.sender.heartbeat())
+        await rig.until(lambda count=before: len(rig.incoming) > count)
+    for station in (rig.first, rig.second):
+        assert (await station.receive())[5] == 42
+    assert rig.autopilot.is_silent()
+    return rig
+
+
+async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -> None:
+    signed = world.sender(42, 1, signed=True)
+    for frame in (world.autopilot.sender.attitude(), signed.attitude()):
+        world.autopilot.say(frame)
+        assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+        assert world.foreign[-1] == frame
+
+
+async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
+    count = len(world.incoming)
+    request = world.first.sender.command(42, 1)
+    world.first.say(request)
+    assert await world.autopilot.receive() == request
+    answer = world.autopilot.sender.command(255, 190)
+    world.autopilot.say(answer)
+    assert await world.first.receive() == answer
+    assert world.second.is_silent()
+    assert len(world.incoming) == count
+
+
+async def test_a_request_to_us_stays_here(world: Any) -> None:
+    request = world.first.sender.command(1, 1)
+    world.first.say(request)
+    await world.until(lambda: world.incoming[-1].frame == request)
+    assert world.autopilot.is_silent()
+
+
+async def test_a_request_to_nobody_goes_nowhere(world: Any) -> None:
+    world.first.say(world.first.sender.command(99, 1))
+    await world.until(lambda: world.world.counters().unroutable == 1)
+    assert world.autopilot.is_silent()
+
+
+async def test_what_a_station_says_to_all_reaches_vehicles_only(world: Any) -> None:
+    said = world.first.sender.heartbeat()
+    world.first.say(said)
+    assert await world.autopilot.receive() == said
+    assert world.second.is_silent()
+
+
+async def test_copies_and_echoes_are_dropped(world: Any) -> None:
+    hub = world.world
+    frame = world.autopilot.sender.attitude()
+    world.autopilot.say(frame)
+    assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+    world.second.say(frame)
+    await world.until(lambda: hub.counters().duplicates == 1)
+    ours = world.vehicle.attitude()
+    world.first.say(ours)
+    await world.until(lambda: hub.counters().looped == 1)
+    assert world.second.is_silent()
+    assert world.incoming[-1].frame != ours
+
+
+async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
+    trusted = rig.station()
+    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
+    await rig.until_open(hub)
+    stranger = rig.station(hub.listening_ports()[0])
+    stranger.sender = rig.sender(42, 1)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    assert await trusted.receive()
+    for frame in (stranger.sender.heartbeat(), stranger.sender.command(1, 1)):
+        stranger.say(frame)
+        await rig.until(lambda frame=frame: [i.frame for i in rig.incoming][-1:] == [frame])
+        assert not rig.incoming[-1].trusted
+    stranger.say(stranger.sender.command(255, 190))
+    await rig.until(lambda: hub.counters().unroutable == 1)
+    assert trusted.is_silent()
+    assert rig.foreign == []
+
+
+async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=5.0)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 1)
+    rig.clock.us = 5_000_000
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    assert (await station.receive())[7] == 0
+    assert (await station.receive())[7] == 0
+    reader = dialect.MAVLink(None)
+    ping, sync = [reader.parse_buffer(await station.receive())[0] for _ in range(2)]
+    rig.clock.us += 1_500
+    asker = (ping.get_srcSystem(), ping.get_srcComponent())
+    station.say(station.sender.pack(dialect.MAVLink_ping_message(ping.time_usec, ping.seq, *asker)))
+    await rig.until(lambda: hub.clients()[0].round_trip_us == 1_500)
+    rig.clock.us += 500
+    station.say(station.sender.pack(dialect.MAVLink_timesync_message(77, sync.ts1)))
+    await rig.until(lambda: hub.clients()[0].round_trip_us == 2_000)
+    assert len(rig.incoming) == 1
+
+
+class TestChangesAtRunTime:
+    async def test_add_and_remove(self, rig: Any) -> None:
+        hub, station = rig.hub(), rig.station()
+        hub.add(f"udp:127.0.0.1:{station.port}?name=tablet")
+        await rig.until_open(hub)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await station.receive() == frame
+        with pytest.raises(ValueError, match="there already"):
+            hub.add(f"udp:127.0.0.1:{station.port}")
+        hub.remove("tablet")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients() == ()
+        assert station.is_silent()
+        with pytest.raises(ValueError, match="tablet"):
+            hub.remove("tablet")
+
+    async def test_reload_drops_nobody_who_stays(self, rig: Any) -> None:
+        stays, goes, comes = (rig.station() for _ in range(3))
+        hub = rig.hub(
+            "udp-listen:127.0.0.1:0",
+            f"udp:127.0.0.1:{stays.port}",
+            f"udp:127.0.0.1:{goes.port}",
+        )
+        caller = rig.station(hub.listening_ports()[0])
+        caller.say(caller.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 3)
+        await rig.until_open(hub)
+        before = {client.remote: client.client_id for client in hub.clients()}
+        hub.apply(
+            msgspec.structs.replace(
+                hub.settings,
+                endpoints=(
+                    "udp-listen:127.0.0.1:0?deny=RAW_IMU",
+                    f"udp:127.0.0.1:{stays.port}?name=laptop&deny=ATTITUDE",
+                    f"udp:127.0.0.1:{comes.port}",
+                ),
+            )
+        )
+        await rig.until_open(hub)
+        after = {client.remote: client.client_id for client in hub.clients()}
+        assert {remote: after.get(remote) for remote in before} == before | {
+            f"127.0.0.1:{goes.port}": None
+        }
+        heard = {}
+        frames = [rig.vehicle.raw_imu(), rig.vehicle.attitude()]
+        for frame in frames:
+            hub.send(rig.out(frame))
+        for name, station in (("stays", stays), ("comes", comes), ("caller", caller)):
+            heard[name] = [(await station.receive())[7]]
+            while True:
+                try:
+                    heard[name].append(station.socket.recv(100)[7])
+                except BlockingIOError:
+                    break
+        assert heard == {"stays": [27], "comes": [27, 30], "caller": [30]}
+        assert goes.is_silent()
+        assert "laptop" in {client.name for client in hub.clients()}
+
+    async def test_what_was_added_by_hand_survives_a_reload(self, rig: Any) -> None:
+        hub, station = rig.hub(), rig.station()
+        hub.add(f"udp:127.0.0.1:{station.port}")
+        hub.apply(hub.settings)
+        assert len(hub.endpoints()) == 1
