@@ -20,6 +20,7 @@ from gateway.routing.settings import HubSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
+from gateway.simulator.settings import SimulatorSettings
 from gateway.vehicle.settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
@@ -36,6 +37,7 @@ class GatewaySettings(Settings, frozen=True):
     vehicle: VehicleSettings = VehicleSettings()
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
+    simulator: SimulatorSettings = SimulatorSettings()
     calibration_folder: Annotated[
         str,
         setting(

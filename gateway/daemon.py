@@ -3,16 +3,20 @@
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
+
+import msgspec
 
 from gateway.config import GatewaySettings
 from gateway.edges.clock import GatewayClock
 from gateway.edges.hub import Hub
+from gateway.edges.pty_port import PtyPort
 from gateway.edges.serial_link import SerialLink
 from gateway.pipeline import Action, Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, GpsFix, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
+from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 
@@ -32,32 +36,42 @@ class Daemon:
         Everything that can be set.
     calibrations : mapping of int to NodeCalibration
         By vehicle id.
+    line : iterator of TimedFrame, optional
+        What a simulated receiver says; it then takes the place of the serial port.
     """
 
     def __init__(
-        self, settings: GatewaySettings, calibrations: Mapping[int, NodeCalibration]
+        self,
+        settings: GatewaySettings,
+        calibrations: Mapping[int, NodeCalibration],
+        line: Iterator[TimedFrame] | None = None,
     ) -> None:
         self.now_us = GatewayClock()
-        self._settings = settings
+        self._receiver = None if line is None else PtyPort(line)
+        serial = settings.serial
+        if self._receiver is not None:
+            serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._pipeline = Pipeline(
             PipelineSettings(settings.sensing, settings.estimation, settings.vehicle, calibrations)
         )
+        self._pipeline.disconnect(serial.port)
         self._hub = Hub(settings.hub, self._on_frame, self.now_us)
-        self._serial = SerialLink(
-            settings.serial, self._on_bytes, self._on_open, self._on_lost, self.now_us
-        )
+        self._serial = SerialLink(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
         self._hub.start()
-        self._pipeline.disconnect(self._settings.serial.port)
         self._serial.start()
+        if self._receiver is not None:
+            self._receiver.start()
         self._poll()
 
     def close(self) -> None:
         """End everything: first what comes in, then what goes out."""
+        if self._receiver is not None:
+            self._receiver.close()
         self._serial.close()
         if self._timer is not None:
             self._timer.cancel()

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import run, setup
+from gateway.cli import demo, run, setup
 
 app = typer.Typer(
     name="mavgate",
@@ -20,6 +20,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 run.register(app)
+demo.register(app)
 setup.register(app)
 
 

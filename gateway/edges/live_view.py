@@ -20,6 +20,8 @@ from gateway.units import US_PER_S
 SILENT_US: Final = 2 * US_PER_S
 UNKNOWN: Final = "—"
 LOG_LINES: Final = 5
+RATE_SNAPSHOTS: Final = 11
+"""Rates are told over so many views: a message of 1 Hz must not flicker between 0 and 2."""
 RATE_COLUMNS: Final = 3
 """Message rates stand side by side: the view must fit a terminal of 80 by 40."""
 
@@ -51,11 +53,11 @@ class RecentLog(logging.Handler):
 
 
 class LiveView:
-    """Draw snapshots; keeps the previous one to tell rates."""
+    """Draw snapshots; keeps the last ones to tell rates."""
 
     def __init__(self) -> None:
         self.log = RecentLog()
-        self._previous: Snapshot | None = None
+        self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
         """Build the whole view of one moment.
@@ -70,7 +72,8 @@ class LiveView:
         RenderableType
             To be shown by a rich `Live` or `Console`.
         """
-        previous, self._previous = self._previous or snapshot, snapshot
+        self._snapshots.append(snapshot)
+        previous = self._snapshots[0]
         parts: list[RenderableType] = [_link_line(snapshot), Text()]
         if snapshot.report.nodes:
             parts.append(_nodes(snapshot.report))

@@ -1,0 +1,36 @@
+"""Fixtures that start the gateway and clients, and end them whatever happens."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.processes import CONFIG, Client, Gateway
+
+
+@pytest.fixture
+def start_gateway(tmp_path: Path) -> Iterator[Callable[..., Gateway]]:
+    started: list[Gateway] = []
+
+    def start(command: str, *options: str, config: str = CONFIG) -> Gateway:
+        started.append(Gateway(tmp_path, command, *options, config=config))
+        return started[-1]
+
+    yield start
+    for gateway in started:
+        if gateway.process.poll() is None:
+            gateway.process.kill()
+            gateway.process.wait(10)
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., Client]]:
+    clients: list[Client] = []
+
+    def make(port: int = 0) -> Client:
+        clients.append(Client(port))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.sock.close()

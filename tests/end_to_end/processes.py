@@ -1,0 +1,85 @@
+"""The gateway as its users start it: a process of its own, and a bare client of it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from pymavlink.dialects.v20 import common as mavlink
+
+START_LIMIT_S = 90.0
+"""The first start after an upgrade compiles; everything else takes a second."""
+
+CONFIG = """
+[hub]
+endpoints = ["udp:127.0.0.1:{port}", "udp-listen:127.0.0.1:{listen}"]
+
+[simulator]
+gps_first_fix_s = 0.5
+"""
+
+
+def free_udp_ports(count: int) -> list[int]:
+    """Find UDP ports that nobody uses."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for sock in sockets:
+            sock.bind(("127.0.0.1", 0))
+        return [sock.getsockname()[1] for sock in sockets]
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
+class Gateway:
+    """A running `mavgate` process."""
+
+    def __init__(self, folder: Path, command: str, *options: str, config: str = CONFIG) -> None:
+        self.port, self.listen_port = free_udp_ports(2)
+        self.log = folder / "mavgate.log"
+        file = folder / "gateway.toml"
+        file.write_text(config.format(port=self.port, listen=self.listen_port))
+        arguments = ["-m", "gateway.cli", command, "--plain", "--config", str(file), *options]
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"COLUMNS": "200"},
+            )
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(10)
+
+
+class Client:
+    """A bare MAVLink client, decoding with pymavlink alone."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sock.bind(("127.0.0.1", port))
+        self.sock.settimeout(START_LIMIT_S)
+        self.mavlink = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+
+    def receive(self) -> list[mavlink.MAVLink_message]:
+        """Wait for a datagram and decode it."""
+        return self.mavlink.parse_buffer(self.sock.recv(65_536)) or []
+
+    def until(
+        self, wanted: Callable[[dict[str, mavlink.MAVLink_message]], bool], limit: int = 20_000
+    ) -> dict[str, mavlink.MAVLink_message]:
+        """Receive until what was seen, newest by name, satisfies a condition."""
+        seen: dict[str, mavlink.MAVLink_message] = {}
+        for _ in range(limit):
+            for message in self.receive():
+                seen[message.get_type()] = message
+            if wanted(seen):
+                return seen
+        raise AssertionError(f"not in {limit} datagrams; seen: {sorted(seen)}")
+
+    def send(self, message: mavlink.MAVLink_message, port: int) -> None:
+        self.sock.sendto(message.pack(self.mavlink), ("127.0.0.1", port))

@@ -1,0 +1,146 @@
+"""`mavgate demo` as a ground station meets it."""
+
+import asyncio
+import math
+import os
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.simulator.settings import SimulatorSettings
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+
+HOME = SimulatorSettings()
+NEAR_DEG = 0.001
+"""Standing on the runway: about 100 m."""
+
+EXPECTED = {
+    "HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "ATTITUDE_QUATERNION", "ATTITUDE",
+    "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "HIGHRES_IMU", "SCALED_PRESSURE",
+    "HOME_POSITION", "RADIO_STATUS", "STATUSTEXT",
+}  # fmt: skip
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+
+def test_every_message_arrives_and_stopping_is_clean(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
+) -> None:
+    gateway = start_gateway("demo")
+    seen = connect(gateway.port).until(lambda seen: set(seen) >= EXPECTED)
+    heartbeat, place = seen["HEARTBEAT"], seen["GLOBAL_POSITION_INT"]
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
+    assert place.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert place.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    assert gateway.stop() == 0
+    assert "Traceback" not in gateway.log.read_text()
+
+
+def test_whoever_speaks_to_the_listening_port_is_served(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
+) -> None:
+    gateway = start_gateway("demo")
+    connect(gateway.port).until(lambda seen: "HEARTBEAT" in seen)
+    guest = connect()
+    beat = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+    )
+    guest.send(beat, gateway.listen_port)
+    guest.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
+
+
+async def test_mavsdk_sees_vehicle_attitude_and_position(
+    start_gateway: Callable[..., Gateway],
+) -> None:
+    gateway = start_gateway("demo")
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
+        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+        telemetry = TelemetryAsync(system)
+        async with asyncio.timeout(30):
+            async for place in telemetry.subscribe_position():
+                if math.isfinite(place.latitude_deg):
+                    break
+            attitude = await anext(telemetry.subscribe_attitude_euler())
+            speeds = await anext(telemetry.subscribe_fixedwing_metrics())
+    assert place.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert place.longitude_deg == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    assert place.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=20.0)
+    assert abs(attitude.roll_deg) < 10.0
+    assert abs(speeds.climb_rate_m_s) < 3.0
+
+
+class MavProxy:
+    """MAVProxy without its windows, driven as by keyboard."""
+
+    def __init__(self, port: int, folder: Path) -> None:
+        self.output = ""
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                str(Path(sys.executable).parent / "mavproxy.py"),
+                f"--master=udpin:127.0.0.1:{port}",
+                f"--state-basedir={folder}",
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            cwd=folder,
+        )
+
+    def type(self, command: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{command}\n".encode())
+        self.process.stdin.flush()
+
+    def until(self, pattern: str) -> re.Match[str]:
+        """Read until the output holds a pattern."""
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + START_LIMIT_S
+        while (found := re.search(pattern, self.output)) is None:
+            wait_s = deadline - time.monotonic()
+            ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, wait_s))
+            assert ready, f"{pattern!r} did not come; MAVProxy said:\n{self.output}"
+            self.output += os.read(self.process.stdout.fileno(), 65_536).decode(errors="replace")
+        return found
+
+
+@pytest.fixture
+def start_mavproxy(tmp_path: Path) -> Iterator[Callable[[int], MavProxy]]:
+    started: list[MavProxy] = []
+
+    def start(port: int) -> MavProxy:
+        started.append(MavProxy(port, tmp_path))
+        return started[-1]
+
+    yield start
+    for proxy in started:
+        proxy.process.kill()
+        proxy.process.communicate()
+
+
+def test_mavproxy_sees_vehicle_attitude_and_position(
+    start_gateway: Callable[..., Gateway], start_mavproxy: Callable[[int], MavProxy]
+) -> None:
+    gateway = start_gateway("demo")
+    proxy = start_mavproxy(gateway.port)
+    proxy.until(r"Detected vehicle 1:1")
+    proxy.until(r"Home set by GPS")
+    proxy.type("status")
+    place = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),")
+    assert int(place[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert int(place[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    attitude = proxy.until(r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),")
+    assert abs(float(attitude[1])) < 0.2
+    assert abs(float(attitude[2])) < 0.2
