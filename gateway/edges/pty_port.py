@@ -1,0 +1,118 @@
+"""A pseudo-terminal that speaks like the receiver's serial port, at the true rate.
+
+Whoever opens `path` meets what a USB adapter would show: bytes at their times, and none kept for a
+reader that is not there (beyond the kernel's few kilobytes, which opening flushes).
+"""
+
+import asyncio
+import os
+import tty
+from collections.abc import Iterator
+from typing import Final
+
+from gateway.simulator.receiver import TimedFrame
+
+MAX_LATE_S: Final = 1.0
+"""A loop held up for longer, as by a suspended machine, goes on where it was: making up for it
+would hold up the loop even more."""
+
+MAX_BATCH: Final = 64
+"""Frames written in one go before the loop's other work gets its turn."""
+
+
+class PtyPort:
+    """Play timed frames on a pseudo-terminal; never blocks, never grows.
+
+    Parameters
+    ----------
+    frames : iterator of TimedFrame
+        In the order of time; pulled one ahead.
+    speed : float
+        How much faster than true time; positive.
+
+    Raises
+    ------
+    ValueError
+        If the speed is not positive.
+    OSError
+        If the machine has no pseudo-terminal left.
+    """
+
+    def __init__(self, frames: Iterator[TimedFrame], speed: float = 1.0) -> None:
+        if not speed > 0.0:
+            raise ValueError(f"speed of {speed}; it must be positive")
+        self.written = 0
+        """Frames that went out whole."""
+        self.dropped = 0
+        """Frames that found the terminal full, since nobody reads."""
+        self.ended = asyncio.Event()
+        """Set after the last frame, and by closing."""
+        self._frames = frames
+        self._speed = speed
+        self._next: TimedFrame | None = None
+        self._rest = b""
+        self._start_s = 0.0
+        self._timer: asyncio.Handle | None = None
+        self._master, self._slave = os.openpty()
+        # Our own end of the slave stays open, so a reader that leaves causes no hang-up.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        """The device to open instead of a serial port."""
+
+    def start(self) -> None:
+        """Begin: the frames' time zero is now. Needs a running event loop."""
+        self._start_s = asyncio.get_running_loop().time()
+        self._advance()
+
+    def close(self) -> None:
+        """Stop and remove the terminal; may be called twice."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._master >= 0:
+            os.close(self._master)
+            os.close(self._slave)
+            self._master = self._slave = -1
+        self.ended.set()
+
+    def _advance(self) -> None:
+        """Write what is due and wait for the next frame."""
+        loop = asyncio.get_running_loop()
+        self._timer = None
+        for _ in range(MAX_BATCH):
+            if self._next is None:
+                self._next = next(self._frames, None)
+            if self._next is None:
+                self.ended.set()
+                return
+            due_s = self._start_s + self._next.time_s / self._speed
+            late_s = loop.time() - due_s
+            if late_s < 0.0:
+                self._timer = loop.call_at(due_s, self._advance)
+                return
+            if late_s > MAX_LATE_S:
+                self._start_s += late_s
+            self._write(self._next.data)
+            self._next = None
+        self._timer = loop.call_soon(self._advance)
+
+    def _write(self, data: bytes) -> None:
+        """Write one frame whole, or keep its end for the next time, or drop it."""
+        if self._rest:
+            self._rest = self._rest[self._put(self._rest) :]
+        if self._rest:
+            self.dropped += 1
+            return
+        count = self._put(data)
+        if count:
+            self.written += 1
+            self._rest = data[count:]
+        else:
+            self.dropped += 1
+
+    def _put(self, data: bytes) -> int:
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0

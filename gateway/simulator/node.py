@@ -1,0 +1,214 @@
+"""The two radio nodes of an aircraft: samples in, payloads out, each at its moment."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+import numpy as np
+
+from gateway.records import GpsFixType, ImuFlags, NodeId
+from gateway.simulator.flight import GPS_NODE, IMU_NODE, Aircraft
+from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
+from gateway.simulator.noise import FloatArray
+from gateway.simulator.samplers import BaroSamples, DeviceClock, ImuSamples
+from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, IntArray
+from gateway.simulator.settings import SimulatorSettings
+from gateway.wire.payloads import (
+    BaroPayload,
+    GpsFixPayload,
+    GpsQualityPayload,
+    ImuPayload,
+    NodeStatusPayload,
+    Payload,
+)
+
+IMU_READING_S: Final = 0.0011
+"""MPU6050 and HMC5883L over a 400 kHz bus."""
+BARO_READING_S: Final = 0.0006
+GPS_READING_S: Final = 0.009
+"""100 bytes of UBX-NAV-PVT at 115 200 baud."""
+STATUS_S: Final = 1.0
+
+IMU_SENSORS: Final = 0b0111
+GPS_SENSORS: Final = 0b1000
+POWER_ON: Final = 1
+LOOP_US: Final = 1400
+SUPPLY_MV: Final = 3300
+UINT16_MAX: Final = 65_535
+INT16_MAX: Final = 32_767
+
+UNIX_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """One payload on its way to the node's radio."""
+
+    time_s: float
+    """True time at which the node hands it over."""
+    node_time_us: int
+    """The payload's stamp on the node's clock, not wrapped."""
+    payload: Payload
+
+
+class Node(ABC):
+    """A source of payloads, run on piece by piece.
+
+    Parameters
+    ----------
+    node_id : NodeId
+    clock : DeviceClock
+    sensors : int
+        Bits of the sensors on it.
+    rate_hz : int
+        What it reports as its sample rate.
+    """
+
+    def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
+        self.node_id = node_id
+        self.radio_failed = 0
+        self.radio_retries = 0
+        self._clock = clock
+        self._sensors = sensors
+        self._rate_hz = rate_hz
+        self._waiting: list[Sent] = []
+        self._statuses = 0
+
+    def take(self, until_s: float) -> list[Sent]:
+        """Give every payload handed to the radio before a true time, in order."""
+        # Stable: a fix stays behind the quality payload of the same moment.
+        made = sorted(
+            [*self._waiting, *self._make(until_s), *self._report(until_s)],
+            key=lambda sent: sent.time_s,
+        )
+        ready = sum(1 for sent in made if sent.time_s < until_s)
+        self._waiting = made[ready:]
+        return made[:ready]
+
+    @abstractmethod
+    def _make(self, until_s: float) -> Iterator[Sent]:
+        """Make at least every payload that is handed over before a true time."""
+
+    def _report(self, until_s: float) -> Iterator[Sent]:
+        while (time_s := (self._statuses + 0.5) * STATUS_S) < until_s:
+            self._statuses += 1
+            status = NodeStatusPayload(
+                firmware_version=(1, 0),
+                reset_cause=POWER_ON,
+                sensors_present=self._sensors,
+                sensors_failed=0,
+                bus_errors=0,
+                radio_failed=self.radio_failed & UINT16_MAX,
+                radio_retries=self.radio_retries & UINT16_MAX,
+                loop_max_us=LOOP_US,
+                sample_rate_hz=self._rate_hz,
+                supply_mv=SUPPLY_MV,
+            )
+            yield Sent(time_s, self._clock.at(time_s), status)
+
+
+class ImuNode(Node):
+    """MPU6050, HMC5883L and BMP180 of a simulated aircraft."""
+
+    def __init__(self, aircraft: Aircraft, rate_hz: int) -> None:
+        node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
+        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz)
+        self._aircraft = aircraft
+
+    def _make(self, until_s: float) -> Iterator[Sent]:
+        yield from imu_payloads(self._aircraft.imu.take(until_s))
+        yield from baro_payloads(self._aircraft.baro.take(until_s))
+
+
+class GpsNode(Node):
+    """M8N of a simulated aircraft."""
+
+    def __init__(self, aircraft: Aircraft, geoid_separation_m: float) -> None:
+        node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
+        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ)
+        self._aircraft = aircraft
+        self._geoid_separation_m = geoid_separation_m
+
+    def _make(self, until_s: float) -> Iterator[Sent]:
+        gps = self._aircraft.gps.take(until_s)
+        yield from gps_payloads(gps, self._clock, self._geoid_separation_m)
+
+
+def nodes_of(aircraft: Aircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
+    """Put the two nodes into an aircraft."""
+    return (
+        ImuNode(aircraft, settings.imu_rate_hz),
+        GpsNode(aircraft, settings.geoid_separation_m),
+    )
+
+
+def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
+    """Pack IMU samples."""
+    columns = (
+        imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw,
+        imu.temperature_raw, imu.flags,
+    )  # fmt: skip
+    for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
+        *(column.tolist() for column in columns), strict=True
+    ):
+        payload = ImuPayload(
+            accel=tuple(accel),
+            gyro=tuple(gyro),
+            mag=tuple(mag),
+            temperature=temperature,
+            flags=ImuFlags(flags),
+            accel_range=ACCEL_RANGE,
+            gyro_range=GYRO_RANGE,
+            mag_gain=MAG_GAIN,
+        )
+        yield Sent(time_s + IMU_READING_S, node_us, payload)
+
+
+def baro_payloads(baro: BaroSamples) -> Iterator[Sent]:
+    """Pack barometer samples."""
+    columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+    for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
+        payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
+        yield Sent(time_s + BARO_READING_S, node_us, payload)
+
+
+def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float) -> Iterator[Sent]:
+    """Pack GPS messages, each as quality and fix."""
+    h_acc_cm, v_acc_cm = _held(gps.h_acc_m), _held(gps.v_acc_m)
+    speed_acc_cmps, course_acc_cdeg = _held(gps.speed_acc_mps), _held(gps.course_acc_deg)
+    pdop_centi = _held(gps.pdop)
+    lat_dege7, lon_dege7 = np.rint(gps.lat_deg * 1e7), np.rint(gps.lon_deg * 1e7)
+    vel_cmps = np.clip(np.rint(gps.vel_n_mps * 100.0), -INT16_MAX, INT16_MAX).astype(np.int64)
+    for k, time_s in enumerate(gps.time_s.tolist()):
+        itow_ms, node_us = int(gps.itow_ms[k]), clock.at(time_s)
+        utc = UNIX_EPOCH + timedelta(microseconds=int(gps.unix_us[k]))
+        quality = GpsQualityPayload(
+            itow_ms=itow_ms,
+            h_acc_cm=int(h_acc_cm[k]),
+            v_acc_cm=int(v_acc_cm[k]),
+            speed_acc_cmps=int(speed_acc_cmps[k]),
+            course_acc_cdeg=int(course_acc_cdeg[k]),
+            pdop_centi=int(pdop_centi[k]),
+            geoid_separation_cm=round(geoid_separation_m * 100.0),
+            utc=utc if gps.time_valid[k] else None,
+        )
+        north, east, down = vel_cmps[k].tolist()
+        fix = GpsFixPayload(
+            itow_ms=itow_ms,
+            lat_dege7=int(lat_dege7[k]),
+            lon_dege7=int(lon_dege7[k]),
+            alt_amsl_mm=round(float(gps.alt_amsl_m[k]) * 1e3),
+            vel_n_cmps=(north, east, down),
+            fix_type=GpsFixType(int(gps.fix_type[k])),
+            fix_ok=bool(gps.has_fix[k]),
+            satellites=int(gps.satellites[k]),
+        )
+        yield Sent(time_s + GPS_READING_S, node_us, quality)
+        yield Sent(time_s + GPS_READING_S, node_us, fix)
+
+
+def _held(values: FloatArray) -> IntArray:
+    """Scale to hundredths, held at the end of 16 bits."""
+    return np.clip(np.rint(values * 100.0), 0, UINT16_MAX).astype(np.int64)

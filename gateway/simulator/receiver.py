@@ -1,0 +1,277 @@
+"""The radio between nodes and receiver, the receiver, and its serial line.
+
+Theory of operation. Each node sends one payload after the other; a payload that meets noise is
+repeated by the radio chip, which delays it and all behind it, and is lost after the last try. The
+receiver stamps what arrives with its own clock and queues it for the serial line; what finds the
+queue full is dropped and counted. A frame's time is that of its last bit on the line.
+
+Everything runs in pieces of `PIECE_S`, so memory stays the same however long it runs.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Final
+
+import numpy as np
+
+from gateway.records import PipeCounters
+from gateway.simulator.flight import START_UNIX_US, Aircraft
+from gateway.simulator.node import Node, Sent, nodes_of
+from gateway.simulator.samplers import Chance, DeviceClock, generator
+from gateway.simulator.settings import SimulatorSettings
+from gateway.wire.framing import encode_frame
+from gateway.wire.payloads import (
+    PIPES,
+    Header,
+    Payload,
+    ReceiverStatusFrame,
+    encode_payload,
+    encode_radio,
+    encode_receiver_status,
+)
+
+PIECE_S: Final = 0.1
+"""Short enough that making a piece holds up an event loop by no more than 2 ms."""
+
+ATTEMPT_S: Final = 0.00045
+"""130 us of settling and 40 bytes with preamble, address and CRC at 1 Mbit/s."""
+RETRY_S: Final = 0.00075
+"""Wait for the acknowledgement, then the chip's auto-retransmit delay."""
+RETRIES: Final = 5
+RETRY_SHARE: Final = 0.08
+"""Share of the attempts that have to be repeated."""
+
+RECEIVER_BOOT_US: Final = 1_618_033
+RECEIVER_SKEW_SHARE: Final = 0.5
+HANDLING_S: Final = 0.0001
+LINE_BUFFER_BYTES: Final = 512
+REPORT_ROOM_BYTES: Final = 80
+"""Kept free for the status frame, or a full line would never tell that it is full."""
+BITS_PER_BYTE: Final = 10
+STATUS_S: Final = 1.0
+CHANNEL: Final = 76
+NOISE_PERCENT: Final = 2
+POWER_ON: Final = 1
+
+UINT8: Final = 1 << 8
+UINT16: Final = 1 << 16
+UINT32: Final = 1 << 32
+
+
+@dataclass(frozen=True, slots=True)
+class TimedFrame:
+    """The bytes of one serial frame, delimiter included."""
+
+    time_s: float
+    """True time since the start at which its last bit leaves the receiver; never goes back."""
+    data: bytes
+    damaged: int = 0
+    """How many of its bytes are not what the receiver sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    time_s: float
+    path: "_RadioPath"
+    header: Header
+    payload: Payload
+
+
+class _RadioPath:
+    """One node's radio: order, retries, loss and duplicates."""
+
+    def __init__(
+        self, node: Node, pipe: int, settings: SimulatorSettings, rng: np.random.Generator
+    ) -> None:
+        self.pipe = pipe
+        self.last_seq: int | None = None
+        self._node = node
+        self._rng = rng
+        self._free_s = 0.0
+        self._seq = 0
+        self._losing = False
+        self._duplicates = settings.radio_duplicates
+        # Gilbert's two-state channel: its long-run share of losses is `radio_loss`.
+        self._leave_loss = 1.0 / settings.radio_burst
+        enter = settings.radio_loss / (settings.radio_burst * (1.0 - settings.radio_loss))
+        self._enter_loss = min(enter, 1.0)
+
+    def run(self, until_s: float) -> Iterator[_Arrival]:
+        """Send all that the node hands over before a true time."""
+        for sent in self._node.take(until_s):
+            yield from self._send(sent)
+
+    def _send(self, sent: Sent) -> Iterator[_Arrival]:
+        seq, self._seq = self._seq, (self._seq + 1) % UINT16
+        change, luck, twice = self._rng.random(3).tolist()
+        self._losing = change >= self._leave_loss if self._losing else change < self._enter_loss
+        retries = RETRIES
+        if not self._losing:
+            # The number of attempts is geometric; those beyond the last retry are not losses here.
+            retries = min(int(math.log(1.0 - luck) / math.log(RETRY_SHARE)), RETRIES)
+        start_s = max(sent.time_s, self._free_s)
+        arrival_s = start_s + ATTEMPT_S + retries * RETRY_S
+        self._free_s = arrival_s
+        self._node.radio_retries += retries
+        if self._losing:
+            self._node.radio_failed += 1
+            return
+        header = Header(self._node.node_id, seq, sent.node_time_us % UINT32)
+        yield _Arrival(arrival_s, self, header, sent.payload)
+        if twice < self._duplicates:
+            # The acknowledgement was lost, and the chip's own duplicate check missed it.
+            self._free_s += RETRY_S
+            self._node.radio_retries += 1
+            yield _Arrival(self._free_s, self, header, sent.payload)
+
+
+class SimulatedReceiver:
+    """The receiver on the ground, hearing the nodes.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+        Radio, line and clocks.
+    nodes : sequence of Node
+        In the order of their pipes; more than six share them.
+    """
+
+    def __init__(self, settings: SimulatorSettings, nodes: Sequence[Node]) -> None:
+        self._settings = settings
+        self._clock = DeviceClock(RECEIVER_BOOT_US, settings.clock_skew_ppm * RECEIVER_SKEW_SHARE)
+        self._paths = [_make_path(k, node, settings) for k, node in enumerate(nodes)]
+        self._received = [0] * PIPES
+        self._lost = [0] * PIPES
+        self._dropped = 0
+        self._frame_seq = 0
+        self._line_free_s = 0.0
+
+    def frames(self, until_s: float = math.inf) -> Iterator[TimedFrame]:
+        """Give the serial frames in the order of time; call it once.
+
+        Parameters
+        ----------
+        until_s : float
+            True time at which the receiver is switched off.
+
+        Yields
+        ------
+        TimedFrame
+        """
+        frames = self._clean_frames(until_s)
+        if self._settings.corrupt_bytes > 0.0:
+            rng = generator(self._settings, 0, Chance.LINE)
+            frames = damage(frames, self._settings.corrupt_bytes, rng)
+        return frames
+
+    def _clean_frames(self, until_s: float) -> Iterator[TimedFrame]:
+        waiting: list[_Arrival] = []
+        next_status_s = STATUS_S
+        for piece in itertools.count(1):
+            end_s = min(piece * PIECE_S, until_s)
+            arrivals = [a for path in self._paths for a in path.run(end_s)]
+            arrivals = sorted([*waiting, *arrivals], key=attrgetter("time_s"))
+            ready = sum(1 for arrival in arrivals if arrival.time_s < end_s)
+            waiting = arrivals[ready:]
+            for arrival in arrivals[:ready]:
+                while next_status_s <= arrival.time_s:
+                    yield from self._report(next_status_s)
+                    next_status_s += STATUS_S
+                yield from self._pass_on(arrival)
+            while next_status_s < end_s:
+                yield from self._report(next_status_s)
+                next_status_s += STATUS_S
+            if end_s >= until_s:
+                return
+
+    def _pass_on(self, arrival: _Arrival) -> Iterator[TimedFrame]:
+        path = arrival.path
+        self._received[path.pipe] += 1
+        if path.last_seq is not None:
+            gap = (arrival.header.seq - path.last_seq - 1) % UINT16
+            # A duplicate leaves a gap of 65 535.
+            self._lost[path.pipe] += gap if gap < UINT16 // 2 else 0
+        path.last_seq = arrival.header.seq
+        stamp_us = self._clock.at(arrival.time_s) % UINT32
+        packet = encode_payload(arrival.header, arrival.payload)
+        content = encode_radio(self._frame_seq, path.pipe, stamp_us, packet)
+        yield from self._write(arrival.time_s, content, LINE_BUFFER_BYTES - REPORT_ROOM_BYTES)
+
+    def _report(self, time_s: float) -> Iterator[TimedFrame]:
+        counters = zip(self._received, self._lost, strict=True)
+        status = ReceiverStatusFrame(
+            frame_seq=self._frame_seq,
+            receiver_time_us=self._clock.at(time_s) % UINT32,
+            channel=CHANNEL,
+            noise_percent=NOISE_PERCENT,
+            uart_dropped=self._dropped % UINT16,
+            reset_cause=POWER_ON,
+            pipes=tuple(PipeCounters(received, lost, 0) for received, lost in counters),
+        )
+        yield from self._write(time_s, encode_receiver_status(status), LINE_BUFFER_BYTES)
+
+    def _write(self, time_s: float, content: bytes, room: int) -> Iterator[TimedFrame]:
+        # A dropped frame takes its number with it, so that the gateway sees the gap.
+        self._frame_seq = (self._frame_seq + 1) % UINT8
+        data = encode_frame(content)
+        byte_s = BITS_PER_BYTE / self._settings.baud
+        queued = max(self._line_free_s - time_s, 0.0) / byte_s
+        if queued + len(data) > room:
+            self._dropped += 1
+            return
+        start_s = max(time_s + HANDLING_S, self._line_free_s)
+        self._line_free_s = start_s + len(data) * byte_s
+        yield TimedFrame(self._line_free_s, data)
+
+
+def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) -> SimulatedReceiver:
+    """Set up the receiver and all aircraft of the settings.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+    start_unix_us : int
+        UTC at the start, which the GPS will tell.
+
+    Returns
+    -------
+    SimulatedReceiver
+    """
+    nodes: list[Node] = []
+    for index in range(settings.vehicles):
+        nodes += nodes_of(Aircraft(settings, index, start_unix_us), settings)
+    return SimulatedReceiver(settings, nodes)
+
+
+def damage(
+    frames: Iterator[TimedFrame], share: float, rng: np.random.Generator
+) -> Iterator[TimedFrame]:
+    """Change a share of the bytes to any other value.
+
+    Parameters
+    ----------
+    frames : iterator of TimedFrame
+    share : float
+        Probability that a byte is hit, 0 to 1.
+    rng : numpy.random.Generator
+
+    Yields
+    ------
+    TimedFrame
+        With the number of its damaged bytes.
+    """
+    for frame in frames:
+        data = np.frombuffer(frame.data, dtype=np.uint8)
+        hit = rng.random(len(data)) < share
+        flips = rng.integers(1, UINT8, len(data), dtype=np.uint8) * hit
+        yield TimedFrame(frame.time_s, (data ^ flips).tobytes(), int(hit.sum()))
+
+
+def _make_path(index: int, node: Node, settings: SimulatorSettings) -> _RadioPath:
+    rng = np.random.default_rng(
+        [settings.seed, node.node_id.vehicle_id, Chance.RADIO, node.node_id.node_id]
+    )
+    return _RadioPath(node, index % PIPES, settings, rng)

@@ -1,0 +1,109 @@
+"""Payloads carry what the sensors read, at their moments."""
+
+import numpy as np
+import pytest
+
+from gateway.records import GpsFixType, ImuFlags, NodeId
+from gateway.simulator.flight import Aircraft, fly
+from gateway.simulator.node import GpsNode, ImuNode, Sent, nodes_of
+from gateway.simulator.settings import SimulatorSettings
+from gateway.wire.payloads import (
+    BaroPayload,
+    GpsFixPayload,
+    GpsQualityPayload,
+    Header,
+    ImuPayload,
+    NodeStatusPayload,
+    decode_payload,
+    encode_payload,
+)
+
+SETTINGS = SimulatorSettings()
+SECONDS = 20.0
+
+
+def nodes() -> tuple[ImuNode, GpsNode]:
+    return nodes_of(Aircraft(SETTINGS), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def imu_sent() -> list[Sent]:
+    return nodes()[0].take(SECONDS)
+
+
+@pytest.fixture(scope="module")
+def gps_sent() -> list[Sent]:
+    return nodes()[1].take(SECONDS)
+
+
+def of_kind(sent: list[Sent], kind: type) -> list[Sent]:
+    return [s for s in sent if isinstance(s.payload, kind)]
+
+
+class TestImuNode:
+    def test_sends_the_flight(self, imu_sent: list[Sent]) -> None:
+        imu = fly(SETTINGS, duration_s=SECONDS).imu
+        payloads = [s.payload for s in of_kind(imu_sent, ImuPayload)]
+        np.testing.assert_array_equal([p.accel for p in payloads], imu.accel_raw[: len(payloads)])
+        np.testing.assert_array_equal([p.gyro for p in payloads], imu.gyro_raw[: len(payloads)])
+        np.testing.assert_array_equal([p.mag for p in payloads], imu.mag_raw[: len(payloads)])
+        assert len(payloads) == pytest.approx(2000, abs=1)
+        assert payloads[0].flags & ImuFlags.MAG_NEW
+        assert (payloads[0].accel_range, payloads[0].gyro_range, payloads[0].mag_gain) == (2, 2, 1)
+
+    def test_sends_barometer_and_status(self, imu_sent: list[Sent]) -> None:
+        baro = [s.payload for s in of_kind(imu_sent, BaroPayload)]
+        assert len(baro) == pytest.approx(500, abs=1)
+        assert all(9_900_000 < p.pressure_centipa < 10_130_000 for p in baro)
+        status = [s.payload for s in of_kind(imu_sent, NodeStatusPayload)]
+        assert len(status) == 20
+        assert (status[0].sensors_present, status[0].sample_rate_hz) == (0b0111, 100)
+
+    def test_stamps_the_sampling(self, imu_sent: list[Sent]) -> None:
+        stamps = [s.node_time_us for s in of_kind(imu_sent, ImuPayload)]
+        assert set(np.diff(stamps)) == {10_000}
+        times = np.array([s.time_s for s in of_kind(imu_sent, ImuPayload)])
+        np.testing.assert_allclose(np.diff(times), 0.01 / (1.0 + 120e-6), atol=1e-9)
+
+
+class TestGpsNode:
+    def test_sends_quality_before_its_fix(self, gps_sent: list[Sent]) -> None:
+        messages = [s.payload for s in gps_sent if not isinstance(s.payload, NodeStatusPayload)]
+        for quality, fix in zip(messages[::2], messages[1::2], strict=True):
+            assert isinstance(quality, GpsQualityPayload)
+            assert isinstance(fix, GpsFixPayload)
+            assert quality.itow_ms == fix.itow_ms
+
+    def test_tells_when_it_has_no_fix(self, gps_sent: list[Sent]) -> None:
+        fixes = of_kind(gps_sent, GpsFixPayload)
+        for sent in fixes:
+            found = sent.time_s > 5.15
+            assert sent.payload.fix_ok is found
+            assert (sent.payload.fix_type is GpsFixType.FIX_3D) is found
+        qualities = [s.payload for s in of_kind(gps_sent, GpsQualityPayload)]
+        assert qualities[0].utc is None
+        assert qualities[0].h_acc_cm == 9999
+        assert qualities[-1].utc is not None
+        assert qualities[-1].geoid_separation_cm == 2300
+
+    def test_leads_to_the_place(self, gps_sent: list[Sent]) -> None:
+        fix = of_kind(gps_sent, GpsFixPayload)[50].payload
+        assert fix.lat_dege7 == pytest.approx(-77_656_000, abs=1000)
+        assert fix.lon_dege7 == pytest.approx(1_103_728_000, abs=2000)
+        assert fix.alt_amsl_mm == pytest.approx(110_000, abs=8000)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_pieces_equal_the_whole_and_stay_in_order(index: int) -> None:
+    whole = nodes()[index].take(12.0)
+    node = nodes()[index]
+    pieces = [sent for k in range(1, 121) for sent in node.take(k * 0.1)]
+    assert pieces == whole
+    times = [sent.time_s for sent in whole]
+    assert times == sorted(times)
+
+
+def test_every_payload_fits_the_radio(imu_sent: list[Sent], gps_sent: list[Sent]) -> None:
+    for sent in (*imu_sent, *gps_sent):
+        header = Header(NodeId(31, 7), 65_535, sent.node_time_us)
+        assert decode_payload(encode_payload(header, sent.payload)) == (header, sent.payload)

@@ -1,0 +1,196 @@
+"""The frames on the line: decodable, in order, with the losses that were asked for."""
+
+import gc
+import itertools
+import tracemalloc
+
+import msgspec
+import numpy as np
+import pytest
+
+from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
+from gateway.simulator.flight import fly
+from gateway.simulator.receiver import TimedFrame, damage, simulate
+from gateway.simulator.settings import SimulatorSettings
+from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame
+from gateway.wire.link import Link
+from gateway.wire.payloads import RadioFrame, ReceiverStatusFrame, decode_content
+
+SECONDS = 20.0
+
+
+def settings(**changes: object) -> SimulatorSettings:
+    return msgspec.structs.replace(SimulatorSettings(), **changes)
+
+
+def frames(seconds: float = SECONDS, **changes: object) -> list[TimedFrame]:
+    return list(simulate(settings(**changes)).frames(seconds))
+
+
+def decoded(line: list[TimedFrame]) -> list[RadioFrame | ReceiverStatusFrame]:
+    events = FrameDecoder().feed(b"".join(frame.data for frame in line))
+    contents = [decode_content(event.content) for event in events if isinstance(event, Frame)]
+    assert len(contents) == len(line)
+    return [c for c in contents if isinstance(c, RadioFrame | ReceiverStatusFrame)]
+
+
+@pytest.fixture(scope="module")
+def line() -> list[TimedFrame]:
+    return frames()
+
+
+class TestLine:
+    def test_every_frame_decodes(self, line: list[TimedFrame]) -> None:
+        contents = decoded(line)
+        assert len(contents) == len(line)
+        sequence = [content.frame_seq for content in contents]
+        assert all((b - a) % 256 == 1 for a, b in itertools.pairwise(sequence))
+
+    def test_time_goes_on_and_the_line_is_not_too_fast(self, line: list[TimedFrame]) -> None:
+        for before, after in itertools.pairwise(line):
+            assert after.time_s - before.time_s >= len(after.data) * 10 / 500_000 - 1e-9
+        assert line[-1].time_s < SECONDS + 0.01
+
+    def test_receiver_stamps_the_arrival(self, line: list[TimedFrame]) -> None:
+        for frame, content in zip(line, decoded(line), strict=True):
+            heard_s = (content.receiver_time_us - 1_618_033) * 1e-6 / (1.0 + 60e-6)
+            assert 0.0 < frame.time_s - heard_s < 0.006
+
+    def test_receiver_reports_once_a_second(self, line: list[TimedFrame]) -> None:
+        reports = [c for c in decoded(line) if isinstance(c, ReceiverStatusFrame)]
+        assert len(reports) == 19
+        assert reports[-1].pipes[0].received == pytest.approx(19 * 126, rel=0.03)
+        assert reports[-1].pipes[1].received == pytest.approx(19 * 11, rel=0.05)
+        assert reports[-1].pipes[2].received == 0
+
+    def test_seeds(self, line: list[TimedFrame]) -> None:
+        same, other = frames(5.0), frames(5.0, seed=2)
+        assert same == line[: len(same)]
+        assert same != other
+
+    def test_too_slow_a_line_drops_and_counts(self) -> None:
+        contents = decoded(frames(10.0, baud=38_400, imu_rate_hz=200))
+        report = [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1]
+        assert report.uart_dropped > 100
+        radio = [c.frame_seq for c in contents]
+        assert any((b - a) % 256 > 1 for a, b in itertools.pairwise(radio)), "the gap shows"
+
+    def test_thousand_samples_a_second_fit(self) -> None:
+        contents = decoded(frames(3.0, imu_rate_hz=1000, radio_loss=0.0))
+        assert [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1].uart_dropped == 0
+        assert len(contents) == pytest.approx(3 * 1037, rel=0.01)
+
+
+class TestRadio:
+    @pytest.mark.parametrize(("loss", "burst"), [(0.0, 1.0), (0.01, 1.0), (0.1, 1.0), (0.1, 20.0)])
+    def test_loss_is_as_set(self, loss: float, burst: float) -> None:
+        line = frames(100.0, radio_loss=loss, radio_burst=burst, radio_duplicates=0.0)
+        seqs = [
+            c.header.seq for c in decoded(line)
+            if isinstance(c, RadioFrame) and c.header.node == NodeId(1, 0)
+        ]  # fmt: skip
+        gaps = np.diff(seqs) - 1
+        assert (gaps >= 0).all()
+        share = gaps.sum() / (gaps.sum() + len(seqs))
+        # A burst counts as one draw: fewer independent draws, wider bounds.
+        assert share == pytest.approx(loss, abs=4.0 * np.sqrt(2.0 * burst * loss / 12_600) + 1e-9)
+        if loss:
+            assert gaps[gaps > 0].mean() == pytest.approx(burst, rel=0.35)
+
+    def test_duplicates(self) -> None:
+        link = feed(frames(30.0, radio_duplicates=0.05, radio_loss=0.0))
+        report = link.report(30_000_000, connected=True, port="")
+        imu = next(node for node in report.nodes if node.node == NodeId(1, 0))
+        assert imu.duplicates == pytest.approx(0.05 * imu.received, rel=0.2)
+        assert imu.lost == 0
+
+
+def feed(line: list[TimedFrame]) -> Link:
+    link = Link()
+    for frame in line:
+        link.feed(frame.data, round(frame.time_s * 1e6))
+    return link
+
+
+class TestThroughTheWire:
+    def test_clocks_run_as_set(self) -> None:
+        link = feed(frames(60.0, clock_skew_ppm=300.0))
+        nodes = link.report(60_000_000, connected=True, port="").nodes
+        skews = {node.node.node_id: node.clock_skew_ppm for node in nodes}
+        assert skews[0] == pytest.approx(300.0, abs=5.0)
+        assert skews[1] == pytest.approx(-300.0, abs=15.0)
+
+    def test_records_are_those_of_the_flight(self) -> None:
+        # Without losses, since a fix whose quality payload was lost has no accuracy or time.
+        line, link = frames(radio_loss=0.0), Link()
+        records = [r for f in line for r in link.feed(f.data, round(f.time_s * 1e6))]
+        direct = {
+            (type(r), r.node_time_us): r for r in fly(settings(), duration_s=SECONDS).records()
+        }
+        for record in records:
+            if isinstance(record, ImuRaw | BaroRaw | GpsFix):
+                original = direct[type(record), record.node_time_us]
+                assert abs(record.time_us - original.time_us) < 12_000
+                if isinstance(record, ImuRaw):
+                    assert (record.accel_raw, record.gyro_raw, record.mag_raw, record.flags) == (
+                        original.accel_raw, original.gyro_raw, original.mag_raw, original.flags
+                    )  # fmt: skip
+                if isinstance(record, GpsFix):
+                    assert (record.lat_dege7, record.utc_us, record.fix_type) == (
+                        original.lat_dege7, original.utc_us, original.fix_type
+                    )  # fmt: skip
+
+    def test_three_aircraft_share_the_receiver(self) -> None:
+        link = feed(frames(5.0, vehicles=3, vehicle_id=7))
+        nodes = link.report(5_000_000, connected=True, port="").nodes
+        assert {(n.node.vehicle_id, n.node.node_id, n.pipe) for n in nodes} == {
+            (7, 0, 0), (7, 1, 1), (8, 0, 2), (8, 1, 3), (9, 0, 4), (9, 1, 5)
+        }  # fmt: skip
+
+
+class TestDamage:
+    def test_hits_the_share_of_bytes(
+        self, rng: np.random.Generator, line: list[TimedFrame]
+    ) -> None:
+        hit = list(damage(iter(line), 0.1, rng))
+        size = sum(len(frame.data) for frame in line)
+        assert sum(f.damaged for f in hit) == pytest.approx(0.1 * size, rel=0.03)
+        for before, after in zip(line, hit, strict=True):
+            differing = sum(a != b for a, b in zip(before.data, after.data, strict=True))
+            assert differing == after.damaged
+            assert after.time_s == before.time_s
+
+    @pytest.mark.parametrize("share", [0.002, 0.02, 0.1])
+    def test_what_comes_through_can_be_told(self, share: float) -> None:
+        """A frame survives if it and the delimiter before it are whole."""
+        clean = frames(10.0)
+        hit = frames(10.0, corrupt_bytes=share)
+        expected = 0
+        delimiter = True
+        for frame in hit:
+            expected += delimiter and frame.damaged == 0
+            delimiter = frame.data[-1] == 0
+        events = FrameDecoder().feed(b"".join(frame.data for frame in hit))
+        good = [event for event in events if isinstance(event, Frame)]
+        assert len(good) == expected
+        contents = {encode_frame(frame.content) for frame in good}
+        assert contents <= {frame.data for frame in clean}
+        assert any(event.kind is FaultKind.CRC for event in events if not isinstance(event, Frame))
+
+
+@pytest.mark.slow
+def test_memory_stays_the_same() -> None:
+    """Nothing is kept but what waits for its moment, however long it runs."""
+    walk = simulate(settings(imu_rate_hz=20, baro_rate_hz=1)).frames()
+    sizes = []
+    tracemalloc.start()
+    for until_s in (10.0, 30.0, 60.0):
+        next(frame for frame in walk if frame.time_s > until_s)
+        sizes.append(_traced_after_collection())
+    tracemalloc.stop()
+    assert sizes[2] - sizes[1] < 8_000
+
+
+def _traced_after_collection() -> int:
+    gc.collect()
+    return tracemalloc.get_traced_memory()[0]
