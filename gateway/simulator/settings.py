@@ -11,7 +11,12 @@ class SimulatorSettings(Settings, frozen=True):
     """The simulated aircraft, its sensors, its radio and the receiver."""
 
     seed: Annotated[
-        int, setting("Start of every random number; the same seed flies the same flight.", ge=0)
+        int,
+        setting(
+            "Start of every random number; the same seed flies the same flight.",
+            ge=0,
+            le=2**32 - 1,
+        ),
     ] = 1
     vehicle_id: Annotated[
         int, setting("Vehicle id in the frames of the first aircraft.", ge=1, le=31)

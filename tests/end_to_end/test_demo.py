@@ -104,15 +104,17 @@ class MavProxy:
         self.process.stdin.write(f"{command}\n".encode())
         self.process.stdin.flush()
 
-    def until(self, pattern: str) -> re.Match[str]:
-        """Read until the output holds a pattern."""
+    def until(self, pattern: str, asking: str = "") -> re.Match[str]:
+        """Read until the output holds a pattern; ask for it by a command every second."""
         assert self.process.stdout is not None
         deadline = time.monotonic() + START_LIMIT_S
         while (found := re.search(pattern, self.output)) is None:
-            wait_s = deadline - time.monotonic()
-            ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, wait_s))
-            assert ready, f"{pattern!r} did not come; MAVProxy said:\n{self.output}"
-            self.output += os.read(self.process.stdout.fileno(), 65_536).decode(errors="replace")
+            assert time.monotonic() < deadline, f"no {pattern!r} in:\n{self.output}"
+            if asking:
+                self.type(asking)
+            ready, _, _ = select.select([self.process.stdout], [], [], 1.0)
+            if ready:
+                self.output += os.read(self.process.stdout.fileno(), 65_536).decode()
         return found
 
 
@@ -137,8 +139,7 @@ def test_mavproxy_sees_vehicle_attitude_and_position(
     proxy = start_mavproxy(gateway.port)
     proxy.until(r"Detected vehicle 1:1")
     proxy.until(r"Home set by GPS")
-    proxy.type("status")
-    place = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),")
+    place = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),", "status")
     assert int(place[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     assert int(place[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
     attitude = proxy.until(r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),")
