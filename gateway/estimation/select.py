@@ -2,6 +2,8 @@
 
 from typing import Annotated, Literal
 
+from gateway.estimation.complementary.estimator import ComplementaryEstimator
+from gateway.estimation.complementary.state import ComplementarySettings
 from gateway.estimation.interface import Estimator
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
@@ -18,6 +20,7 @@ class EstimationSettings(Settings, frozen=True):
     )
     reference: ReferenceSettings = ReferenceSettings()
     paper: PaperSettings = PaperSettings()
+    complementary: ComplementarySettings = ComplementarySettings()
 
 
 def make_estimator(settings: EstimationSettings) -> Estimator:
@@ -33,4 +36,6 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     Estimator
         Fresh, for one aircraft.
     """
+    if settings.estimator == "complementary":
+        return ComplementaryEstimator(settings.complementary, settings.reference)
     return PaperEstimator(settings.paper, settings.reference)

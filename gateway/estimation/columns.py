@@ -1,0 +1,137 @@
+"""The one definition of the numbers that go into and come out of the kernels.
+
+A live sample is one row, a log many of the same: this is why both give the same bits.
+"""
+
+import math
+from typing import Final
+
+from gateway.estimation.record import FloatArray
+from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    GpsFix,
+    ImuFlags,
+    ImuSample,
+    NavFlags,
+    NavState,
+)
+from gateway.units import DEG_PER_DEGE7
+
+ImuRow = tuple[float, float, float, float, float, float, float, float, float, float]
+GpsRow = tuple[float, ...]
+
+ACCEL: Final = 0
+"""Specific force in body FRD, m/s2: three columns."""
+GYRO: Final = 3
+"""Angular rate in body FRD, rad/s: three columns."""
+MAG: Final = 6
+"""Magnetic field in body FRD, uT: three columns, NaN unless new."""
+CLIPPED: Final = 9
+"""1 where a sensor touched the end of its range, else 0."""
+IMU_COLUMNS: Final = 10
+
+GPS_USABLE: Final = 0
+"""1 for a fix that may be fused, else 0."""
+GPS_LAT: Final = 1
+GPS_LON: Final = 2
+GPS_ALT: Final = 3
+GPS_VEL: Final = 4
+"""Velocity NED, m/s: three columns, NaN where the receiver tells none."""
+GPS_H_ACC: Final = 7
+GPS_V_ACC: Final = 8
+GPS_SPEED_ACC: Final = 9
+"""The receiver's own standard deviations; NaN where it tells none."""
+GPS_DECLINATION: Final = 10
+"""Declination in rad; NaN while not known."""
+GPS_COLUMNS: Final = 11
+
+NAV_QUAT: Final = 0
+NAV_RATE: Final = 4
+NAV_LAT: Final = 7
+NAV_LON: Final = 8
+NAV_ALT: Final = 9
+NAV_VEL: Final = 10
+NAV_ATTITUDE_STD: Final = 13
+NAV_VEL_STD: Final = 16
+NAV_POS_STD: Final = 19
+NAV_FLAGS: Final = 22
+NAV_COLUMNS: Final = 23
+
+CLIP_FLAGS: Final = ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
+
+
+def imu_row(sample: ImuSample) -> ImuRow:
+    """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
+    clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
+    mag = sample.mag_b_ut or UNKNOWN_VEC3
+    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped)
+
+
+def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:
+    """Lay out a fix together with the declination at its place.
+
+    Parameters
+    ----------
+    fix : GpsFix
+        As it arrived.
+    settings : ReferenceSettings
+        Tells which fixes are usable.
+    earth : EarthField
+        Told the place of a usable fix.
+
+    Returns
+    -------
+    tuple of floats
+        `GPS_COLUMNS` of them.
+    """
+    lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
+    usable = is_usable(fix, settings)
+    if usable:
+        earth.update(lat_deg, lon_deg, fix.alt_amsl_m, fix.utc_us)
+    vel = fix.vel_n_mps
+    if not all(map(math.isfinite, vel)):
+        vel = (NAN, NAN, NAN)
+    return (
+        1.0 if usable else 0.0,
+        lat_deg,
+        lon_deg,
+        fix.alt_amsl_m,
+        *vel,
+        fix.h_acc_m,
+        fix.v_acc_m,
+        fix.speed_acc_mps,
+        earth.declination_rad,
+    )
+
+
+def nav_state(time_us: int, row: FloatArray) -> NavState:
+    """Read a navigation state out of a kernel's output row.
+
+    Parameters
+    ----------
+    time_us : int
+        Gateway clock.
+    row : ndarray, shape (NAV_COLUMNS,)
+        Output of a kernel.
+
+    Returns
+    -------
+    NavState
+        The same as a record.
+    """
+    v = row.tolist()
+    return NavState(
+        time_us=time_us,
+        q_nb=(v[0], v[1], v[2], v[3]),
+        rate_b_radps=(v[4], v[5], v[6]),
+        lat_deg=v[NAV_LAT],
+        lon_deg=v[NAV_LON],
+        alt_amsl_m=v[NAV_ALT],
+        vel_n_mps=(v[10], v[11], v[12]),
+        attitude_std_rad=(v[13], v[14], v[15]),
+        vel_std_mps=(v[16], v[17], v[18]),
+        pos_std_m=(v[19], v[20], v[21]),
+        flags=NavFlags(int(v[NAV_FLAGS])),
+    )

@@ -1,0 +1,1 @@
+"""The default estimator: a quaternion complementary filter with GPS and compass references."""

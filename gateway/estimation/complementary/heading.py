@@ -1,0 +1,118 @@
+"""The heading: a scalar filter fed by the compass and by the GPS acceleration.
+
+The level frame of the tilt filter drifts about the vertical with the gyroscope; `heading_rad` is
+the turn from it to NED. Its variance makes the compass a first-order filter with a fixed time
+constant that starts as a plain mean, and weighs compass against GPS. A field whose strength or
+dip is not the usual one is not believed for a minute; a new field that stays the same while the
+aircraft turns becomes the usual one.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.complementary.state import Gains, State
+from gateway.estimation.magfield import judge_field
+from gateway.estimation.record import as_quat
+from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.records import Vec3
+
+UNKNOWN_VAR: Final = 10.0
+"""Variance of a heading of which nothing is known, rad2."""
+GOOD_VAR: Final = 0.07
+"""Up to 15 deg of standard deviation, the GPS acceleration may be turned by the heading."""
+MATCH_MEMORY_S: Final = 30.0
+MATCH_INFORMATION: Final = 25.0
+"""Information in 1/rad2 at which matched accelerations give the first heading."""
+MATCH_WINDOW_S: Final = 1.0
+"""Differences of successive velocities share their noise; over this time it averages out."""
+
+STALE_MAG_S: Final = 1.0
+MIN_FIELD_UT: Final = 1.0
+
+
+@compiled
+def is_heading_good(s: State) -> bool:
+    """Tell whether horizontal vectors may be turned by the heading."""
+    return s.heading_known == 1 and s.heading_var < GOOD_VAR
+
+
+@compiled
+def correct_heading(s: State, measured_rad: float, variance: float) -> None:
+    """Blend one measured heading in, the shortest way round."""
+    if s.heading_known == 0:
+        s.heading_rad, s.heading_var, s.heading_known = measured_rad, variance, 1
+        return
+    gain = s.heading_var / (s.heading_var + variance)
+    s.heading_rad = wrap_pi(s.heading_rad + gain * wrap_pi(measured_rad - s.heading_rad))
+    s.heading_var *= 1.0 - gain
+
+
+@compiled
+def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
+    """Correct the heading by one magnetometer sample.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    mag_b : tuple of 3 floats
+        Calibrated field in body FRD, uT.
+    """
+    dt = s.time_s - s.mag_s
+    if dt <= 0.0:
+        return
+    s.mag_s = s.time_s
+    north, east, down = rotate(as_quat(s.q_eb), mag_b)
+    norm = math.sqrt(north * north + east * east + down * down)
+    if norm < MIN_FIELD_UT:
+        return
+    dt = min(dt, STALE_MAG_S)
+    weight = judge_field(s, p, norm, math.asin(down / norm), dt)
+    if weight <= 0.0:
+        return
+    declination = s.declination_rad
+    if s.heading_known == 0 or math.isfinite(declination):
+        s.heading_true = 1 if math.isfinite(declination) else s.heading_true
+    measured = -math.atan2(east, north)
+    if math.isfinite(declination):
+        measured += declination
+    correct_heading(s, measured, p.heading_noise_rad2s / (dt * weight))
+
+
+@compiled
+def take_match(s: State, p: Gains, force_e: Vec3, accel_n: Vec3, dt: float) -> None:
+    """Correct the heading by matching the horizontal force with the GPS acceleration.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    force_e : tuple of 3 floats
+        Mean specific force in the level frame, m/s2.
+    accel_n : tuple of 3 floats
+        Mean acceleration in NED, m/s2.
+    dt : float
+        Length of the interval, s.
+    """
+    real = force_e[0] * accel_n[0] + force_e[1] * accel_n[1]
+    imag = force_e[0] * accel_n[1] - force_e[1] * accel_n[0]
+    power = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
+    noise = p.gps_velocity_noise_mps
+    information = power * dt * MATCH_WINDOW_S / (2.0 * noise * noise)
+    if s.heading_known == 1:
+        if information > 0.0:
+            s.heading_true = 1
+            correct_heading(s, math.atan2(imag, real), 1.0 / information)
+        return
+    kept = math.exp(-dt / MATCH_MEMORY_S)
+    s.match[0] = kept * s.match[0] + dt * real
+    s.match[1] = kept * s.match[1] + dt * imag
+    s.match[2] = kept * s.match[2] + information
+    if s.match[2] > MATCH_INFORMATION:
+        s.heading_true = 1
+        correct_heading(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])

@@ -1,0 +1,156 @@
+"""Position and velocity: dead reckoning between fixes, blended at each fix as of when it was valid.
+
+Horizontally the paper's eq. 1, 2, 7 and 8 as recursions; the weights follow from a time constant,
+so they suit any fix rate. Vertically the barometer, offset to the GPS height, blends in the same
+way and also learns the error of the vertical acceleration.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import GPS_H_ACC
+from gateway.estimation.complementary.state import Gains, State
+from gateway.estimation.record import FloatArray, as_quat, put
+from gateway.geometry.quaternion import rotate
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+DRIFT_MPS2: Final = 1.0
+"""Acceleration error that dead reckoning may have had, for the gates."""
+BLUNDER_H_ACC_M: Final = 30.0
+ACCEL_BIAS_LIMIT_MPS2: Final = 1.0
+BARO_STALE_S: Final = 2.0
+REST_DECAY_S: Final = 0.5
+
+
+@compiled
+def dead_reckon(s: State, force_b: Vec3, dt: float) -> None:
+    """Integrate the acceleration twice: the inertial path of eq. 1, 2, 7 and 8.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    force_b : tuple of 3 floats
+        Specific force in body FRD, m/s2.
+    dt : float
+        Time step, s.
+    """
+    force_i = rotate(as_quat(s.q_ib), force_b)
+    north, east, down = rotate(as_quat(s.q_nb), force_b)
+    accel = (north, east, down + STANDARD_GRAVITY_MPS2 - s.accel_bias_d)
+    for k in range(3):
+        s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * accel[k] * dt) * dt
+        s.integrals[3 + k] += accel[k] * dt
+        s.integrals[k] += force_i[k] * dt
+        s.pos_n[k] += (s.vel_n[k] + 0.5 * accel[k] * dt) * dt
+        s.vel_n[k] += accel[k] * dt
+
+
+@compiled
+def restart_at(s: State, pos: Vec3, vel: Vec3, lag: float) -> None:
+    """Take position and velocity from one fix alone."""
+    put(s.vel_n, vel)
+    for k in range(2):
+        s.pos_n[k] = pos[k] + vel[k] * lag
+    if s.has_height == 0 or s.baro_known == 0:
+        s.pos_n[2] = pos[2] + vel[2] * lag
+    elif s.baro_known == 1:
+        # The barometer has held the height so far; the fix tells its offset to the sea.
+        shift = pos[2] + vel[2] * lag - s.pos_n[2]
+        s.pos_n[2] += shift
+        s.baro_offset_m += shift
+    s.has_height = 1
+
+
+@compiled
+def is_plausible(s: State, p: Gains, row: FloatArray, off_m: float, off_mps: float) -> bool:
+    """Judge a fix by its distance from dead reckoning, the wider the longer that has run."""
+    age = min(s.time_s - s.fix_s, 120.0)
+    h_acc = row[GPS_H_ACC]
+    allowed_m = p.gps_gate_m + 0.5 * DRIFT_MPS2 * age * age
+    if math.isfinite(h_acc):
+        allowed_m += 3.0 * min(h_acc, BLUNDER_H_ACC_M)
+    return off_m < allowed_m and off_mps < p.gps_gate_mps + DRIFT_MPS2 * age
+
+
+@compiled
+def blend_fix(
+    s: State, p: Gains, pos: Vec3, vel: Vec3, past: tuple[Vec3, Vec3], lag: float
+) -> None:
+    """Blend one accepted fix: eq. 1, 2, 7 and 8 at the time the fix was valid.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    pos, vel : tuple of 3 floats
+        The fix.
+    past : tuple
+        Own position and velocity at that time.
+    lag : float
+        How long ago that was, s.
+    """
+    dt = max(s.time_s - s.fix_s, 1e-3)
+    gain_vel = 1.0 - math.exp(-dt / p.tau_velocity_s)
+    gain_pos = 1.0 - math.exp(-dt / p.tau_position_s)
+    for k in range(2):
+        step = gain_vel * (vel[k] - past[1][k])
+        s.pos_n[k] += gain_pos * (pos[k] - past[0][k]) + step * lag
+        s.vel_n[k] += step
+    baro_fresh = s.baro_known == 1 and s.time_s - s.baro_s < BARO_STALE_S
+    if baro_fresh:
+        gain = 1.0 - math.exp(-dt / p.tau_baro_offset_s)
+        shift = gain * (pos[2] - past[0][2])
+        s.baro_offset_m += shift
+        s.pos_n[2] += shift
+    else:
+        step = gain_vel * (vel[2] - past[1][2])
+        s.pos_n[2] += gain_pos * (pos[2] - past[0][2]) + step * lag
+        s.vel_n[2] += step
+
+
+@compiled
+def take_baro(s: State, p: Gains, alt_m: float) -> None:
+    """Blend one barometer height.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    alt_m : float
+        Pressure altitude, positive up.
+    """
+    if s.started == 0 or not math.isfinite(alt_m):
+        return
+    down = -alt_m
+    if s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:
+        if s.has_height == 0:
+            s.pos_n[2], s.vel_n[2], s.has_height = down, 0.0, 1
+            s.baro_offset_m = 0.0
+        else:
+            s.baro_offset_m = s.pos_n[2] - down
+        s.baro_known = 1
+        s.baro_s = s.time_s
+        return
+    dt = min(s.time_s - s.baro_s, 0.25 * p.tau_baro_s)
+    s.baro_s = s.time_s
+    error = down + s.baro_offset_m - s.pos_n[2]
+    rate = dt / p.tau_baro_s
+    s.pos_n[2] += 3.0 * rate * error
+    s.vel_n[2] += 3.0 * rate / p.tau_baro_s * error
+    bias = s.accel_bias_d - rate / (p.tau_baro_s * p.tau_baro_s) * error
+    s.accel_bias_d = max(-ACCEL_BIAS_LIMIT_MPS2, min(ACCEL_BIAS_LIMIT_MPS2, bias))
+
+
+@compiled
+def stand_still(s: State, dt: float) -> None:
+    """Let the velocity fade while the aircraft stands."""
+    kept = math.exp(-dt / REST_DECAY_S)
+    for k in range(3):
+        s.vel_n[k] *= kept

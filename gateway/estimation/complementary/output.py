@@ -1,0 +1,102 @@
+"""What the complementary estimator tells: its output row and flags."""
+
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_QUAT,
+    NAV_RATE,
+    NAV_VEL,
+)
+from gateway.estimation.complementary.heading import STALE_MAG_S, is_heading_good
+from gateway.estimation.complementary.navigation import BARO_STALE_S
+from gateway.estimation.complementary.state import State
+from gateway.estimation.flagbits import (
+    ALTITUDE_VALID,
+    AT_REST,
+    ATTITUDE_VALID,
+    DEAD_RECKONING,
+    DEGRADED,
+    GPS_REJECTED,
+    HEADING_VALID,
+    MAG_DISTURBED,
+    POSITION_VALID,
+    SENSOR_FAULT,
+    USING_BARO,
+    USING_GPS,
+    USING_MAG,
+    VELOCITY_VALID,
+)
+from gateway.estimation.place import NEVER_S
+from gateway.estimation.record import FloatArray
+from gateway.geometry.geodesy import offset_deg
+from gateway.records import NAN
+
+FRESH_GPS_S: Final = 1.5
+DEAD_RECKONING_MAX_S: Final = 60.0
+"""Dead reckoning longer than this is no position any more."""
+
+
+@compiled
+def tell(s: State, row: FloatArray) -> None:
+    """Write the output row.
+
+    Parameters
+    ----------
+    s : State
+        Unchanged.
+    row : ndarray, shape (NAV_COLUMNS,)
+        Filled; standard deviations are not known to this estimator.
+    """
+    row[NAV_QUAT : NAV_QUAT + 4] = s.q_nb
+    row[NAV_RATE : NAV_RATE + 3] = s.rate_b
+    row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
+    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
+    row[NAV_FLAGS] = float(flags_of(s))
+    if s.has_origin == 0:
+        row[NAV_LAT] = row[NAV_LON] = NAN
+        row[NAV_VEL : NAV_VEL + 3] = NAN
+        return
+    lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
+    row[NAV_LAT], row[NAV_LON] = lat, lon
+    row[NAV_VEL : NAV_VEL + 3] = s.vel_n
+
+
+@compiled
+def flags_of(s: State) -> int:
+    """Put the flags together."""
+    flags = ATTITUDE_VALID if s.started == 1 else 0
+    if s.heading_known == 1 and s.heading_true == 1 and is_heading_good(s):
+        flags |= HEADING_VALID
+    if s.at_rest == 1:
+        flags |= AT_REST
+    if s.time_s - s.mag_s < STALE_MAG_S:
+        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+    if s.time_s - s.baro_s < BARO_STALE_S:
+        flags |= USING_BARO
+    if s.has_height == 1:
+        flags |= ALTITUDE_VALID
+    if s.fault == 1:
+        flags |= SENSOR_FAULT | DEGRADED
+    return flags | gps_flags(s)
+
+
+@compiled
+def gps_flags(s: State) -> int:
+    """Tell the flags that follow from the age of the last accepted fix."""
+    if s.fix_s == NEVER_S:
+        return 0
+    age = s.time_s - s.fix_s
+    flags = POSITION_VALID | VELOCITY_VALID if age < DEAD_RECKONING_MAX_S else 0
+    if age < FRESH_GPS_S:
+        flags |= USING_GPS
+    else:
+        flags |= DEAD_RECKONING | DEGRADED
+    if s.time_s - s.reject_last[0] < FRESH_GPS_S:
+        flags |= GPS_REJECTED | DEGRADED
+    return flags

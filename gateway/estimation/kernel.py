@@ -1,0 +1,155 @@
+"""What a compiled estimator looks like from outside: one sample live, or a whole log."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from gateway.estimation.columns import NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
+from gateway.estimation.record import FloatArray, IntArray, copy_record, new_record
+from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.records import BaroSample, GpsFix, ImuSample, NavState
+
+State = TypeVar("State")
+Gains = TypeVar("Gains")
+
+
+@dataclass(frozen=True, slots=True)
+class SampleLog:
+    """A whole log as arrays; each kind in the order of its time."""
+
+    imu_time_us: IntArray
+    imu: FloatArray
+    """Shape (n, IMU_COLUMNS)."""
+    baro_time_us: IntArray
+    baro_alt_m: FloatArray
+    gps_time_us: IntArray
+    """Arrival."""
+    gps: FloatArray
+    """Shape (m, GPS_COLUMNS)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kernels(Generic[State, Gains]):
+    """The compiled functions of one estimator."""
+
+    declaration: type[State]
+    start: Callable[[State, Gains], None]
+    imu: Callable[..., None]
+    """`(state, gains, time_us, *imu_row)`."""
+    baro: Callable[[State, Gains, float], None]
+    gps: Callable[[State, Gains, int, FloatArray], None]
+    tell: Callable[[State, FloatArray], None]
+    """Writes the output row."""
+    run: Callable[..., None]
+    """`(state, gains, *arrays of a SampleLog, output)`."""
+
+
+class KernelEstimator(Generic[State, Gains]):
+    """An estimator made of compiled kernels over one record of state.
+
+    Parameters
+    ----------
+    kernels : Kernels
+        The compiled functions.
+    gains : Gains
+        A record of constants.
+    reference : ReferenceSettings
+        GPS latency and declination.
+    """
+
+    def __init__(
+        self, kernels: Kernels[State, Gains], gains: Gains, reference: ReferenceSettings
+    ) -> None:
+        self._kernels = kernels
+        self._gains = gains
+        self._reference = reference
+        self._earth = EarthField(reference)
+        self._row = np.empty(NAV_COLUMNS)
+        self._state = new_record(kernels.declaration)
+        kernels.start(self._state, gains)
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self._earth.reset()
+        self._state = new_record(self._kernels.declaration)
+        self._kernels.start(self._state, self._gains)
+
+    @property
+    def state(self) -> State:
+        """A copy of all that the kernel remembers; may be set back."""
+        return copy_record(self._state)
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = copy_record(state)
+
+    def update_imu(self, sample: ImuSample) -> NavState:
+        """Advance by one IMU sample.
+
+        Parameters
+        ----------
+        sample : ImuSample
+            Its unfiltered values are used.
+
+        Returns
+        -------
+        NavState
+            State at its time.
+        """
+        self._kernels.imu(self._state, self._gains, sample.time_us, *imu_row(sample))
+        self._kernels.tell(self._state, self._row)
+        return nav_state(sample.time_us, self._row)
+
+    def update_baro(self, sample: BaroSample) -> None:
+        """Take in one barometer sample.
+
+        Parameters
+        ----------
+        sample : BaroSample
+            Its pressure altitude is used.
+        """
+        self._kernels.baro(self._state, self._gains, sample.alt_pressure_m)
+
+    def update_gps(self, fix: GpsFix) -> None:
+        """Take in one GPS fix at its arrival.
+
+        Parameters
+        ----------
+        fix : GpsFix
+            Fused as of the time it was valid.
+        """
+        row = gps_row(fix, self._reference, self._earth)
+        self._kernels.gps(self._state, self._gains, fix.time_us, np.array(row))
+
+    def fix_row(self, fix: GpsFix) -> GpsRow:
+        """Lay out one fix of a log that is to be run as arrays."""
+        return gps_row(fix, self._reference, self._earth)
+
+    def run(self, log: SampleLog) -> FloatArray:
+        """Advance over a whole log; bit for bit what its samples give one at a time.
+
+        Parameters
+        ----------
+        log : SampleLog
+            At each IMU sample, the barometer samples and fixes that are not later come first.
+
+        Returns
+        -------
+        ndarray, shape (n, NAV_COLUMNS)
+            One row per IMU sample.
+        """
+        out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+        self._kernels.run(
+            self._state,
+            self._gains,
+            log.imu_time_us,
+            log.imu,
+            log.baro_time_us,
+            log.baro_alt_m,
+            log.gps_time_us,
+            log.gps,
+            out,
+        )
+        return out

@@ -1,0 +1,114 @@
+"""Magnetic disturbances: whether the field is the usual one.
+
+A field whose strength or dip is not the usual one is not believed for a minute; a new field that
+stays the same while the aircraft turns becomes the usual one.
+"""
+
+from typing import Annotated, Final
+
+from gateway.compiled import compiled
+from gateway.estimation.record import FloatArray
+
+SETTLE_S: Final = 0.5
+"""An undisturbed field must last this long to be believed."""
+REJECT_MAX_S: Final = 60.0
+REJECT_SHARE: Final = 0.5
+"""Weight of a disturbed compass after `REJECT_MAX_S`."""
+FIELD_TAU_S: Final = 20.0
+"""Time constant of the usual strength and dip."""
+NEW_FIELD_S: Final = 20.0
+"""Time in turning motion after which a steady other field becomes the usual one."""
+FIRST_FIELD_S: Final = 5.0
+TURNING_RADPS: Final = 0.35
+
+
+class FieldGains:
+    """How much the field may differ from the usual one."""
+
+    mag_norm_tolerance: float
+    mag_dip_tolerance_rad: float
+
+
+class FieldState:
+    """The usual field and a candidate for it."""
+
+    rate_b: Annotated[FloatArray, (3,)]
+    """Angular rate, bias removed, rad/s."""
+    mag_norm_ref: float
+    mag_dip_ref: float
+    mag_ok_s: float
+    mag_reject_s: float
+    mag_new_norm: float
+    mag_new_dip: float
+    mag_new_s: float
+    mag_disturbed: int
+
+
+@compiled
+def judge_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float) -> float:
+    """Compare the field with the usual one.
+
+    Parameters
+    ----------
+    s : FieldState
+        Changed in place.
+    p : FieldGains
+        Constants.
+    norm, dip : float
+        Strength in uT and dip in rad of the newest field.
+    dt : float
+        Time since the sample before, s.
+
+    Returns
+    -------
+    float
+        Weight of the sample, 0 to 1.
+    """
+    if s.mag_norm_ref == 0.0:
+        # Until a usual field is known there is nothing to compare with.
+        learn_field(s, p, norm, dip, dt)
+        return 1.0
+    usual = (
+        abs(norm - s.mag_norm_ref) < p.mag_norm_tolerance * s.mag_norm_ref
+        and abs(dip - s.mag_dip_ref) < p.mag_dip_tolerance_rad
+    )
+    if usual:
+        s.mag_ok_s += dt
+        if s.mag_ok_s >= SETTLE_S:
+            s.mag_disturbed = 0
+            share = dt / FIELD_TAU_S
+            s.mag_norm_ref += share * (norm - s.mag_norm_ref)
+            s.mag_dip_ref += share * (dip - s.mag_dip_ref)
+    else:
+        s.mag_ok_s = 0.0
+        s.mag_disturbed = 1
+    learn_field(s, p, norm, dip, dt)
+    if s.mag_disturbed == 0:
+        s.mag_reject_s = max(s.mag_reject_s - 2.0 * dt, 0.0)
+        return 1.0
+    if s.mag_reject_s < REJECT_MAX_S:
+        s.mag_reject_s += dt
+        return 0.0
+    return REJECT_SHARE
+
+
+@compiled
+def learn_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float) -> None:
+    """Follow a candidate field and make it the usual one when it has proved steady."""
+    if (
+        abs(norm - s.mag_new_norm) < p.mag_norm_tolerance * s.mag_new_norm
+        and abs(dip - s.mag_new_dip) < p.mag_dip_tolerance_rad
+    ):
+        x, y, z = s.rate_b[0], s.rate_b[1], s.rate_b[2]
+        first = s.mag_norm_ref == 0.0
+        if first or x * x + y * y + z * z > TURNING_RADPS * TURNING_RADPS:
+            s.mag_new_s += dt
+        share = dt / FIELD_TAU_S
+        s.mag_new_norm += share * (norm - s.mag_new_norm)
+        s.mag_new_dip += share * (dip - s.mag_new_dip)
+        needed = FIRST_FIELD_S if first else NEW_FIELD_S
+        if (first or s.mag_disturbed == 1) and s.mag_new_s >= needed:
+            s.mag_norm_ref, s.mag_dip_ref = s.mag_new_norm, s.mag_new_dip
+            s.mag_disturbed = 0
+    else:
+        s.mag_new_norm, s.mag_new_dip, s.mag_new_s = norm, dip, 0.0

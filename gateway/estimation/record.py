@@ -1,0 +1,115 @@
+"""State and gains of a kernel as one flat numpy record, declared once as a typed class.
+
+A kernel's state is read as `s.q_ib[0]`, copied as bytes and handed between live and offline runs
+without conversion. The declaration is a class that is never instantiated: mypy checks each access
+by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
+"""
+
+from typing import Any, TypeVar, cast, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.compiled import compiled
+from gateway.records import Quat, Vec3
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+Declared = TypeVar("Declared")
+
+
+def layout(declaration: type) -> np.dtype[np.void]:
+    """Derive the memory layout from a declaration.
+
+    Parameters
+    ----------
+    declaration : type
+        A class whose annotations are `float`, `int` or `Annotated[FloatArray, shape]`.
+
+    Returns
+    -------
+    numpy.dtype
+        Structured type with one 8-byte aligned field per annotation, in their order.
+    """
+    fields: list[tuple[str, str, tuple[int, ...]]] = []
+    for name, hint in get_type_hints(declaration, include_extras=True).items():
+        if hint is float:
+            fields.append((name, "f8", ()))
+        elif hint is int:
+            fields.append((name, "i8", ()))
+        else:
+            fields.append((name, "f8", get_args(hint)[1]))
+    # `np.record` lets Python read the fields as attributes too.
+    return np.dtype((np.record, fields))
+
+
+def new_record(declaration: type[Declared]) -> Declared:
+    """Make a record of zeros.
+
+    Parameters
+    ----------
+    declaration : type
+        See `layout`.
+
+    Returns
+    -------
+    Declared
+        A numpy record that behaves as declared.
+    """
+    return cast(Declared, np.zeros(1, layout(declaration))[0])
+
+
+def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declared:
+    """Make a record and fill every field; a field without a value is an error.
+
+    Parameters
+    ----------
+    declaration : type
+        See `layout`.
+    values : dict
+        By field name; further names are ignored.
+
+    Returns
+    -------
+    Declared
+        The filled record.
+
+    Raises
+    ------
+    KeyError
+        If a field has no value.
+    """
+    record = np.zeros(1, layout(declaration))[0]
+    for name in record.dtype.names or ():
+        record[name] = values[name]
+    return cast(Declared, record)
+
+
+def copy_record(record: Declared) -> Declared:
+    """Copy a record, for a state that is read out or restored."""
+    return cast(Declared, cast(np.void, record).copy())
+
+
+@compiled
+def as_quat(q: FloatArray) -> Quat:
+    """Read four numbers of a record."""
+    return (q[0], q[1], q[2], q[3])
+
+
+@compiled
+def as_vec(v: FloatArray) -> Vec3:
+    """Read three numbers of a record."""
+    return (v[0], v[1], v[2])
+
+
+@compiled
+def put(target: FloatArray, values: Vec3) -> None:
+    """Write three numbers of a record."""
+    target[0], target[1], target[2] = values
+
+
+@compiled
+def put_quat(target: FloatArray, values: Quat) -> None:
+    """Write four numbers of a record."""
+    target[0], target[1], target[2], target[3] = values

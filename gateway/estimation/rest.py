@@ -1,0 +1,68 @@
+"""Rest detection: quiet sensors, a small rate, and no GPS speed; never in flight."""
+
+from typing import Annotated, Final
+
+from gateway.compiled import compiled
+from gateway.estimation.record import FloatArray
+from gateway.records import Vec3
+
+REST_TAU_S: Final = 0.5
+"""Time constant of the averages that rest is judged by."""
+
+
+class RestGains:
+    """Thresholds of rest."""
+
+    bias_limit_radps: float
+    rest_gyro_radps: float
+    rest_accel_mps2: float
+    rest_time_s: float
+
+
+class RestState:
+    """What rest is judged by."""
+
+    rest_s: float
+    at_rest: int
+    gyro_lp: Annotated[FloatArray, (3,)]
+    gyro_rest: Annotated[FloatArray, (3,)]
+    """Behind `gyro_lp`: still the bias when a slow start of motion is noticed."""
+    accel_lp: Annotated[FloatArray, (3,)]
+
+
+@compiled
+def watch_rest(
+    s: RestState, p: RestGains, gyro: Vec3, accel: Vec3, moving: bool, dt: float
+) -> None:
+    """Judge whether the aircraft stands: quiet sensors, small rate, no GPS speed.
+
+    Parameters
+    ----------
+    s : RestState
+        Changed in place.
+    p : RestGains
+        Constants.
+    gyro, accel : tuple of 3 floats
+        Newest sample in body FRD, bias still in.
+    moving : bool
+        What the GPS says.
+    dt : float
+        Time step, s.
+    """
+    share = min(1.0, dt / REST_TAU_S)
+    gyro_sq, accel_sq, largest = 0.0, 0.0, 0.0
+    for k in range(3):
+        s.gyro_lp[k] += share * (gyro[k] - s.gyro_lp[k])
+        s.gyro_rest[k] += share * (s.gyro_lp[k] - s.gyro_rest[k])
+        s.accel_lp[k] += share * (accel[k] - s.accel_lp[k])
+        gyro_sq += (gyro[k] - s.gyro_lp[k]) ** 2
+        accel_sq += (accel[k] - s.accel_lp[k]) ** 2
+        largest = max(largest, abs(s.gyro_lp[k]))
+    quiet = (
+        gyro_sq < p.rest_gyro_radps**2
+        and accel_sq < p.rest_accel_mps2**2
+        and largest < p.bias_limit_radps
+        and not moving
+    )
+    s.rest_s = s.rest_s + dt if quiet else 0.0
+    s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0

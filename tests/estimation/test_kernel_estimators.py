@@ -1,0 +1,278 @@
+"""What holds for every compiled estimator: same bits live, offline and in pieces; no nonsense."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.estimation.columns import (
+    GPS_COLUMNS,
+    IMU_COLUMNS,
+    NAV_COLUMNS,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_QUAT,
+    NAV_VEL,
+    imu_row,
+)
+from gateway.estimation.complementary.estimator import ComplementaryEstimator
+from gateway.estimation.complementary.state import ComplementarySettings
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.record import layout
+from gateway.estimation.reference import ReferenceSettings
+from gateway.geometry.geodesy import displacement_m
+from gateway.records import BaroSample, GpsFix, ImuSample, NavFlags, NavState
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G, fix, imu, times
+
+Items = list[ImuSample | BaroSample | GpsFix]
+
+REFERENCE = ReferenceSettings(gps_latency_s=0.2)
+MAG = (21.0, 1.3, 43.0)
+"""About the field at the tests' place."""
+
+
+def make_complementary() -> KernelEstimator:
+    return ComplementaryEstimator(ComplementarySettings(), REFERENCE)
+
+
+MAKERS = {"complementary": make_complementary}
+
+
+@pytest.fixture(params=MAKERS.values(), ids=MAKERS.keys())
+def estimator(request: pytest.FixtureRequest) -> KernelEstimator:
+    return request.param()
+
+
+def still(start_us: int, seconds: float, seed: int = 1) -> list[ImuSample]:
+    rng = np.random.default_rng(seed)
+    return [
+        imu(
+            start_us + t,
+            tuple(rng.normal((0, 0, -G), 0.02).tolist()),
+            tuple(rng.normal(0, 0.002, 3).tolist()),
+            tuple(rng.normal(MAG, 0.3).tolist()) if t % 50_000 == 0 else None,
+        )
+        for t in times(seconds)
+    ]
+
+
+def events(seconds: float, seed: int) -> Items:
+    """Half at rest, then turning and climbing wildly, with fixes and barometer."""
+    rng = np.random.default_rng(seed)
+    out: Items = []
+    for sample in still(0, seconds, seed):
+        t = sample.time_us
+        if t % 40_000 == 0:
+            alt_m = ALT_M + float(rng.normal(0, 0.3))
+            out.append(BaroSample(t, 95_000.0, 20.0, alt_m))
+        if t > 1_000_000 and t % 200_000 == 0:
+            moved = max(0.0, t * 1e-6 - seconds / 2)
+            out.append(fix(t, 3.0 * moved, -2.0 * moved, (3.0, -2.0, -0.5) if moved else (0, 0, 0)))
+        if t * 1e-6 > seconds / 2:
+            sample = replace(sample, gyro_b_radps=tuple(rng.normal(0.1, 0.4, 3).tolist()))
+        out.append(sample)
+    return out
+
+
+def feed(
+    estimator: KernelEstimator, items: list[ImuSample | BaroSample | GpsFix]
+) -> list[NavState]:
+    states = []
+    for item in items:
+        if isinstance(item, ImuSample):
+            states.append(estimator.update_imu(item))
+        elif isinstance(item, BaroSample):
+            estimator.update_baro(item)
+        else:
+            estimator.update_gps(item)
+    return states
+
+
+def as_log(estimator: KernelEstimator, items: Items) -> SampleLog:
+    imus = [i for i in items if isinstance(i, ImuSample)]
+    baros = [i for i in items if isinstance(i, BaroSample)]
+    fixes = [i for i in items if isinstance(i, GpsFix)]
+    return SampleLog(
+        imu_time_us=np.array([i.time_us for i in imus]),
+        imu=np.array([imu_row(i) for i in imus]).reshape(-1, IMU_COLUMNS),
+        baro_time_us=np.array([b.time_us for b in baros]),
+        baro_alt_m=np.array([b.alt_pressure_m for b in baros]),
+        gps_time_us=np.array([f.time_us for f in fixes]),
+        gps=np.array([estimator.fix_row(f) for f in fixes]).reshape(-1, GPS_COLUMNS),
+    )
+
+
+def off_m(state: NavState) -> tuple[float, float]:
+    return displacement_m(LAT_DEG, LON_DEG, state.lat_deg, state.lon_deg, ALT_M)
+
+
+def as_rows(states: list[NavState]) -> np.ndarray:
+    return np.array(
+        [
+            [
+                *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
+                *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
+            ]
+            for s in states
+        ]
+    )  # fmt: skip
+
+
+def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
+    items = events(8.0, 5)
+    live = as_rows(feed(estimator, items))
+    estimator.reset()
+    offline = estimator.run(as_log(estimator, items))
+    assert offline.shape == (len(live), NAV_COLUMNS)
+    np.testing.assert_array_equal(offline, live)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_split_run_equals_one_run(estimator: KernelEstimator, seed: int) -> None:
+    items = events(8.0, seed)
+    whole = feed(estimator, items)
+    estimator.reset()
+    cut = len(items) * (seed + 1) // 4
+    first = feed(estimator, items[:cut])
+    kept = estimator.state
+    feed(estimator, items[cut : cut + 50])
+    estimator.state = kept
+    np.testing.assert_array_equal(as_rows(first + feed(estimator, items[cut:])), as_rows(whole))
+
+
+def test_norm_stays_one(estimator: KernelEstimator) -> None:
+    norms = np.linalg.norm(as_rows(feed(estimator, events(8.0, 3)))[:, NAV_QUAT:4], axis=1)
+    np.testing.assert_allclose(norms, 1.0, atol=1e-12)
+
+
+def test_rest_is_found_and_told(estimator: KernelEstimator) -> None:
+    state = feed(estimator, still(0, 4.0))[-1]
+    assert NavFlags.AT_REST | NavFlags.ATTITUDE_VALID | NavFlags.USING_MAG in state.flags
+    assert NavFlags.HEADING_VALID not in state.flags
+    assert math.isnan(state.lat_deg)
+
+
+def test_a_fix_gives_place_and_true_north(estimator: KernelEstimator) -> None:
+    items = [*still(0, 2.0), fix(2_000_000), *still(2_000_000, 1.0)]
+    state = feed(estimator, items)[-1]
+    valid = NavFlags.POSITION_VALID | NavFlags.HEADING_VALID | NavFlags.USING_GPS
+    assert valid in state.flags
+    assert (state.lat_deg, state.lon_deg) == pytest.approx((LAT_DEG, LON_DEG), abs=1e-5)
+    assert state.alt_amsl_m == pytest.approx(ALT_M, abs=1.0)
+    # Calibrated field due magnetic north (atan2(1.3, 21)), declination about 3.5 deg east.
+    heading_deg = math.degrees(2.0 * math.atan2(state.q_nb[3], state.q_nb[0]))
+    assert heading_deg == pytest.approx(3.5 - math.degrees(math.atan2(1.3, 21.0)), abs=1.5)
+
+
+class TestNonsense:
+    def finite(self, states: list[NavState]) -> bool:
+        rows = as_rows(states)
+        return bool(np.isfinite(rows[:, :4]).all() and np.isfinite(rows[1:, NAV_LAT]).all())
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30, -500.0])
+    def test_a_bad_number_is_left_out_and_told(
+        self, estimator: KernelEstimator, bad: float
+    ) -> None:
+        feed(estimator, [*still(0, 3.0), fix(3_000_000)])
+        broken = [
+            replace(
+                s, accel_b_mps2=(bad, 0.0, bad), gyro_b_radps=(bad, bad, 0.0), mag_b_ut=(bad,) * 3
+            )
+            for s in still(3_000_000, 0.5)
+        ]
+        states = feed(estimator, broken)
+        assert self.finite(states)
+        assert NavFlags.SENSOR_FAULT | NavFlags.DEGRADED in states[-1].flags
+        after = feed(estimator, still(3_500_000, 1.0))[-1]
+        assert NavFlags.SENSOR_FAULT not in after.flags
+        assert after.q_nb[0] > 0.99
+        assert math.hypot(*after.vel_n_mps) < 1.0
+
+    def test_bad_before_the_start(self, estimator: KernelEstimator) -> None:
+        state = estimator.update_imu(imu(0, (math.nan, 0.0, 0.0)))
+        assert NavFlags.ATTITUDE_VALID not in state.flags
+        assert NavFlags.SENSOR_FAULT in state.flags
+
+    def test_a_late_sample_changes_nothing(self, estimator: KernelEstimator) -> None:
+        feed(estimator, [*still(0, 3.0), fix(3_000_000)])
+        before = estimator.state.q_nb.copy()
+        state = estimator.update_imu(imu(1_000_000, gyro=(9.0, 9.0, 9.0)))
+        assert NavFlags.SENSOR_FAULT in state.flags
+        np.testing.assert_array_equal(estimator.state.q_nb, before)
+
+    @pytest.mark.parametrize("jump_us", [5_000_000, -60_000_000])
+    def test_a_jump_in_time_is_survived(self, estimator: KernelEstimator, jump_us: int) -> None:
+        start = 100_000_000
+        feed(
+            estimator, [*still(start, 3.0), fix(start + 3_000_000), *still(start + 3_000_000, 1.0)]
+        )
+        later = start + 4_000_000 + jump_us
+        items = still(later, 3.0)
+        states = feed(estimator, [*items[:100], fix(later + 1_000_000), *items[100:]])
+        assert self.finite(states)
+        assert states[-1].q_nb[0] > 0.99
+        assert NavFlags.USING_GPS | NavFlags.POSITION_VALID in states[100].flags
+
+    def test_a_stuck_gyroscope_is_found(self, estimator: KernelEstimator) -> None:
+        feed(estimator, still(0, 3.0))
+        stuck = [replace(s, gyro_b_radps=(0.3, 0.0, 0.0)) for s in still(3_000_000, 6.0)]
+        states = feed(estimator, stuck)
+        assert NavFlags.SENSOR_FAULT in states[-1].flags
+        recovered = feed(estimator, still(9_000_000, 30.0))
+        assert NavFlags.SENSOR_FAULT not in recovered[-1].flags
+        assert recovered[-1].q_nb[0] > 0.99
+
+    def test_a_glitch_of_hundreds_of_metres_is_rejected_and_told(
+        self, estimator: KernelEstimator
+    ) -> None:
+        items: Items = []
+        for sample in still(0, 12.0):
+            t = sample.time_us
+            if t % 200_000 == 0 and t > 1_000_000:
+                off = 300.0 if 6_000_000 < t < 10_000_000 else 0.0
+                items.append(fix(t, north_m=off))
+            items.append(sample)
+        states = feed(estimator, items)
+        off_m = [
+            displacement_m(LAT_DEG, LON_DEG, s.lat_deg, s.lon_deg, ALT_M) for s in states[200:]
+        ]
+        assert max(math.hypot(*o) for o in off_m) < 5.0
+        assert NavFlags.GPS_REJECTED in states[900].flags
+        assert NavFlags.GPS_REJECTED not in states[-1].flags
+
+    def test_a_lasting_new_place_is_believed_in_the_end(self, estimator: KernelEstimator) -> None:
+        items: Items = []
+        for sample in still(0, 60.0):
+            t = sample.time_us
+            if t % 200_000 == 0 and t > 1_000_000:
+                items.append(fix(t, east_m=400.0 if t > 6_000_000 else 0.0))
+            items.append(sample)
+        state = feed(estimator, items)[-1]
+        assert off_m(state)[1] == pytest.approx(400.0, abs=3.0)
+        assert NavFlags.GPS_REJECTED not in state.flags
+
+
+def test_outage_is_told(estimator: KernelEstimator) -> None:
+    feed(estimator, [*still(0, 3.0), fix(3_000_000)])
+    states = feed(estimator, still(3_000_000, 5.0))
+    assert NavFlags.USING_GPS in states[50].flags
+    assert NavFlags.DEAD_RECKONING | NavFlags.DEGRADED in states[-1].flags
+    again = feed(estimator, [fix(8_000_000), *still(8_000_000, 0.1)])[-1]
+    assert NavFlags.USING_GPS in again.flags
+
+
+def test_layout_follows_the_declaration() -> None:
+    class Base:
+        a: int
+
+    class Declared(Base):
+        b: float
+
+    assert layout(Declared).names == ("a", "b")
+
+
+def test_velocity_of_an_aircraft_at_rest_is_zero(estimator: KernelEstimator) -> None:
+    rows = as_rows(feed(estimator, [*still(0, 3.0), fix(3_000_000), *still(3_000_000, 8.0)]))
+    assert np.abs(rows[-1, NAV_VEL : NAV_VEL + 3]).max() < 0.3
+    assert int(rows[-1, NAV_FLAGS]) & NavFlags.AT_REST
