@@ -85,7 +85,7 @@ class Announcer:
         if self._tokens == 0:
             return []
         self._tokens -= 1
-        return self._chunks(text)
+        return chunks(text, self._number())
 
     def poll(self, now_us: int) -> list[Any]:
         """Tell the states that changed while their topics were held."""
@@ -101,7 +101,11 @@ class Announcer:
             return []
         topic.told = topic.state
         topic.held_until_us = now_us + HOLD_US
-        return self._chunks(topic.text)
+        return chunks(topic.text, self._number())
+
+    def _number(self) -> int:
+        self._next_id = self._next_id % 0xFFFF + 1
+        return self._next_id
 
     def _refill(self, now_us: int) -> None:
         fresh = (now_us - self._refilled_us) // REFILL_US
@@ -109,17 +113,30 @@ class Announcer:
             self._tokens = min(BUCKET, self._tokens + fresh)
             self._refilled_us += fresh * REFILL_US
 
-    def _chunks(self, text: Told) -> list[Any]:
-        data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
-        if len(data) <= TEXT_BYTES:
-            return [mavlink.MAVLink_statustext_message(text.severity, data)]
+
+def chunks(text: Told, number: int = 1) -> list[Any]:
+    """Encode a text as one STATUSTEXT, or as several that a reader puts together.
+
+    Parameters
+    ----------
+    text : Told
+        ASCII; cut at `MAX_TEXT_BYTES`.
+    number : int, optional
+        Tells a long text from the one before, 1 to 65535.
+
+    Returns
+    -------
+    list of MAVLink_message
+    """
+    data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
+    if len(data) <= TEXT_BYTES:
         # Id 0 means a text of one chunk.
-        self._next_id = self._next_id % 0xFFFF + 1
-        # A reader takes a chunk that is not full for the last one.
-        starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
-        return [
-            mavlink.MAVLink_statustext_message(
-                text.severity, data[start : start + TEXT_BYTES], self._next_id, number
-            )
-            for number, start in enumerate(starts)
-        ]
+        return [mavlink.MAVLink_statustext_message(text.severity, data)]
+    # A reader takes a chunk that is not full for the last one.
+    starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
+    return [
+        mavlink.MAVLink_statustext_message(
+            text.severity, data[start : start + TEXT_BYTES], number, chunk
+        )
+        for chunk, start in enumerate(starts)
+    ]

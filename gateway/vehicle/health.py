@@ -188,6 +188,10 @@ class Health:
             if link.received and now_us - link.last_time_us > self.silent_us
         )
 
+    def restarts(self) -> dict[int, int]:
+        """Tell how often each node has started anew."""
+        return {link.node.node_id: link.restarts for link in self._nodes}
+
     def known_nodes(self) -> frozenset[int]:
         """Name the nodes that were ever heard."""
         return frozenset(link.node.node_id for link in self._nodes if link.received)

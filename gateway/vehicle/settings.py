@@ -54,6 +54,13 @@ class VehicleSettings(Settings, frozen=True):
             "track and their own logs by it."
         ),
     ] = "flying_or_recording"
+    signing_passphrase: Annotated[
+        str,
+        setting(
+            "MAVLink 2 signing: the same passphrase as in the ground station. Everything sent is "
+            "signed then, and nobody changes anything without a signature. Empty for none."
+        ),
+    ] = ""
     node_silent_s: Annotated[
         float,
         setting(

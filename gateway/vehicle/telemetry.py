@@ -35,6 +35,8 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
     mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
+    mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
 )
 
 HEARTBEAT_HZ: Final = 1.0
@@ -60,9 +62,7 @@ class Telemetry:
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
         self._unix_offset_us: int | None = None
-        self.streams = {
-            message_id: Stream(interval_us(rate)) for message_id, rate in _rates(settings)
-        }
+        self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
         self._builders: dict[int, Builder] = {
             mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_state(
                 messages.attitude_quaternion
@@ -81,6 +81,23 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
         }
+
+    def add(self, message_id: int, builder: Builder) -> None:
+        """Let another service build a message that is sent by time."""
+        self._builders[message_id] = builder
+
+    def knows(self, message_id: int) -> bool:
+        """Tell whether the vehicle ever sends a message."""
+        return message_id in self._builders
+
+    def reconfigure(self, settings: VehicleSettings) -> None:
+        """Take on changed settings; only the rates that differ begin anew."""
+        self.settings = settings
+        self.motion.takeoff_speed_mps = settings.takeoff_speed_mps
+        self.motion.takeoff_height_m = settings.takeoff_height_m
+        for message_id, us in _intervals(settings).items():
+            if self.streams[message_id].interval_us != us:
+                self.streams[message_id].change(us)
 
     @property
     def armed(self) -> bool:
@@ -223,11 +240,10 @@ class Telemetry:
         return status
 
 
-def _rates(settings: VehicleSettings) -> list[tuple[int, float]]:
-    """Pair message ids with rates: a rate's setting is named as its message."""
-    named = msgspec.structs.asdict(settings.rates)
-    rates = [
-        (getattr(mavlink, f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"), rate)
-        for name, rate in named.items()
-    ]
-    return [(mavlink.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_HZ), *rates]
+def _intervals(settings: VehicleSettings) -> dict[int, int]:
+    """Give the interval of every message; a rate's setting is named as its message."""
+    found = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: interval_us(HEARTBEAT_HZ)}
+    for name, rate in msgspec.structs.asdict(settings.rates).items():
+        message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
+        found[getattr(mavlink, message)] = interval_us(rate)
+    return found

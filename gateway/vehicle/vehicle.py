@@ -1,52 +1,86 @@
 """One aircraft as a MAVLink system: records in, frames out; requests in, answers out."""
 
-from collections.abc import Iterable
-from typing import Any, Final
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import (
     BaroSample,
     GpsFix,
     ImuSample,
+    Incoming,
     LinkReport,
-    NavFlags,
     NavState,
     NodeStatus,
-    Outgoing,
+)
+from gateway.settings import Settings
+from gateway.vehicle import identity
+from gateway.vehicle.actions import Action, Answer, Reply, Request, SettingsChange
+from gateway.vehicle.announcements import Announcements
+from gateway.vehicle.calibrator import Calibrator
+from gateway.vehicle.commands import CommandService
+from gateway.vehicle.dialect import (
+    MAVLINK_MSG_ID_AVAILABLE_MODES,
+    MAVLINK_MSG_ID_COMPONENT_METADATA,
+    MAVLINK_MSG_ID_CURRENT_MODE,
+    MAVLINK_MSG_ID_PROTOCOL_VERSION,
 )
 from gateway.vehicle.encoder import Encoder
-from gateway.vehicle.events import CRITICAL, INFO, NOTICE, WARNING, Announcer, Told
+from gateway.vehicle.events import INFO, NOTICE, Told
+from gateway.vehicle.ftp import FtpService
 from gateway.vehicle.health import Health
+from gateway.vehicle.home import Place
+from gateway.vehicle.intervals import IntervalService
+from gateway.vehicle.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
+from gateway.vehicle.parameter_service import ParameterService
+from gateway.vehicle.parameters import ParameterTable
+from gateway.vehicle.places import PlaceService
+from gateway.vehicle.reader import RequestReader
 from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry import Telemetry
+from gateway.vehicle.timing import TimingService
 
-FLAG_TEXTS: Final = (
-    (NavFlags.ATTITUDE_VALID, Told(INFO, "Attitude valid"), Told(WARNING, "Attitude not valid")),
-    (NavFlags.HEADING_VALID, Told(INFO, "Heading valid"), Told(WARNING, "Heading not valid")),
-    (
-        NavFlags.DEAD_RECKONING,
-        Told(WARNING, "Position is dead-reckoned"),
-        Told(INFO, "Position follows GPS again"),
-    ),
-    (NavFlags.GPS_REJECTED, Told(WARNING, "GPS fixes rejected"), Told(INFO, "GPS accepted again")),
-    (
-        NavFlags.MAG_DISTURBED,
-        Told(WARNING, "Magnetic field disturbed"),
-        Told(INFO, "Magnetic field normal again"),
-    ),
-    (NavFlags.SENSOR_FAULT, Told(CRITICAL, "Sensor fault"), Told(NOTICE, "Sensors well again")),
-    (NavFlags.DEGRADED, Told(WARNING, "Estimator degraded"), Told(INFO, "Estimator well again")),
-)
-"""A flag of the estimator, what is told when it rises, and what when it falls."""
+OWN_SECTION = "vehicle"
+
+
+class Service(Protocol):
+    """What answers one family of messages."""
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Names of the messages it takes."""
+        ...
+
+    def changes_state(self, request: Request) -> bool:
+        """Tell whether only an allowed client may ask this."""
+        ...
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Answer."""
+        ...
+
+    def refuse(self, request: Request) -> list[Answer]:
+        """Answer a client that is not allowed to ask this."""
+        ...
 
 
 class Vehicle:
     """The MAVLink side of one aircraft.
 
-    All methods return the frames to send, in order; none raises on data.
+    All methods return what is to be done, in order: mostly frames to send. None raises on data.
     """
 
     def __init__(
-        self, settings: VehicleSettings, system_id: int, vehicle_id: int | None = None
+        self,
+        settings: VehicleSettings,
+        system_id: int,
+        vehicle_id: int | None = None,
+        *,
+        sections: Mapping[str, Settings] | None = None,
+        unix_us_at_zero: int = 0,
     ) -> None:
         """Begin with nothing known.
 
@@ -58,93 +92,209 @@ class Vehicle:
             MAVLink system id, 1 to 250.
         vehicle_id : int, optional
             The id in the radio payloads, if it is not the system id.
+        sections : mapping of str to Settings, optional
+            Other settings of this aircraft that ground stations may change as parameters, by the
+            key under which the change comes back.
+        unix_us_at_zero : int, optional
+            Unix time when the gateway clock was zero; needed for signing only.
         """
         self.system_id = system_id
-        self.health = Health(
-            system_id if vehicle_id is None else vehicle_id, settings.node_silent_s
-        )
+        self.vehicle_id = system_id if vehicle_id is None else vehicle_id
+        self.refusals = 0
+        """Requests to change something that were refused."""
+        self.health = Health(self.vehicle_id, settings.node_silent_s)
         self.telemetry = Telemetry(settings, self.health)
-        self._encoder = Encoder(system_id)
-        self._announcer = Announcer()
-        self._flags = NavFlags(0)
+        passphrase = settings.signing_passphrase
+        key = key_from_passphrase(passphrase) if passphrase else None
+        clock = SigningClock(unix_us_at_zero)
+        self._encoder = Encoder(system_id, key, clock)
+        self._reader = RequestReader(system_id, Verifier(key, clock) if key else None)
+        self._announcements = Announcements(self.health)
+        self._make_services({OWN_SECTION: settings, **(sections or {})})
 
-    def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Outgoing]:
+    def _make_services(self, sections: Mapping[str, Settings]) -> None:
+        self.places = PlaceService(self.telemetry, self._announcements.say)
+        self._intervals = IntervalService(self.system_id, self.telemetry)
+        self._parameters = ParameterService(self.vehicle_id, ParameterTable(sections))
+        self._metadata = Metadata(self._parameters.table)
+        self._ftp = FtpService(
+            {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
+        )
+        self._calibrator = Calibrator(self.vehicle_id)
+        self._identity = {
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
+                self.system_id
+            ),
+            MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: identity.protocol_version(),
+            MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(),
+            MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(),
+            MAVLINK_MSG_ID_COMPONENT_METADATA: self._metadata.announcement,
+        }
+        commands = CommandService(self._intervals, self._build, self._knows, self._explain)
+        commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
+        commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
+        self.places.register(commands)
+        services: tuple[Service, ...] = (
+            commands,
+            self._intervals,
+            self._parameters,
+            self.places.missions,
+            self._ftp,
+            TimingService(),
+        )
+        self._services = {kind: service for service in services for kind in service.types}
+        self._timed = (
+            self._intervals,
+            self._parameters,
+            self.places.missions,
+            self._ftp,
+            self._calibrator,
+        )
+
+    @property
+    def faults(self) -> Counter[str]:
+        """Frames of clients that were dropped, by reason."""
+        return self._reader.faults
+
+    def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in what the estimator made of one IMU sample."""
         self.health.on_state(state, sample)
-        found = self.telemetry.on_state(state, sample)
-        if state.flags != self._flags:
-            found += self._announce_flags(state.flags, now_us)
-        return self._encode(found)
+        found = self._replies(self.telemetry.on_state(state, sample))
+        found += self._replies(self._announcements.on_flags(state.flags, now_us))
+        found += self._intervals.on_state(state.time_us)
+        if self._calibrator.busy:
+            found += self._calibrator.on_sample(sample)
+        return self._finish(found, now_us)
 
-    def on_baro(self, sample: BaroSample, _now_us: int) -> list[Outgoing]:
+    def on_baro(self, sample: BaroSample, now_us: int) -> list[Action]:
         """Take in one barometer sample."""
         self.health.on_baro(sample)
-        return self._encode(self.telemetry.on_baro(sample))
+        return self._finish(self._replies(self.telemetry.on_baro(sample)), now_us)
 
-    def on_gps(self, fix: GpsFix, now_us: int) -> list[Outgoing]:
+    def on_gps(self, fix: GpsFix, now_us: int) -> list[Action]:
         """Take in one GPS fix."""
         self.health.on_gps(fix)
         had_home = self.telemetry.home is not None
         found = self.telemetry.on_gps(fix)
         if self.telemetry.home is not None and not had_home:
-            found += self._announcer.say(Told(INFO, "Home set by GPS"), now_us)
-        found += self._announce_fix(now_us)
-        return self._encode(found)
+            found += self._announcements.say(Told(INFO, "Home set by GPS"), now_us)
+        found += self._announcements.on_fix(now_us)
+        return self._finish(self._replies(found), now_us)
 
-    def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Outgoing]:
+    def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
         self.health.on_node_status(status)
         return []
 
-    def on_link(self, report: LinkReport, now_us: int) -> list[Outgoing]:
+    def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
         """Take in the state of the serial link and of all radio links."""
         self.health.on_link(report)
-        lost = Told(CRITICAL, f"Receiver lost: {report.port}")
-        back = Told(NOTICE, f"Receiver connected: {report.port}")
-        found = self._announcer.track(
-            "link", report.connected, back if report.connected else lost, now_us
-        )
-        silent = self.health.silent_nodes(now_us)
-        for node in sorted(self.health.known_nodes()) if report.connected else ():
-            text = Told(NOTICE, f"Node {node} is back")
-            if node in silent:
-                text = Told(CRITICAL, f"Node {node} silent")
-            found += self._announcer.track(
-                f"node {node}", node not in silent, text, now_us, initially=True
-            )
-        return self._encode(found)
+        return self._finish(self._replies(self._announcements.on_link(report, now_us)), now_us)
 
-    def poll(self, now_us: int) -> list[Outgoing]:
-        """Send what is due by time."""
-        found = self.telemetry.poll(now_us)
-        found += self._announce_fix(now_us)
-        found += self._announcer.poll(now_us)
-        return self._encode(found)
+    def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
+        """Answer one frame of a client; one that is not for this vehicle is left alone.
+
+        Parameters
+        ----------
+        incoming : Incoming
+            A whole frame, whatever is in it.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Action
+        """
+        request = self._reader.read(incoming, now_us)
+        if request is None:
+            return []
+        service = self._services.get(request.message.get_type())
+        if service is None:
+            return []
+        if request.may_change or not service.changes_state(request):
+            return self._finish(service.handle(request, now_us), now_us)
+        self.refusals += 1
+        name = _describe(request)
+        told = Told(NOTICE, f"Refused {name} of system {request.system_id}")
+        answers = service.refuse(request)
+        answers += self._replies(self._announcements.say(told, now_us))
+        return self._finish(answers, now_us)
+
+    def poll(self, now_us: int) -> list[Action]:
+        """Do what is due by time."""
+        self.telemetry.calibrating = self._calibrator.busy
+        found = self._replies(self.telemetry.poll(now_us))
+        found += self._replies(self._announcements.poll(now_us))
+        for service in self._timed:
+            found += service.poll(now_us)
+        return self._finish(found, now_us)
 
     def next_due_us(self) -> int:
         """Tell when `poll` is to be called next, at the latest."""
-        due = (self.telemetry.next_due_us(), self._announcer.next_due_us())
+        due = [self.telemetry.next_due_us(), self._announcements.next_due_us()]
+        due += [service.next_due_us() for service in self._timed]
         return min(time_us for time_us in due if time_us is not None)
+
+    def forget_client(self, client_id: int) -> None:
+        """Drop what was kept for a client that has gone."""
+        self._intervals.forget_client(client_id)
+        self._parameters.forget_client(client_id)
+        self.places.missions.forget_client(client_id)
+        self._ftp.forget_client(client_id)
 
     def set_recording(self, recording: bool) -> None:
         """Note whether a recording runs; the armed bit may follow it."""
         self.health.recording = recording
 
-    def _announce_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
-        changed, self._flags = flags ^ self._flags, flags
-        found = []
-        for flag, raised, fallen in FLAG_TEXTS:
-            if changed & flag:
-                text = raised if flags & flag else fallen
-                found += self._announcer.track(
-                    str(flag.name), bool(flags & flag), text, now_us, initially=False
-                )
-        return found
+    def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
+        """Mark a place (its height may be NaN), or clear the mark."""
+        return self._finish(self.places.put_mark(place, now_us), now_us)
 
-    def _announce_fix(self, now_us: int) -> list[Any]:
-        fixed = self.health.has_fix(now_us)
-        text = Told(NOTICE, "GPS fix") if fixed else Told(WARNING, "GPS fix lost")
-        return self._announcer.track("GPS", fixed, text, now_us, initially=False)
+    def say(self, text: Told, now_us: int) -> list[Action]:
+        """Tell all an event of the gateway, such as a recording that stopped."""
+        return self._finish(self._replies(self._announcements.say(text, now_us)), now_us)
 
-    def _encode(self, found: Iterable[Any]) -> list[Outgoing]:
-        return [self._encoder.encode(message) for message in found]
+    def take_settings(self, section: str, settings: Settings, now_us: int) -> list[Action]:
+        """Take over a section that was changed elsewhere, and tell the parameters that differ."""
+        if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
+            self._reconfigure(settings)
+        return self._finish(self._parameters.take(section, settings), now_us)
+
+    def _knows(self, message_id: int) -> bool:
+        return message_id in self._identity or self.telemetry.knows(message_id)
+
+    def _build(self, message_id: int, now_us: int) -> list[Any]:
+        own = self._identity.get(message_id)
+        message = own(now_us) if own else self.telemetry.build(message_id, now_us)
+        return [] if message is None else [message]
+
+    def _explain(self, text: str, now_us: int) -> list[Answer]:
+        return self._replies(self._announcements.say(Told(NOTICE, text), now_us))
+
+    def _reconfigure(self, settings: VehicleSettings) -> None:
+        self.health.silent_us = round(settings.node_silent_s * 1e6)
+        self.telemetry.reconfigure(settings)
+
+    def _replies(self, messages: Iterable[Any]) -> list[Answer]:
+        return [Reply(message) for message in messages]
+
+    def _finish(self, answers: Iterable[Answer], now_us: int) -> list[Action]:
+        """Encode what is still a message, and take over what concerns the vehicle itself."""
+        self._encoder.set_time(now_us)
+        actions: list[Action] = []
+        for answer in answers:
+            if isinstance(answer, Reply):
+                actions.append(self._encoder.encode(answer.message, answer.client_id))
+                continue
+            actions.append(answer)
+            if isinstance(answer, SettingsChange) and isinstance(answer.settings, VehicleSettings):
+                self._reconfigure(answer.settings)
+        return actions
+
+
+def _describe(request: Request) -> str:
+    message = request.message
+    number = getattr(message, "command", None)
+    known = mavlink.enums["MAV_CMD"].get(number)
+    kind: str = message.get_type()
+    return str(known.name).removeprefix("MAV_CMD_") if known else kind

@@ -1,0 +1,94 @@
+"""What the vehicle asks of the rest of the gateway; the pipeline carries it out."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from gateway.records import ClientInterval, Outgoing, Vec3
+from gateway.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsChange:
+    """A section of this vehicle's settings has a new, already checked value: take it live."""
+
+    vehicle_id: int
+    section: str
+    """Key of the section, as it was given to the vehicle."""
+    settings: Settings
+    """The whole section with the change in it."""
+    path: str
+    """What changed, as dotted keys below the section; empty if all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SaveSettings:
+    """Write what differs from the settings file to storage."""
+
+    vehicle_id: int
+    sections: tuple[tuple[str, Settings], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingRequest:
+    """Start or stop the recording."""
+
+    start: bool
+
+
+class CalibrationKind(StrEnum):
+    """Which error of which sensor was measured."""
+
+    GYRO = "gyro"
+    ACCEL = "accel"
+    LEVEL = "level"
+    MAG = "mag"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationMeasured:
+    """A remaining error of the calibrated samples, to be absorbed by the calibration."""
+
+    vehicle_id: int
+    kind: CalibrationKind
+    error_b: Vec3
+    """In body FRD, to be subtracted from calibrated samples: gyroscope bias in rad/s,
+    accelerometer bias in m/s2, hard iron in uT; for LEVEL the roll, pitch and yaw in rad by
+    which the mounting is off."""
+
+
+Action = (
+    Outgoing
+    | ClientInterval
+    | SettingsChange
+    | SaveSettings
+    | RecordingRequest
+    | CalibrationMeasured
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A message before it is encoded: to the one who asked, or to all."""
+
+    message: Any
+    client_id: int | None = None
+
+
+Answer = Reply | Action
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One checked message of a client to this vehicle."""
+
+    client_id: int
+    system_id: int
+    component_id: int
+    message: Any
+    may_change: bool
+    """Whether the client may change state: trusted, and signed where a key is set."""
+
+    def reply(self, message: Any) -> Reply:
+        """Answer the one who asked."""
+        return Reply(message, self.client_id)

@@ -1,0 +1,75 @@
+"""Messages of the standard that pymavlink's `common` dialect lacks.
+
+Clients ask for them all the same, and one of them, PROTOCOL_VERSION, decides whether
+QGroundControl speaks MAVLink 2. Each is laid out as the standard's generator does it: larger
+fields first, and a CRC seeded by the definition.
+"""
+
+import struct
+from typing import Any, ClassVar, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
+MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
+MAVLINK_MSG_ID_AVAILABLE_MODES: Final = 435
+MAVLINK_MSG_ID_CURRENT_MODE: Final = 436
+
+_Base: Any = mavlink.MAVLink_message
+
+
+class _Extra(_Base):  # type: ignore[misc]
+    """A message packed from its fields in wire order."""
+
+    id: ClassVar[int]
+    msgname: ClassVar[str]
+    crc_extra: ClassVar[int]
+    unpacker: ClassVar[struct.Struct]
+    fieldnames: ClassVar[list[str]] = []
+    fieldtypes: ClassVar[list[str]] = []
+
+    def __init__(self, *wire_values: Any) -> None:
+        super().__init__(self.id, self.msgname)
+        self.wire_values = wire_values
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        """Build the frame; these ids do not fit MAVLink 1."""
+        payload = self.unpacker.pack(*self.wire_values)
+        frame: bytes = self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1)
+        return frame
+
+
+class ProtocolVersion(_Extra):
+    """PROTOCOL_VERSION: version, min_version, max_version, and two library hashes."""
+
+    id = MAVLINK_MSG_ID_PROTOCOL_VERSION
+    msgname = "PROTOCOL_VERSION"
+    crc_extra = 217
+    unpacker = struct.Struct("<HHH8s8s")
+
+
+class ComponentMetadata(_Extra):
+    """COMPONENT_METADATA: time_boot_ms, file_crc, uri."""
+
+    id = MAVLINK_MSG_ID_COMPONENT_METADATA
+    msgname = "COMPONENT_METADATA"
+    crc_extra = 182
+    unpacker = struct.Struct("<II100s")
+
+
+class AvailableModes(_Extra):
+    """AVAILABLE_MODES: custom_mode, properties, number_modes, mode_index, standard_mode, name."""
+
+    id = MAVLINK_MSG_ID_AVAILABLE_MODES
+    msgname = "AVAILABLE_MODES"
+    crc_extra = 134
+    unpacker = struct.Struct("<IIBBB35s")
+
+
+class CurrentMode(_Extra):
+    """CURRENT_MODE: custom_mode, intended_custom_mode, standard_mode."""
+
+    id = MAVLINK_MSG_ID_CURRENT_MODE
+    msgname = "CURRENT_MODE"
+    crc_extra = 193
+    unpacker = struct.Struct("<IIB")

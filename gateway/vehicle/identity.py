@@ -1,0 +1,65 @@
+"""Who the vehicle is and what it understands, for the questions of a ground station's start."""
+
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway import __version__
+from gateway.vehicle.dialect import AvailableModes, CurrentMode, ProtocolVersion
+
+CAPABILITIES: Final = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
+)
+
+MODE_NAME: Final = b"Tracking"
+NOT_USER_SELECTABLE: Final = 2
+"""MAV_MODE_PROPERTY: there is nothing to switch to."""
+
+UID_PREFIX: Final = int.from_bytes(b"mavgate")
+
+
+def software_version(version: str) -> int:
+    """Pack major, minor and patch into the upper three bytes, and the type into the lowest."""
+    parts = [int(part) if part.isdigit() else 0 for part in version.split(".")[:3]]
+    major, minor, patch = (*parts, 0, 0, 0)[:3]
+    kind: int = mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+    return major << 24 | minor << 16 | patch << 8 | kind
+
+
+def autopilot_version(system_id: int) -> Any:
+    """Encode AUTOPILOT_VERSION; the uid tells the vehicles of one gateway apart."""
+    nothing = [0] * 8
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities=CAPABILITIES,
+        flight_sw_version=software_version(__version__),
+        middleware_sw_version=0,
+        os_sw_version=0,
+        board_version=0,
+        flight_custom_version=nothing,
+        middleware_custom_version=nothing,
+        os_custom_version=nothing,
+        vendor_id=0,
+        product_id=0,
+        uid=UID_PREFIX << 8 | system_id,
+    )
+
+
+def protocol_version() -> Any:
+    """Encode PROTOCOL_VERSION: both versions are read, version 2 is spoken."""
+    return ProtocolVersion(200, 100, 200, b"", b"")
+
+
+def available_modes() -> Any:
+    """Encode AVAILABLE_MODES: the one mode that a tracker has."""
+    return AvailableModes(0, NOT_USER_SELECTABLE, 1, 1, 0, MODE_NAME)
+
+
+def current_mode() -> Any:
+    """Encode CURRENT_MODE."""
+    return CurrentMode(0, 0, 0)

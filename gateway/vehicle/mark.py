@@ -1,0 +1,91 @@
+"""The marked location: distance and bearing to it, in NAV_CONTROLLER_OUTPUT.
+
+The newest mark wins, whoever set it: the current item of an uploaded mission, the first rally
+point, a region of interest, a home set by hand, or the command line.
+"""
+
+import math
+from typing import Any
+
+import pymap3d.vincenty as vincenty
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import NAN, NavState
+from gateway.vehicle import fields
+from gateway.vehicle.home import Place
+from gateway.vehicle.mission_items import Item
+
+
+class Mark:
+    """The marked location of one vehicle."""
+
+    def __init__(self) -> None:
+        self.place: Place | None = None
+        self._from_items: int | None = None
+
+    def put(self, place: Place | None) -> None:
+        """Mark a place, or none."""
+        self.place, self._from_items = place, None
+
+    def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
+        """Mark the first place among stored items; none there unmarks what they had marked.
+
+        Parameters
+        ----------
+        kind : int
+            MAV_MISSION_TYPE of the items.
+        items : tuple of Item
+            From the current one on.
+        home_alt_m : float
+            Height of home above mean sea level, NaN while there is none.
+        """
+        places = (item.place(home_alt_m) for item in items)
+        place = next((place for place in places if place is not None), None)
+        if place is not None:
+            self.place, self._from_items = place, kind
+        elif self._from_items == kind:
+            self.put(None)
+
+    def way(self, state: NavState) -> tuple[float, float] | None:
+        """Measure the way from the vehicle to the mark.
+
+        Parameters
+        ----------
+        state : NavState
+            Where the vehicle is.
+
+        Returns
+        -------
+        tuple of 2 floats, or None
+            Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
+            None without a mark or a position.
+        """
+        if self.place is None or not math.isfinite(state.lat_deg + state.lon_deg):
+            return None
+        distance_m, bearing_deg = vincenty.vdist(
+            state.lat_deg, state.lon_deg, self.place.lat_deg, self.place.lon_deg
+        )
+        return float(distance_m), math.radians(float(bearing_deg))
+
+    def nav_controller_output(self, state: NavState | None) -> Any:
+        """Encode the way to the mark; None while there is nothing to tell.
+
+        The desired heading is the bearing; bearings are -180 to 180, as autopilots send them.
+        Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed's
+        error is 0, for none is desired; clients print it as an integer, which no NaN survives.
+        """
+        way = None if state is None else self.way(state)
+        if state is None or self.place is None or way is None:
+            return None
+        distance_m, bearing_rad = way
+        bearing_deg = (fields.compass_deg(bearing_rad) + 180) % 360 - 180
+        return mavlink.MAVLink_nav_controller_output_message(
+            nav_roll=NAN,
+            nav_pitch=NAN,
+            nav_bearing=bearing_deg,
+            target_bearing=bearing_deg,
+            wp_dist=fields.uint16(distance_m, unknown=0),
+            alt_error=self.place.alt_amsl_m - state.alt_amsl_m,
+            aspd_error=0.0,
+            xtrack_error=NAN,
+        )

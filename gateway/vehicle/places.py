@@ -1,0 +1,115 @@
+"""Home and the marked location, as ground stations set them."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import NAN
+from gateway.vehicle.actions import Answer, Reply
+from gateway.vehicle.commands import ACCEPTED, DENIED, NOT_NOW, Command, CommandService, Outcome
+from gateway.vehicle.commands import whole as whole_number
+from gateway.vehicle.events import INFO, Told
+from gateway.vehicle.home import Home, Place
+from gateway.vehicle.mark import Mark
+from gateway.vehicle.messages import has_position
+from gateway.vehicle.mission import MissionService
+from gateway.vehicle.mission_items import FENCE, MISSION
+from gateway.vehicle.place import GLOBAL_FRAMES, height_amsl_m, is_on_earth
+from gateway.vehicle.telemetry import Telemetry
+
+Say = Callable[[Told, int], list[Any]]
+
+USE_CURRENT: int = 1
+"""First parameter of MAV_CMD_DO_SET_HOME."""
+
+
+class PlaceService:
+    """Set home, set and clear the mark."""
+
+    def __init__(self, telemetry: Telemetry, say: Say) -> None:
+        self.mark = Mark()
+        self.missions = MissionService(self._on_items, self._explain)
+        self._telemetry = telemetry
+        self._say = say
+        telemetry.add(
+            mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+            lambda _: self.mark.nav_controller_output(telemetry.state),
+        )
+        telemetry.add(
+            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, lambda _: self.missions.mission_current()
+        )
+
+    def register(self, commands: CommandService) -> None:
+        """Offer the commands that are carried out here."""
+        commands.register(mavlink.MAV_CMD_DO_SET_HOME, self._set_home)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI, self._set_roi)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, self._set_roi_location)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI_NONE, self._clear_roi)
+        commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
+
+    def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
+        """Mark a place, or none, and tell all."""
+        self.mark.put(place)
+        text = "Mark cleared"
+        if place is not None:
+            text = f"Marked {place.lat_deg:.6f}, {place.lon_deg:.6f}"
+        return [Reply(message) for message in self._say(Told(INFO, text), now_us)]
+
+    @property
+    def _home_alt_m(self) -> float:
+        home = self._telemetry.home
+        return home.place.alt_amsl_m if home else NAN
+
+    def _explain(self, text: str, now_us: int) -> list[Answer]:
+        return [Reply(message) for message in self._say(Told(INFO, text), now_us)]
+
+    def _on_items(self, kind: int, _now_us: int) -> list[Answer]:
+        if kind != FENCE:
+            first = self.missions.current if kind == MISSION else 0
+            self.mark.follow(kind, self.missions.items[kind][first:], self._home_alt_m)
+        return []
+
+    def _place(self, command: Command) -> Place | None:
+        """Read the place of a command; None if it is none."""
+        if command.frame not in GLOBAL_FRAMES:
+            return None
+        if not is_on_earth(command.lat_deg, command.lon_deg):
+            return None
+        height = height_amsl_m(command.height_m, command.frame, self._home_alt_m)
+        return Place(command.lat_deg, command.lon_deg, height)
+
+    def _set_home(self, command: Command, now_us: int) -> Outcome:
+        if whole_number(command.params[0]) == USE_CURRENT:
+            state = self._telemetry.state
+            if state is None or not has_position(state):
+                return NOT_NOW, []
+            place: Place | None = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        else:
+            place = self._place(command)
+        if place is None or not math.isfinite(place.alt_amsl_m):
+            return DENIED, []
+        told = self._telemetry.set_home(Home(place, now_us))
+        self.mark.put(place)
+        said = self._say(Told(INFO, "Home set by a ground station"), now_us)
+        return ACCEPTED, [Reply(message) for message in (*told, *said)]
+
+    def _set_roi(self, command: Command, now_us: int) -> Outcome:
+        mode = whole_number(command.params[0])
+        if mode == mavlink.MAV_ROI_NONE:
+            return self._clear_roi(command, now_us)
+        if mode != mavlink.MAV_ROI_LOCATION:
+            return DENIED, []
+        return self._set_roi_location(command, now_us)
+
+    def _set_roi_location(self, command: Command, now_us: int) -> Outcome:
+        place = self._place(command)
+        return (DENIED, []) if place is None else (ACCEPTED, self.put_mark(place, now_us))
+
+    def _clear_roi(self, _command: Command, now_us: int) -> Outcome:
+        return ACCEPTED, self.put_mark(None, now_us)
+
+    def _set_mission_current(self, command: Command, now_us: int) -> Outcome:
+        answers = self.missions.set_current(whole_number(command.params[0]), now_us)
+        return (DENIED, []) if answers is None else (ACCEPTED, answers)

@@ -1,0 +1,108 @@
+"""Frames of clients to checked requests; whatever is wrong with one, it is counted and dropped."""
+
+from collections import Counter
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import Incoming
+from gateway.vehicle.actions import Request
+from gateway.vehicle.encoder import AUTOPILOT_COMPONENT
+from gateway.vehicle.signing import Verifier
+
+V1_START: Final = 0xFE
+V2_START: Final = 0xFD
+SIGNED: Final = 0x01
+V1_OVERHEAD: Final = 8
+V2_OVERHEAD: Final = 12
+BROADCAST: Final = 0
+
+
+class RequestReader:
+    """Decode frames, check who sent them and whom they are for.
+
+    Parameters
+    ----------
+    system_id : int
+        The system that requests must be meant for.
+    verifier : Verifier or None
+        Checks signatures; with one, an unsigned client may only read.
+    """
+
+    def __init__(self, system_id: int, verifier: Verifier | None) -> None:
+        self.faults: Counter[str] = Counter()
+        """Frames dropped, by reason."""
+        self._system_id = system_id
+        self._verifier = verifier
+        self._mav: Any = mavlink.MAVLink(None)
+
+    def read(self, incoming: Incoming, now_us: int) -> Request | None:
+        """Decode one whole frame.
+
+        Parameters
+        ----------
+        incoming : Incoming
+            MAVLink 1 or 2.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        Request or None
+            None for what is broken, unknown, forged, or meant for somebody else.
+        """
+        frame = incoming.frame
+        message = self._decode(frame)
+        if isinstance(message, str):
+            self.faults[message] += 1
+            return None
+        if not self._is_for_us(message):
+            return None
+        allowed = incoming.trusted
+        if self._verifier is not None:
+            signed = frame[0] == V2_START and frame[2] & SIGNED
+            if signed and not self._verifier.accepts(frame, now_us):
+                self.faults["bad signature"] += 1
+                return None
+            allowed = allowed and bool(signed)
+        return Request(
+            incoming.client_id,
+            message.get_srcSystem(),
+            message.get_srcComponent(),
+            message,
+            allowed,
+        )
+
+    def _decode(self, frame: bytes) -> Any:
+        """Decode a frame, or name what is wrong with it."""
+        if not _is_whole(frame):
+            return "malformed"
+        try:
+            message = self._mav.decode(bytearray(frame))
+        except mavlink.MAVError:
+            return "broken"
+        if message.get_type().startswith("UNKNOWN"):
+            return "unknown"
+        if message.get_srcSystem() == self._system_id:
+            return "own id"
+        return message
+
+    def _is_for_us(self, message: Any) -> bool:
+        system = getattr(message, "target_system", BROADCAST)
+        component = getattr(message, "target_component", BROADCAST)
+        return system in (BROADCAST, self._system_id) and component in (
+            BROADCAST,
+            AUTOPILOT_COMPONENT,
+        )
+
+
+def _is_whole(frame: bytes) -> bool:
+    if len(frame) < V1_OVERHEAD:
+        return False
+    if frame[0] == V1_START:
+        return len(frame) == frame[1] + V1_OVERHEAD
+    if frame[0] != V2_START or frame[2] & ~SIGNED:
+        # An unknown incompatibility flag forbids reading on.
+        return False
+    signature = 13 if frame[2] & SIGNED else 0
+    return len(frame) == frame[1] + V2_OVERHEAD + signature

@@ -1,0 +1,43 @@
+from typing import Annotated
+
+import pytest
+
+from gateway.records import Vec3
+from gateway.settings import Settings, setting
+from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.vehicle import Vehicle
+from tests.conftest import ManualClock
+from tests.vehicle.ground_station import GroundStation
+from tests.vehicle.samples import BARO, FIX, sample_at, state_at
+
+
+class InnerSettings(Settings, frozen=True):
+    """A section in a section."""
+
+    alpha_gyro: Annotated[float, setting("Weight of the gyroscope.", ge=0.0, le=1.0)] = 0.75
+
+
+class TuningSettings(Settings, frozen=True):
+    """Every kind of setting that can be a parameter, and some that cannot."""
+
+    cutoff_hz: Annotated[float, setting("Cutoff of a filter.", "Hz", ge=0.1, le=500.0)] = 10.0
+    order: Annotated[int, setting("Order of a filter.", ge=1, le=8)] = 2
+    enabled: Annotated[bool, setting("Whether it runs.")] = True
+    shape: Annotated[str, setting("A free text.")] = "round"
+    bias_mps2: Annotated[Vec3, setting("An offset.", "m/s2")] = (0.0, 1.0, 2.0)
+    inner: InnerSettings = InnerSettings()
+
+
+@pytest.fixture
+def vehicle() -> Vehicle:
+    return Vehicle(VehicleSettings(), 1, sections={"tuning": TuningSettings()})
+
+
+@pytest.fixture
+def station(vehicle: Vehicle, clock: ManualClock) -> GroundStation:
+    """A trusted ground station of a vehicle that knows where it is."""
+    clock.now_us = 1_000_000
+    vehicle.on_gps(FIX, clock.now_us)
+    vehicle.on_baro(BARO, clock.now_us)
+    vehicle.on_state(state_at(clock.now_us), sample_at(clock.now_us), clock.now_us)
+    return GroundStation(vehicle, clock)
