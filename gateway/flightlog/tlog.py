@@ -191,22 +191,25 @@ class TlogIndex:
         end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
         self.size = max(self.size, batch.offset + end)
 
-    def offset_before(self, time_us: int) -> int:
+    def offset_before(self, time_us: int, records: int = 0) -> int:
         """Tell where to begin reading to find the first record that is not before a time.
 
         Parameters
         ----------
         time_us : int
             µs since 1970.
+        records : int
+            Begin at least so many records earlier, or at the begin of the file.
 
         Returns
         -------
         int
-            Offset of a record at most `STRIDE` records before it; 0 for an empty file.
+            Offset of a record at most `records` and two strides before it; 0 for an empty file.
         """
         if not self._offsets:
             return 0
-        return self._offsets[max(bisect_left(self._times, time_us) - 1, 0)]
+        entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
+        return self._offsets[max(entry, 0)]
 
     def _add_damage(self, run: Damage) -> None:
         self.damaged_bytes += run.size

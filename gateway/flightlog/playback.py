@@ -1,0 +1,253 @@
+"""When each recorded frame is due again.
+
+Theory of operation. While it plays, one line ties the gateway clock to the recording:
+
+    due = anchor_now + (time - anchor_time) / speed
+
+Whatever changes the course of time (pause, speed, seek, a skipped gap, a clock that jumps within
+the recording) sets a new anchor and nothing else. Frames come in the order of their times over all
+tracks. At infinite speed everything is due at once and the owner's batch size sets the pace.
+
+| state   | resume, seek, step, speed               | end of the range reached            |
+| ------- | --------------------------------------- | ----------------------------------- |
+| playing | takes effect from here                  | loop: seek to its begin; else ended |
+| paused  | resume: playing; step: so many frames   | stays paused                        |
+| ended   | seek: playing; resume: from the begin   |                                     |
+"""
+
+import math
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Final
+
+from gateway.flightlog.track import Track
+from gateway.units import US_PER_S
+
+LEAST_SPEED: Final = 0.1
+GREATEST_SPEED: Final = 100.0
+AS_FAST_AS_POSSIBLE: Final = math.inf
+CLOCK_JUMP_US: Final = 86_400 * US_PER_S
+"""A longer silence is no silence but a clock that was set; it is never waited for."""
+
+
+class PlayState(StrEnum):
+    """What a player does."""
+
+    PLAYING = "playing"
+    PAUSED = "paused"
+    ENDED = "ended"
+
+
+def check_speed(speed: float) -> float:
+    """Check a speed: 0.1 to 100, or infinite.
+
+    Raises
+    ------
+    ValueError
+        If it is another.
+    """
+    if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
+        raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")
+    return speed
+
+
+class Player:
+    """Plays recordings together.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+        At least one.
+    now_us : int
+        Gateway clock at the start.
+    speed : float
+        See `check_speed`.
+    begin_us, end_us : int, optional
+        Range of the recordings' time to play; the whole by default, the end included.
+    max_gap_us : int, optional
+        Longest silence to keep; None keeps all.
+    loop : bool
+        Start anew at the end.
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[Track],
+        now_us: int,
+        *,
+        speed: float = 1.0,
+        begin_us: int | None = None,
+        end_us: int | None = None,
+        max_gap_us: int | None = None,
+        loop: bool = False,
+    ) -> None:
+        self._tracks = tracks
+        self.begin_us = min(t.first_us for t in tracks) if begin_us is None else begin_us
+        self.end_us = max(t.last_us for t in tracks) if end_us is None else end_us
+        self.max_gap_us = max_gap_us
+        self.loop = loop
+        self.state = PlayState.PLAYING
+        self.sent = 0
+        """Frames so far."""
+        self._speed = check_speed(speed)
+        self._anchor = (now_us, self.begin_us)
+        self._last_us = self.begin_us
+        self._context = self._seek_tracks(self.begin_us)
+
+    @property
+    def speed(self) -> float:
+        """How much faster than it happened."""
+        return self._speed
+
+    @property
+    def position_us(self) -> int:
+        """Recorded time of the newest frame that was played."""
+        return self._last_us
+
+    def set_speed(self, speed: float, now_us: int) -> None:
+        """Go on faster or slower from here; raises ValueError as `check_speed`."""
+        here_us = self._time_at(now_us)
+        self._speed = check_speed(speed)
+        self._anchor = (now_us, here_us)
+
+    def pause(self, now_us: int) -> None:
+        """Hold."""
+        if self.state is PlayState.PLAYING:
+            self._anchor = (now_us, self._time_at(now_us))
+            self.state = PlayState.PAUSED
+
+    def resume(self, now_us: int) -> None:
+        """Go on from where it was held; from the begin after the end."""
+        if self.state is PlayState.ENDED:
+            self.seek(self.begin_us, now_us)
+        elif self.state is PlayState.PAUSED:
+            self._anchor = (now_us, self._anchor[1])
+        self.state = PlayState.PLAYING
+
+    def step(self, now_us: int, count: int = 1) -> list[bytes]:
+        """Pause, and play the next frames at once.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        count : int
+            How many frames.
+
+        Returns
+        -------
+        list of bytes
+            At most `count` frames, after what a seek has left to tell.
+        """
+        self.pause(now_us)
+        frames, self._context = self._context, []
+        for _ in range(count):
+            track = self._next_track()
+            if track is None:
+                break
+            frames.append(self._take(track))
+        self._anchor = (now_us, self._last_us)
+        return frames
+
+    def seek(self, time_us: int, now_us: int) -> None:
+        """Move to a time of the recordings, held within the range; a pause stays a pause."""
+        time_us = min(max(time_us, self.begin_us), self.end_us)
+        self._context = self._seek_tracks(time_us)
+        self._anchor = (now_us, time_us)
+        self._last_us = time_us
+        if self.state is PlayState.ENDED:
+            self.state = PlayState.PLAYING
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` is to be called next; None while nothing will be due by itself."""
+        if self._context:
+            return self._anchor[0]
+        if self.state is not PlayState.PLAYING:
+            return None
+        track = self._next_track()
+        return self._anchor[0] if track is None else self._due_us(track)
+
+    def poll(self, now_us: int, limit: int) -> list[bytes]:
+        """Return the frames that are due.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        limit : int
+            At most so many of the recordings' frames, so that others get their turn.
+
+        Returns
+        -------
+        list of bytes
+            In order; after a seek, first what a ground station must know.
+        """
+        frames, self._context = self._context, []
+        if self.state is not PlayState.PLAYING:
+            return frames
+        for _ in range(limit):
+            track = self._next_track()
+            if track is None:
+                self._end(now_us)
+                break
+            self._skip_silence(track, now_us)
+            if self._due_us(track) > now_us:
+                break
+            frames.append(self._take(track))
+        return frames
+
+    def _seek_tracks(self, time_us: int) -> list[bytes]:
+        return [frame for track in self._tracks for frame in track.seek(time_us)]
+
+    def _next_track(self) -> Track | None:
+        """Find the track whose next frame is the earliest; None at the end of the range."""
+        found: Track | None = None
+        earliest_us = self.end_us
+        for track in self._tracks:
+            time_us = track.peek_us()
+            if time_us is not None and (
+                time_us < earliest_us or (found is None and time_us == earliest_us)
+            ):
+                found, earliest_us = track, time_us
+        return found
+
+    def _take(self, track: Track) -> bytes:
+        self._last_us = track.peek_us() or self._last_us
+        self.sent += 1
+        return track.take()
+
+    def _end(self, now_us: int) -> None:
+        if self.loop and self.sent:
+            self.seek(self.begin_us, now_us)
+        else:
+            self.state = PlayState.ENDED
+
+    def _time_at(self, now_us: int) -> int:
+        """Tell the recorded time of a moment while playing, never beyond the next frame."""
+        anchor_now_us, anchor_time_us = self._anchor
+        if self.state is not PlayState.PLAYING:
+            return anchor_time_us
+        if self._speed == AS_FAST_AS_POSSIBLE:
+            return self._last_us
+        return anchor_time_us + round((now_us - anchor_now_us) * self._speed)
+
+    def _due_us(self, track: Track) -> int:
+        anchor_now_us, anchor_time_us = self._anchor
+        time_us = track.peek_us()
+        if time_us is None or self._speed == AS_FAST_AS_POSSIBLE:
+            return anchor_now_us
+        # Rounded up: a frame must not be due before its time.
+        return anchor_now_us + math.ceil((time_us - anchor_time_us) / self._speed)
+
+    def _skip_silence(self, track: Track, now_us: int) -> None:
+        """Set a new anchor where the next frame is too far away, or the recorded clock fell."""
+        time_us = track.peek_us() or 0
+        silence_us = time_us - self._last_us
+        longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
+        fell = silence_us < -US_PER_S
+        if silence_us <= longest_us and not fell:
+            return
+        kept_us = 0 if fell or self.max_gap_us is None else self.max_gap_us
+        due_last_us = self._anchor[0] + math.ceil((self._last_us - self._anchor[1]) / self._speed)
+        self._anchor = (max(due_last_us, now_us) if fell else due_last_us, time_us - kept_us)
+        self._last_us = time_us - kept_us

@@ -1,0 +1,301 @@
+"""One row of the table: an IMU sample, what arrived before it, and the state it led to.
+
+A row's records were taken in the order barometer, GPS, IMU. Where they came in another order, or
+two of a kind between two IMU samples, rows without an IMU sample stand in between, so that the
+file keeps every record and its place.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.records import (
+    BaroRaw,
+    FusedSample,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    ImuRaw,
+    ImuSample,
+    NavFlags,
+    NavState,
+    NodeId,
+    Vec3,
+)
+
+Cell = int | float | None
+Text = list[str]
+
+HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
+RAW_COLUMNS: Final = (
+    *("accel_x_raw", "accel_y_raw", "accel_z_raw", "gyro_x_raw", "gyro_y_raw", "gyro_z_raw"),
+    *("mag_x_raw", "mag_y_raw", "mag_z_raw", "temperature_raw"),
+    *("accel_range_g", "gyro_range_dps", "mag_lsb_per_gauss"),
+)
+SI_COLUMNS: Final = (
+    *("accel_x_b_mps2", "accel_y_b_mps2", "accel_z_b_mps2"),
+    *("gyro_x_b_radps", "gyro_y_b_radps", "gyro_z_b_radps"),
+    *("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut", "temperature_degc"),
+)
+BARO_COLUMNS: Final = (
+    *("baro_time_us", "baro_node_id", "baro_node_time_us"),
+    *("baro_pressure_pa", "baro_temperature_degc"),
+)
+GPS_COLUMNS: Final = (
+    *("gps_time_us", "gps_node_id", "gps_node_time_us", "gps_itow_ms"),
+    *("gps_fix_type", "gps_fix_ok", "gps_satellites"),
+    *("gps_lat_dege7", "gps_lon_dege7", "gps_alt_amsl_m"),
+    *("gps_vel_north_mps", "gps_vel_east_mps", "gps_vel_down_mps", "gps_alt_ellipsoid_m"),
+    *("gps_h_acc_m", "gps_v_acc_m", "gps_speed_acc_mps", "gps_course_acc_deg", "gps_pdop"),
+    "gps_utc_us",
+)
+NAV_COLUMNS: Final = (
+    *("nav_time_us", "nav_q_w", "nav_q_x", "nav_q_y", "nav_q_z"),
+    *("nav_rate_x_b_radps", "nav_rate_y_b_radps", "nav_rate_z_b_radps"),
+    *("nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m"),
+    *("nav_vel_north_mps", "nav_vel_east_mps", "nav_vel_down_mps"),
+    *("nav_attitude_std_north_rad", "nav_attitude_std_east_rad", "nav_attitude_std_down_rad"),
+    *("nav_vel_std_north_mps", "nav_vel_std_east_mps", "nav_vel_std_down_mps"),
+    *("nav_pos_std_north_m", "nav_pos_std_east_m", "nav_pos_std_down_m", "nav_flags"),
+)
+COLUMNS: Final = HEAD_COLUMNS + RAW_COLUMNS + SI_COLUMNS + BARO_COLUMNS + GPS_COLUMNS + NAV_COLUMNS
+
+_RAW: Final = len(HEAD_COLUMNS)
+_SI: Final = _RAW + len(RAW_COLUMNS)
+_BARO: Final = _SI + len(SI_COLUMNS)
+_GPS: Final = _BARO + len(BARO_COLUMNS)
+_NAV: Final = _GPS + len(GPS_COLUMNS)
+
+_NO_RAW: Final = (None,) * len(RAW_COLUMNS)
+_NO_SI: Final = (None,) * len(SI_COLUMNS)
+_NO_BARO: Final = (None,) * len(BARO_COLUMNS)
+_NO_GPS: Final = (None,) * len(GPS_COLUMNS)
+_NO_NAV: Final = (None,) * len(NAV_COLUMNS)
+_NO_VECTOR: Final = (None, None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedImu:
+    """An IMU sample in SI and body FRD; all that other people's logs have."""
+
+    accel_b_mps2: Vec3
+    gyro_b_radps: Vec3
+    mag_b_ut: Vec3 | None
+    temperature_degc: float
+    flags: ImuFlags
+
+
+@dataclass(frozen=True, slots=True)
+class TableRow:
+    """One row; what is not there is None."""
+
+    time_us: int
+    """Of the IMU sample, or of the newest record where there is none."""
+    baro: BaroRaw | None = None
+    gps: GpsFix | None = None
+    raw: ImuRaw | None = None
+    imu: CalibratedImu | None = None
+    state: NavState | None = None
+
+
+def calibrated(sample: ImuSample) -> CalibratedImu:
+    """Take from a sample what the table keeps; its filtered twins can be computed again."""
+    return CalibratedImu(
+        sample.accel_b_mps2,
+        sample.gyro_b_radps,
+        sample.mag_b_ut,
+        sample.temperature_degc,
+        sample.flags,
+    )
+
+
+def row_to_line(row: TableRow) -> str:
+    """Write a row as a line: floats with all their digits, NaN and absent as an empty cell."""
+    cells: tuple[Cell, ...] = (
+        row.time_us,
+        *_head_cells(row),
+        *(_raw_cells(row.raw) if row.raw else _NO_RAW),
+        *(_si_cells(row.imu) if row.imu else _NO_SI),
+        *(_baro_cells(row.baro) if row.baro else _NO_BARO),
+        *(_gps_cells(row.gps) if row.gps else _NO_GPS),
+        *(_nav_cells(row.state) if row.state else _NO_NAV),
+    )
+    # A cell that differs from itself is NaN.
+    return ",".join(["" if c is None or c != c else repr(c) for c in cells]) + "\n"
+
+
+def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
+    """Read a row from the texts of its cells, in the order of `COLUMNS`.
+
+    Raises
+    ------
+    ValueError
+        If a cell is no number, or one that its column needs is empty.
+    """
+    time_us = int(cells[0])
+    flags = ImuFlags(int(cells[3] or 0))
+    return TableRow(
+        time_us=time_us,
+        baro=_read_baro(cells[_BARO:_GPS], vehicle_id) if cells[_BARO] else None,
+        gps=_read_gps(cells[_GPS:_NAV], vehicle_id) if cells[_GPS] else None,
+        raw=_read_raw(cells, time_us, vehicle_id, flags) if cells[_RAW] else None,
+        imu=_read_si(cells[_SI:_BARO], flags) if cells[_SI] else None,
+        state=_read_nav(cells[_NAV:]) if cells[_NAV] else None,
+    )
+
+
+class RowBuilder:
+    """Gather the records of one aircraft into rows."""
+
+    def __init__(self) -> None:
+        self._baro: BaroRaw | None = None
+        self._gps: GpsFix | None = None
+
+    def add(self, record: BaroRaw | GpsFix | FusedSample) -> list[TableRow]:
+        """Take the next record and return the rows that it completes."""
+        match record:
+            case BaroRaw():
+                rows = self.flush() if self._baro or self._gps else []
+                self._baro = record
+            case GpsFix():
+                rows = self.flush() if self._gps else []
+                self._gps = record
+            case FusedSample():
+                imu = calibrated(record.sample)
+                raw = record.imu
+                rows = [TableRow(raw.time_us, self._baro, self._gps, raw, imu, record.state)]
+                self._baro = self._gps = None
+        return rows
+
+    def flush(self) -> list[TableRow]:
+        """Return what waits for an IMU sample as a row without one."""
+        newest = self._gps or self._baro
+        if newest is None:
+            return []
+        row = TableRow(newest.time_us, self._baro, self._gps)
+        self._baro = self._gps = None
+        return [row]
+
+
+def _head_cells(row: TableRow) -> tuple[Cell, ...]:
+    if row.raw:
+        return (row.raw.node.node_id, row.raw.node_time_us, int(row.raw.flags))
+    return (None, None, int(row.imu.flags) if row.imu else None)
+
+
+def _raw_cells(raw: ImuRaw) -> tuple[Cell, ...]:
+    return (
+        *(*raw.accel_raw, *raw.gyro_raw, *raw.mag_raw, raw.temperature_raw),
+        *(raw.accel_range_g, raw.gyro_range_dps, raw.mag_lsb_per_gauss),
+    )
+
+
+def _si_cells(imu: CalibratedImu) -> tuple[Cell, ...]:
+    mag = imu.mag_b_ut or _NO_VECTOR
+    return (*imu.accel_b_mps2, *imu.gyro_b_radps, *mag, imu.temperature_degc)
+
+
+def _baro_cells(baro: BaroRaw) -> tuple[Cell, ...]:
+    return (
+        *(baro.time_us, baro.node.node_id, baro.node_time_us),
+        *(baro.pressure_pa, baro.temperature_degc),
+    )
+
+
+def _gps_cells(fix: GpsFix) -> tuple[Cell, ...]:
+    return (
+        *(fix.time_us, fix.node.node_id, fix.node_time_us, fix.itow_ms),
+        *(int(fix.fix_type), int(fix.fix_ok), fix.satellites),
+        *(fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_m, *fix.vel_n_mps, fix.alt_ellipsoid_m),
+        *(fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps, fix.course_acc_deg, fix.pdop),
+        fix.utc_us,
+    )
+
+
+def _nav_cells(state: NavState) -> tuple[Cell, ...]:
+    return (
+        *(state.time_us, *state.q_nb, *state.rate_b_radps),
+        *(state.lat_deg, state.lon_deg, state.alt_amsl_m, *state.vel_n_mps),
+        *(*state.attitude_std_rad, *state.vel_std_mps, *state.pos_std_m, int(state.flags)),
+    )
+
+
+def _number(text: str) -> float:
+    return float(text) if text else float("nan")
+
+
+def _vector(cells: Text) -> Vec3:
+    x, y, z = cells
+    return (_number(x), _number(y), _number(z))
+
+
+def _read_raw(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuRaw:
+    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, *ranges = map(int, cells[_RAW:_SI])
+    accel_range_g, gyro_range_dps, mag_lsb_per_gauss = ranges
+    return ImuRaw(
+        time_us=time_us,
+        node=NodeId(vehicle_id, int(cells[1])),
+        node_time_us=int(cells[2]),
+        accel_raw=(ax, ay, az),
+        gyro_raw=(gx, gy, gz),
+        mag_raw=(mx, my, mz),
+        temperature_raw=temperature,
+        accel_range_g=accel_range_g,
+        gyro_range_dps=gyro_range_dps,
+        mag_lsb_per_gauss=mag_lsb_per_gauss,
+        flags=flags,
+    )
+
+
+def _read_si(cells: Text, flags: ImuFlags) -> CalibratedImu:
+    mag = _vector(cells[6:9]) if cells[6] else None
+    return CalibratedImu(_vector(cells[0:3]), _vector(cells[3:6]), mag, _number(cells[9]), flags)
+
+
+def _read_baro(cells: Text, vehicle_id: int) -> BaroRaw:
+    return BaroRaw(
+        time_us=int(cells[0]),
+        node=NodeId(vehicle_id, int(cells[1])),
+        node_time_us=int(cells[2]),
+        pressure_pa=_number(cells[3]),
+        temperature_degc=_number(cells[4]),
+    )
+
+
+def _read_gps(cells: Text, vehicle_id: int) -> GpsFix:
+    return GpsFix(
+        time_us=int(cells[0]),
+        node=NodeId(vehicle_id, int(cells[1])),
+        node_time_us=int(cells[2]),
+        itow_ms=int(cells[3]),
+        fix_type=GpsFixType(int(cells[4])),
+        fix_ok=cells[5] == "1",
+        satellites=int(cells[6]),
+        lat_dege7=int(cells[7]),
+        lon_dege7=int(cells[8]),
+        alt_amsl_m=_number(cells[9]),
+        vel_n_mps=_vector(cells[10:13]),
+        alt_ellipsoid_m=_number(cells[13]),
+        h_acc_m=_number(cells[14]),
+        v_acc_m=_number(cells[15]),
+        speed_acc_mps=_number(cells[16]),
+        course_acc_deg=_number(cells[17]),
+        pdop=_number(cells[18]),
+        utc_us=int(cells[19]) if cells[19] else None,
+    )
+
+
+def _read_nav(cells: Text) -> NavState:
+    w, x, y, z = map(_number, cells[1:5])
+    return NavState(
+        time_us=int(cells[0]),
+        q_nb=(w, x, y, z),
+        rate_b_radps=_vector(cells[5:8]),
+        lat_deg=_number(cells[8]),
+        lon_deg=_number(cells[9]),
+        alt_amsl_m=_number(cells[10]),
+        vel_n_mps=_vector(cells[11:14]),
+        attitude_std_rad=_vector(cells[14:17]),
+        vel_std_mps=_vector(cells[17:20]),
+        pos_std_m=_vector(cells[20:23]),
+        flags=NavFlags(int(cells[23])),
+    )

@@ -1,0 +1,278 @@
+"""When to record, into which part, and what to do when the disk does not want to.
+
+Theory of operation. The session never touches a file: it tells its owner what to do and is told
+what came of it.
+
+| state     | event                              | becomes   | actions                           |
+| --------- | ---------------------------------- | --------- | --------------------------------- |
+| idle      | wanted (start, in flight, always)  | opening   | open part 1 of a new session      |
+| opening   | opened                             | recording | announce (first part only)        |
+| opening   | failed                             | blocked   | announce why                      |
+| recording | not wanted any more                | idle      | close, announce                   |
+| recording | part too large or too old          | opening   | close, open the next part         |
+| recording | the clock turns out to be wrong    | opening   | close, rename, open the next part |
+| recording | too little free space, or failed   | blocked   | close, announce why               |
+| blocked   | retry is due and there is space    | opening   | open the next part                |
+| blocked   | not wanted any more                | idle      | announce                          |
+
+What is wanted: a user's start or stop counts until the user says otherwise; without one the mode
+of the settings decides.
+"""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Annotated, Final, Literal
+
+from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
+
+RETRY_US: Final = 5 * US_PER_S
+RESUME_FACTOR: Final = 1.25
+"""Free space must exceed the floor by this before recording resumes, or it would flap."""
+MAX_NAME: Final = 100
+PART_DIGITS: Final = 2
+
+
+class RecordingSettings(Settings, frozen=True):
+    """What is recorded, where, and when."""
+
+    mode: Annotated[
+        Literal["manual", "in_flight", "always"],
+        setting(
+            "manual: on command only; in_flight: from arming or take-off to landing; always: as "
+            "long as the gateway runs."
+        ),
+    ] = "in_flight"
+    folder: Annotated[str, setting("Folder of the recordings; made if it is not there.")] = (
+        "~/mavgate/recordings"
+    )
+    tlog: Annotated[bool, setting("Record all MAVLink that is sent and received.")] = True
+    table: Annotated[bool, setting("Record raw samples and fused states, one CSV an aircraft.")] = (
+        True
+    )
+    rotate_mb: Annotated[
+        float, setting("A file that grows larger is closed and the next begun.", "MB", ge=1)
+    ] = 512.0
+    rotate_min: Annotated[
+        float, setting("A file that grows older is closed and the next begun.", "min", ge=1)
+    ] = 120.0
+    free_floor_mb: Annotated[
+        float, setting("Recording stops when the disk has less space left.", "MB", ge=0)
+    ] = 200.0
+    flush_s: Annotated[
+        float, setting("What is lost at most when the gateway is killed.", "s", ge=0.05, le=1)
+    ] = 0.5
+    sync_s: Annotated[
+        float,
+        setting("What is lost at most when the power fails.", "s", ge=0.1, le=60),
+    ] = 1.0
+
+
+class SessionState(StrEnum):
+    """Where the recording stands."""
+
+    IDLE = "idle"
+    OPENING = "opening"
+    RECORDING = "recording"
+    BLOCKED = "blocked"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenPart:
+    """Open the files of a part; answer by `opened` or `failed`."""
+
+    session: str
+    part: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClosePart:
+    """Close the files of the part that is open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Announce:
+    """Tell the user."""
+
+    is_trouble: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rename:
+    """Give the files of a session, all closed, the name of the time at which it truly began."""
+
+    session: str
+    to_session: str
+
+
+SessionAction = OpenPart | ClosePart | Announce | Rename
+
+
+def session_name(unix_us: int) -> str:
+    """Name a session by the civil time of its start, in UTC: `20260611-142530`."""
+    return datetime.fromtimestamp(unix_us // US_PER_S, UTC).strftime("%Y%m%d-%H%M%S")
+
+
+def part_stem(session: str, part: int) -> str:
+    """Name the files of a part, without their endings: `20260611-142530_01`."""
+    return f"{session}_{part:0{PART_DIGITS}d}"
+
+
+def check_name(name: str) -> str:
+    """Check the name under which a user saves a session.
+
+    Parameters
+    ----------
+    name : str
+        Letters, digits, space, dot, hyphen and underscore; begins with a letter or digit.
+
+    Returns
+    -------
+    str
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If a file must not be named so.
+    """
+    sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
+    if not sound or not name[:1].isalnum() or name.endswith((" ", ".")):
+        raise ValueError(
+            f"{name!r} is no name for a recording: at most {MAX_NAME} letters, digits, spaces, "
+            "dots, hyphens and underscores, beginning with a letter or digit"
+        )
+    return name
+
+
+class Session:
+    """Decides when files are opened and closed.
+
+    Parameters
+    ----------
+    settings : RecordingSettings
+        Mode and limits.
+    """
+
+    def __init__(self, settings: RecordingSettings) -> None:
+        self._settings = settings
+        self._in_flight = False
+        self._asked: bool | None = None
+        self._begun_us = 0
+        self._opened_us = 0
+        self._retry_us = 0
+        self.state = SessionState.IDLE
+        self.name = ""
+        """Name of the session that runs, or ran last."""
+        self.part = 0
+        self.reason = ""
+        """Why it is blocked."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there should be a recording now."""
+        if self._asked is not None:
+            return self._asked
+        mode = self._settings.mode
+        return mode == "always" or (mode == "in_flight" and self._in_flight)
+
+    def start(self) -> None:
+        """Take a user's order to record."""
+        self._asked = True
+
+    def stop(self) -> None:
+        """Take a user's order to stop; holds until the next order, or the next flight."""
+        self._asked = False
+
+    def set_in_flight(self, in_flight: bool) -> None:
+        """Note take-off or landing; a flight that begins ends an earlier order to stop."""
+        if in_flight and not self._in_flight and self._asked is False:
+            self._asked = None
+        self._in_flight = in_flight
+
+    def opened(self, now_us: int) -> list[SessionAction]:
+        """Note that the files of the part are open."""
+        self.state, self._opened_us = SessionState.RECORDING, now_us
+        resumed, self.reason = bool(self.reason), ""
+        if self.part == 1 or resumed:
+            return [Announce(is_trouble=False, text=f"Recording {self.name}")]
+        return []
+
+    def failed(self, reason: str, now_us: int) -> list[SessionAction]:
+        """Note that files could not be opened or written; they are tried again later."""
+        closing: list[SessionAction] = [ClosePart()] if self.state is SessionState.RECORDING else []
+        if self.state is SessionState.OPENING:
+            self.part -= 1
+        self.state, self._retry_us = SessionState.BLOCKED, now_us + RETRY_US
+        known, self.reason = reason == self.reason, reason
+        if known:
+            return closing
+        return [*closing, Announce(is_trouble=True, text=f"Recording stopped: {reason}")]
+
+    def poll(
+        self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False
+    ) -> list[SessionAction]:
+        """Do what is due.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        unix_us : int
+            Civil time, for the name of a new session.
+        part_bytes : int
+            Size of the largest file that is open.
+        free_bytes : int
+            Space left on the disk; 0 if that cannot be told.
+        jumped : bool
+            Whether civil time has turned out to differ from that of the open files.
+
+        Returns
+        -------
+        list of SessionAction
+            To be done in this order.
+        """
+        match self.state:
+            case SessionState.IDLE if self.wanted:
+                self.name, self.part, self._begun_us = session_name(unix_us), 0, now_us
+                return self._open_next()
+            case SessionState.RECORDING:
+                return self._poll_recording(now_us, unix_us, part_bytes, free_bytes, jumped)
+            case SessionState.BLOCKED:
+                return self._poll_blocked(now_us, free_bytes)
+            case _:
+                return []
+
+    def _poll_recording(
+        self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, jumped: bool
+    ) -> list[SessionAction]:
+        s = self._settings
+        if not self.wanted:
+            self.state = SessionState.IDLE
+            return [ClosePart(), Announce(is_trouble=False, text=f"Recording {self.name} ended")]
+        if free_bytes < s.free_floor_mb * 1e6:
+            return self.failed(f"less than {s.free_floor_mb:g} MB free", now_us)
+        age_us = now_us - self._opened_us
+        too_old = age_us > s.rotate_min * 60 * US_PER_S
+        if jumped:
+            old, self.name = self.name, session_name(unix_us - (now_us - self._begun_us))
+            return [ClosePart(), Rename(old, self.name), *self._open_next()]
+        if too_old or part_bytes > s.rotate_mb * 1e6:
+            return [ClosePart(), *self._open_next()]
+        return []
+
+    def _poll_blocked(self, now_us: int, free_bytes: int) -> list[SessionAction]:
+        if not self.wanted:
+            self.state, self.reason = SessionState.IDLE, ""
+            return [Announce(is_trouble=False, text=f"Recording {self.name} ended")]
+        enough = free_bytes >= self._settings.free_floor_mb * 1e6 * RESUME_FACTOR
+        if now_us < self._retry_us or not enough:
+            return []
+        return self._open_next()
+
+    def _open_next(self) -> list[SessionAction]:
+        self.state = SessionState.OPENING
+        self.part += 1
+        return [OpenPart(self.name, self.part)]
