@@ -148,7 +148,8 @@ static_assert(IMU_SAMPLE_HZ >= 200 && IMU_SAMPLE_HZ <= 1000 && 1000 % (IMU_SAMPL
               "IMU_SAMPLE_HZ is 1000, 500, 250 or 200");
 static_assert(IMU_SEND_HZ >= 60 && IMU_SEND_HZ <= 250 && IMU_SEND_HZ <= IMU_SAMPLE_HZ,
               "IMU_SEND_HZ is 60 to 250");
-static_assert(ACCEL_LOWPASS_HZ * 3 < IMU_SAMPLE_HZ, "ACCEL_LOWPASS_HZ is too high");
+static_assert(ACCEL_LOWPASS_HZ * 10 <= IMU_SAMPLE_HZ,
+              "ACCEL_LOWPASS_HZ is at most a tenth of IMU_SAMPLE_HZ");
 static_assert(ACCEL_RANGE >= 0 && ACCEL_RANGE <= 3, "ACCEL_RANGE is 0 to 3");
 static_assert(GYRO_RANGE >= 0 && GYRO_RANGE <= 3, "GYRO_RANGE is 0 to 3");
 static_assert(MAG_GAIN >= 0 && MAG_GAIN <= 7, "MAG_GAIN is 0 to 7");

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/filters.h"
 
+#include <string.h>
+
 namespace {
 
 int16_t saturate(int32_t value) {
@@ -13,6 +15,15 @@ int16_t saturate(int32_t value) {
     return static_cast<int16_t>(value);
 }
 
+// A coefficient of 31 fraction bits times a value, halved. The upper half of the product is taken
+// by its place in memory: a shift of 64 bits costs more than the product.
+int32_t scale(int32_t coefficient, int32_t value) {
+    const int64_t product = static_cast<int64_t>(coefficient) * value;
+    int32_t halves[2];
+    memcpy(halves, &product, sizeof halves);
+    return halves[1];
+}
+
 }  // namespace
 
 void low_pass_start(LowPass *filter, int16_t x) {
@@ -22,16 +33,14 @@ void low_pass_start(LowPass *filter, int16_t x) {
 
 void low_pass_update(LowPass *filter, const LowPassDesign &design, int16_t x) {
     const int32_t window = static_cast<int32_t>(x) + INT32_C(2) * filter->x1 + filter->x2;
-    // b0 < 0.25 and |window| < 2^17: the product, brought to the output's scale, stays below 2^59.
-    int64_t sum = static_cast<int64_t>(design.b0) * (window * (INT32_C(1) << (LOW_PASS_OUTPUT_BITS - 2)));
-    sum *= 4;
-    sum -= static_cast<int64_t>(design.a1) * filter->y1;
-    sum -= static_cast<int64_t>(design.a2) * filter->y2;
-    sum += INT32_C(1) << (LOW_PASS_COEFFICIENT_BITS - 1);
+    // Each product loses its fraction downwards, half a unit in the mean: one and a half of three.
+    const int32_t correction = scale(design.b0, window * (INT32_C(1) << LOW_PASS_OUTPUT_BITS)) -
+                               scale(design.c1, filter->y1) + scale(design.c2, filter->y2);
+    const int32_t y = 2 * filter->y1 - filter->y2 + 2 * correction + 1;
     filter->x2 = filter->x1;
     filter->x1 = x;
     filter->y2 = filter->y1;
-    filter->y1 = static_cast<int32_t>(sum >> LOW_PASS_COEFFICIENT_BITS);
+    filter->y1 = y;
 }
 
 int16_t low_pass_output(const LowPass *filter) {

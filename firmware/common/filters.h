@@ -6,12 +6,14 @@
 
 // Second-order Butterworth low-pass,
 //     y = b0 (x + 2 x1 + x2) - a1 y1 - a2 y2,
-// by the bilinear transform with the cutoff pre-warped. Coefficients have 29 fraction bits, the
-// output 14, so that its rounding stays below 0.01 count at a cutoff of a hundredth of the rate.
+// by the bilinear transform with the cutoff pre-warped. It is computed as
+//     y = 2 y1 - y2 + b0 (x + 2 x1 + x2) - c1 y1 + c2 y2,   c1 = 2 + a1, c2 = 1 - a2,
+// for at a cutoff far below the rate a1 and a2 are nearly -2 and 1, and their differences from that
+// are what counts. Coefficients have 31 fraction bits, the output 14.
 struct LowPassDesign {
     int32_t b0;
-    int32_t a1;
-    int32_t a2;
+    int32_t c1;
+    int32_t c2;
 };
 
 struct LowPass {
@@ -21,7 +23,6 @@ struct LowPass {
     int32_t y2;
 };
 
-constexpr uint8_t LOW_PASS_COEFFICIENT_BITS = 29;
 constexpr uint8_t LOW_PASS_OUTPUT_BITS = 14;
 
 // tan(x) for 0 <= x < 1.2, by its continued fraction; computed by the compiler alone.
@@ -33,17 +34,16 @@ constexpr double filters_tan(double x) {
     return x / denominator;
 }
 
-// cutoff_hz must be below rate_hz / 3.
+// cutoff_hz must not be above rate_hz / 10.
 constexpr LowPassDesign low_pass_design(double cutoff_hz, double rate_hz) {
     const double k = filters_tan(3.14159265358979323846 * cutoff_hz / rate_hz);
     const double root2_k = 1.41421356237309504880 * k;
     const double norm = 1.0 / (1.0 + root2_k + k * k);
-    const double one = static_cast<double>(1UL << LOW_PASS_COEFFICIENT_BITS);
-    const int32_t a1 = static_cast<int32_t>(2.0 * (k * k - 1.0) * norm * one - 0.5);
-    const int32_t a2 = static_cast<int32_t>((1.0 - root2_k + k * k) * norm * one + 0.5);
-    // From the rounded poles, so that a constant passes unchanged.
-    const int32_t b0 = ((INT32_C(1) << LOW_PASS_COEFFICIENT_BITS) + a1 + a2) / 4;
-    return LowPassDesign{b0, a1, a2};
+    const double one = 2147483648.0;
+    const int32_t c1 = static_cast<int32_t>((2.0 * root2_k + 4.0 * k * k) * norm * one + 0.5);
+    const int32_t c2 = static_cast<int32_t>(2.0 * root2_k * norm * one + 0.5);
+    // From the rounded poles, so that a constant passes unchanged: 4 b0 = 1 + a1 + a2.
+    return LowPassDesign{(c1 - c2) / 4, c1, c2};
 }
 
 // Starts the filter as if `x` had stood at its input for ever.

@@ -10,7 +10,6 @@
 namespace {
 
 constexpr uint8_t TICKS_PER_US = F_CPU / 8 / 1000000UL;  // prescaler 8
-constexpr uint8_t OVERFLOW_SHIFT = TICKS_PER_US == 2 ? 15 : 16;
 constexpr uint16_t TICKS_PER_MS = TICKS_PER_US * 1000U;
 
 }  // namespace
@@ -41,7 +40,12 @@ uint32_t clock_us_in_interrupt() {
         ticks = TCNT1;
         ++overflows;  // it wrapped and its interrupt still waits
     }
-    return (overflows << OVERFLOW_SHIFT) + ticks / TICKS_PER_US;
+    const uint32_t all_ticks = overflows << 16 | ticks;
+    if (TICKS_PER_US == 1) {
+        return all_ticks;
+    }
+    // The 33rd bit of the ticks is the 32nd of the microseconds; AVR has no quick shift by 15.
+    return all_ticks >> 1 | (overflows & 0x10000 ? 0x80000000 : 0);
 }
 
 uint32_t clock_us() {

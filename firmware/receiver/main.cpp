@@ -23,10 +23,14 @@ constexpr uint32_t SET_UP_EVERY_US = 500000;
 constexpr uint32_t NOISE_EVERY_US = 50000;
 // The carrier detector needs 130 us to enter reception and 40 us to measure: section 6.4.
 constexpr uint32_t NOISE_AFTER_US = 200;
+// A carrier that ends in a packet within this time was our own; the longest lasts 1.4 ms.
+constexpr uint32_t NOISE_OWN_US = 2000;
+
+enum NoiseState : uint8_t { NOISE_IDLE, NOISE_LISTENING, NOISE_HEARD };
 
 struct Receiver {
     bool radio_present;
-    bool listening_afresh;
+    NoiseState noise_state;
     uint8_t sequence;
     uint16_t dropped;
     uint16_t noise_looks;
@@ -72,7 +76,7 @@ void poll_radio() {
     // Causes are cleared before the FIFO is read, so that a packet that comes meanwhile pulls the
     // line low again.
     nrf24_take_causes();
-    receiver.listening_afresh = false;  // the detector now holds the packet's own carrier
+    receiver.noise_state = NOISE_IDLE;  // the carrier is a packet's own
     uint32_t arrived_us = lines_radio_us();
     Nrf24Packet packet;
     while (nrf24_receive(&packet)) {
@@ -81,22 +85,27 @@ void poll_radio() {
     }
 }
 
+void end_noise_look(uint32_t now_us, bool heard) {
+    ++receiver.noise_looks;
+    receiver.noise_heard = static_cast<uint16_t>(receiver.noise_heard + (heard ? 1 : 0));
+    receiver.noise_state = NOISE_IDLE;
+    receiver.noise_due_us = now_us + NOISE_EVERY_US;
+}
+
 void poll_noise(uint32_t now_us) {
     if (!clock_passed(now_us, receiver.noise_due_us)) {
         return;
     }
-    if (!receiver.listening_afresh) {
+    if (receiver.noise_state == NOISE_IDLE) {
         nrf24_restart_listening();
-        receiver.listening_afresh = true;
+        receiver.noise_state = NOISE_LISTENING;
         receiver.noise_due_us = now_us + NOISE_AFTER_US;
-        return;
+    } else if (receiver.noise_state == NOISE_LISTENING && nrf24_carrier()) {
+        receiver.noise_state = NOISE_HEARD;
+        receiver.noise_due_us = now_us + NOISE_OWN_US;
+    } else {
+        end_noise_look(now_us, receiver.noise_state == NOISE_HEARD);
     }
-    ++receiver.noise_looks;
-    if (nrf24_carrier()) {
-        ++receiver.noise_heard;
-    }
-    receiver.listening_afresh = false;
-    receiver.noise_due_us = now_us + NOISE_EVERY_US;
 }
 
 uint8_t take_noise_percent() {
