@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: Apache-2.0
+// Payloads that wait for the radio. Where it does not keep up the oldest goes: a fresh sample is
+// worth more than a stale one.
+#pragma once
+
+#include <stdint.h>
+
+#include "common/wire.h"
+
+constexpr uint8_t PAYLOAD_QUEUE_SIZE = 8;
+
+struct Payload {
+    uint8_t size;
+    uint8_t bytes[WIRE_MAX_PAYLOAD];
+};
+
+struct PayloadQueue {
+    uint8_t first;
+    uint8_t count;
+    uint16_t dropped;  // wraps
+    Payload payloads[PAYLOAD_QUEUE_SIZE];
+};
+
+void payload_queue_push(PayloadQueue *queue, const void *bytes, uint8_t size);
+
+// The oldest payload, or null.
+const Payload *payload_queue_front(const PayloadQueue *queue);
+
+void payload_queue_pop(PayloadQueue *queue);

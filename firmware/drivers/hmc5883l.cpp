@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "drivers/hmc5883l.h"
+
+#include "hal/twi.h"
+#include "settings.h"
+
+namespace {
+
+constexpr uint8_t CONFIG_A = 0x00;
+constexpr uint8_t IDENTIFICATION = 0x0A;
+
+constexpr uint8_t MEAN_OF_8_AT_75_HZ = 3 << 5 | 6 << 2;
+constexpr uint8_t GAIN_SHIFT = 5;
+constexpr uint8_t CONTINUOUS = 0;
+
+int16_t word(const uint8_t *bytes) { return static_cast<int16_t>(bytes[0] << 8 | bytes[1]); }
+
+}  // namespace
+
+bool hmc5883l_set_up() {
+    const uint8_t where = IDENTIFICATION;
+    uint8_t id[3];
+    if (!twi_run(HMC5883L_ADDRESS, &where, 1, id, sizeof id)) {
+        return false;
+    }
+    // The address pointer goes on by itself: configuration A and B, then the mode.
+    const uint8_t set[4] = {CONFIG_A, MEAN_OF_8_AT_75_HZ, MAG_GAIN << GAIN_SHIFT, CONTINUOUS};
+    return id[0] == 'H' && id[1] == '4' && id[2] == '3' &&
+           twi_run(HMC5883L_ADDRESS, set, sizeof set, nullptr, 0);
+}
+
+void hmc5883l_read_bytes(const uint8_t *bytes, int16_t mag[3]) {
+    mag[0] = word(bytes);
+    mag[1] = word(bytes + 4);
+    mag[2] = word(bytes + 2);
+}

@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+// nRF24L01+: Enhanced ShockBurst with dynamic payload length, 2-byte CRC and automatic
+// acknowledgement. Product specification 1.0.
+#pragma once
+
+#include <stdint.h>
+
+#include "common/wire.h"
+
+// Status register, section 9.1: interrupt causes.
+constexpr uint8_t NRF24_RECEIVED = 1 << 6;
+constexpr uint8_t NRF24_SENT = 1 << 5;
+constexpr uint8_t NRF24_GAVE_UP = 1 << 4;
+
+// Both return false if the chip does not keep what is written to it.
+bool nrf24_start_sender(uint8_t pipe);
+bool nrf24_start_receiver();
+
+// False if the chip has lost its configuration, as after a dip of its supply.
+bool nrf24_configured();
+
+// Puts one payload on the air; the chip sends it again up to `retries` times, each `pause` times
+// 250 us after the last, until it is acknowledged.
+void nrf24_send(const uint8_t *payload, uint8_t size, uint8_t pause, uint8_t retries);
+
+// Sends the payload that was given up once more, with its packet identity unchanged.
+void nrf24_send_again(uint8_t pause, uint8_t retries);
+
+// Takes the radio off the air and forgets what it has not sent.
+void nrf24_stop_sending();
+
+// Interrupt causes; reading clears them.
+uint8_t nrf24_take_causes();
+
+// Retries that the last payload took.
+uint8_t nrf24_retries();
+
+struct Nrf24Packet {
+    uint8_t pipe;
+    uint8_t size;
+    uint8_t payload[WIRE_MAX_PAYLOAD];
+    bool fifo_full;  // it was, before this packet was taken
+};
+
+// Takes the next received packet; false if there is none.
+bool nrf24_receive(Nrf24Packet *packet);
+
+// Leaves and enters reception, so that the carrier detector measures afresh.
+void nrf24_restart_listening();
+
+// Whether a carrier above -64 dBm stood on the channel; valid 0.2 ms after the restart.
+bool nrf24_carrier();

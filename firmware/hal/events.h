@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the interrupts tell the main loop, and the sleep between.
+#pragma once
+
+#include <stdint.h>
+
+enum Event : uint8_t {
+    EVENT_TICK = 1 << 0,   // a millisecond has passed
+    EVENT_IMU = 1 << 1,    // the MPU6050 has a sample
+    EVENT_RADIO = 1 << 2,  // the radio's interrupt line fell
+    EVENT_TWI = 1 << 3,    // a transfer ended
+    EVENT_UART = 1 << 4,   // a byte came in
+};
+
+// Sleeps until at least one event; returns all since the last call.
+uint8_t events_wait();

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+// The two interrupt lines: D2 (INT0) from the MPU6050, rising; D3 (INT1) from the radio, falling.
+#pragma once
+
+#include <stdint.h>
+
+void lines_start_imu();
+void lines_start_radio();
+
+// When the line last moved.
+uint32_t lines_imu_us();
+uint32_t lines_radio_us();
+
+// Whether the radio still holds its line low: an edge may be missed, a level not.
+bool lines_radio_low();

@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: Apache-2.0
+// The IMU node: GY-87 (MPU6050, HMC5883L, BMP180) to radio.
+#include <string.h>
+
+#include "common/filters.h"
+#include "common/imu_reducer.h"
+#include "common/wire.h"
+#include "hal/board.h"
+#include "hal/clock.h"
+#include "hal/lines.h"
+#include "hal/spi.h"
+#include "hal/twi.h"
+#include "imu_node/sensors.h"
+#include "node/node_report.h"
+#include "node/radio_sender.h"
+#include "settings.h"
+
+namespace {
+
+constexpr ImuReducerSettings REDUCER_SETTINGS = {
+    IMU_SAMPLE_HZ,
+    IMU_SEND_HZ,
+    IMU_RAW != 0,
+    low_pass_design(ACCEL_LOWPASS_HZ, IMU_SAMPLE_HZ),
+    high_pass_gain(GYRO_HIGHPASS_HZ, IMU_SEND_HZ),
+};
+constexpr uint8_t RANGES = wire_ranges(ACCEL_RANGE, GYRO_RANGE, MAG_GAIN);
+
+Sensors sensors;
+SensorReadings readings;
+ImuReducer reducer;
+WireImu imu;
+RadioSender sender;
+NodeReport report;
+bool mag_is_new;
+
+uint16_t flag_if(bool condition, uint16_t flag) { return condition ? flag : 0; }
+
+uint16_t sensor_flags() {
+    return flag_if(mag_is_new, WIRE_MAG_NEW) |
+           flag_if(!sensors.states[SENSOR_MAG].answering, WIRE_MAG_ABSENT) |
+           flag_if(!sensors.states[SENSOR_BARO].answering, WIRE_BARO_ABSENT) |
+           flag_if(sensors.self_test_failed, WIRE_SELF_TEST_FAILED);
+}
+
+void send_imu() {
+    for (uint8_t axis = 0; axis < 3; ++axis) {
+        imu.mag[axis] = readings.mag[axis];
+    }
+    imu.flags |= sensor_flags();
+    imu.ranges = RANGES;
+    mag_is_new = false;
+    ++report.samples;
+    radio_sender_push(&sender, WIRE_IMU, readings.imu_us, &imu, sizeof imu);
+}
+
+void send_baro() {
+    WireBaro baro = {};
+    baro.pressure_centipa = readings.pressure_centipa;
+    baro.temperature_ddegc = readings.temperature_ddegc;
+    radio_sender_push(&sender, WIRE_BARO, readings.baro_us, &baro, sizeof baro);
+}
+
+void poll_sensors() {
+    const uint8_t news = sensors_poll(&sensors, &readings);
+    if ((news & SENSOR_NEWS_MAG) != 0) {
+        mag_is_new = true;
+    }
+    if ((news & SENSOR_NEWS_IMU) != 0 && imu_reduce(&reducer, REDUCER_SETTINGS, readings.imu, &imu)) {
+        send_imu();
+    }
+    if ((news & SENSOR_NEWS_BARO) != 0) {
+        send_baro();
+    }
+}
+
+NodeHealth health() {
+    return NodeHealth{sensors_present(&sensors), sensors_failed(&sensors), twi_errors()};
+}
+
+}  // namespace
+
+int main() {
+    spi_start();
+    lines_start_radio();
+    board_start();
+    radio_sender_start(&sender, IMU_RADIO_PIPE, wire_vehicle_node(VEHICLE_ID, IMU_NODE_ID));
+    sensors_start(&sensors, board_started_cold());
+    report.due_us = report.loop_began_us = clock_us();
+    for (;;) {
+        node_report_wait(&report);
+        poll_sensors();
+        radio_sender_poll(&sender);
+        node_report_poll(&report, health(), &sender);
+    }
+}

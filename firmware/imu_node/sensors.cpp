@@ -1,0 +1,240 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "imu_node/sensors.h"
+
+#include <string.h>
+
+#include "common/wire.h"
+#include "drivers/bmp180.h"
+#include "drivers/hmc5883l.h"
+#include "hal/clock.h"
+#include "hal/lines.h"
+#include "hal/twi.h"
+#include "settings.h"
+
+namespace {
+
+enum Job : uint8_t { NO_JOB, IMU_READ, MAG_READ, BARO_COMMAND, BARO_READ };
+
+// The barometer's cycle: a temperature now and then, a pressure each time.
+enum BaroStep : uint8_t { BEGIN_TEMPERATURE, READ_TEMPERATURE, BEGIN_PRESSURE, READ_PRESSURE };
+
+constexpr uint8_t FAILURES_TO_ABSENT = 3;
+constexpr uint32_t RETRY_US = 200000;
+constexpr uint32_t IMU_SILENT_US = 50000;
+constexpr uint32_t MAG_EVERY_US = 1000000UL / MAG_HZ;
+constexpr uint32_t BARO_EVERY_US = 1000000UL / BARO_HZ;
+constexpr uint8_t PRESSURES_PER_TEMPERATURE = BARO_HZ;  // once a second
+constexpr uint32_t PRESSURE_US = bmp180_pressure_us(BARO_OVERSAMPLING);
+static_assert(BARO_EVERY_US > PRESSURE_US + BMP180_TEMPERATURE_US + 1000,
+              "BARO_HZ is too high for BARO_OVERSAMPLING");
+
+bool set_up(Sensors *sensors, uint8_t index) {
+    switch (index) {
+        case SENSOR_IMU:
+            return mpu6050_set_up();
+        case SENSOR_MAG:
+            return hmc5883l_set_up();
+        default:
+            sensors->baro_step = BEGIN_TEMPERATURE;
+            sensors->baro_cycle = 0;
+            sensors->baro_due_us = clock_us();
+            return bmp180_set_up(&sensors->words);
+    }
+}
+
+void try_set_up(Sensors *sensors, uint8_t index) {
+    SensorState *state = &sensors->states[index];
+    state->answering = set_up(sensors, index);
+    state->seen = state->seen || state->answering;
+    state->failures = 0;
+    state->retry_us = clock_us() + RETRY_US;
+}
+
+void retry_absent(Sensors *sensors) {
+    for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
+        const SensorState *state = &sensors->states[index];
+        if (!state->answering && clock_passed(clock_us(), state->retry_us)) {
+            try_set_up(sensors, index);
+            if (index == SENSOR_IMU) {
+                sensors->imu_taken_us = lines_imu_us();
+            }
+        }
+    }
+}
+
+void note(SensorState *state, bool ok) {
+    state->failures = ok ? 0 : static_cast<uint8_t>(state->failures + 1);
+    if (state->failures >= FAILURES_TO_ABSENT) {
+        state->answering = false;
+        state->retry_us = clock_us() + RETRY_US;
+    }
+}
+
+void read(Sensors *sensors, Job job, uint8_t address, uint8_t from, uint8_t size) {
+    sensors->job = job;
+    twi_begin(address, &from, 1, sensors->bytes, size);
+}
+
+void convert(Sensors *sensors, uint8_t conversion) {
+    const uint8_t bytes[2] = {BMP180_CONTROL, conversion};
+    sensors->job = BARO_COMMAND;
+    twi_begin(BMP180_ADDRESS, bytes, sizeof bytes, nullptr, 0);
+}
+
+void begin_baro(Sensors *sensors) {
+    switch (sensors->baro_step) {
+        case BEGIN_TEMPERATURE:
+            convert(sensors, BMP180_CONVERT_TEMPERATURE);
+            break;
+        case BEGIN_PRESSURE:
+            convert(sensors, bmp180_convert_pressure(BARO_OVERSAMPLING));
+            break;
+        case READ_TEMPERATURE:
+            read(sensors, BARO_READ, BMP180_ADDRESS, BMP180_RESULT, 2);
+            break;
+        default:
+            read(sensors, BARO_READ, BMP180_ADDRESS, BMP180_RESULT, 3);
+            break;
+    }
+}
+
+// The next step's time counts from the end of the command, when the conversion begins.
+void baro_commanded(Sensors *sensors) {
+    const uint32_t now_us = clock_us();
+    const bool pressure = sensors->baro_step == BEGIN_PRESSURE;
+    sensors->baro_due_us = now_us + (pressure ? PRESSURE_US : BMP180_TEMPERATURE_US);
+    sensors->baro_at_us = now_us + PRESSURE_US / 2;
+    ++sensors->baro_step;
+}
+
+uint8_t baro_read(Sensors *sensors, SensorReadings *readings) {
+    const uint8_t *bytes = sensors->bytes;
+    const uint16_t high = static_cast<uint16_t>(bytes[0] << 8 | bytes[1]);
+    if (sensors->baro_step == READ_TEMPERATURE) {
+        sensors->baro_b5 = bmp180_b5(&sensors->words, high);
+        sensors->baro_step = BEGIN_PRESSURE;
+        return 0;
+    }
+    const uint32_t raw = (static_cast<uint32_t>(high) << 8 | bytes[2]) >> (8 - BARO_OVERSAMPLING);
+    readings->baro_us = sensors->baro_at_us;
+    readings->pressure_centipa =
+        bmp180_pressure_centipa(&sensors->words, sensors->baro_b5, raw, BARO_OVERSAMPLING);
+    readings->temperature_ddegc = bmp180_temperature_ddegc(sensors->baro_b5);
+    sensors->baro_cycle = static_cast<uint8_t>((sensors->baro_cycle + 1) % PRESSURES_PER_TEMPERATURE);
+    sensors->baro_step = sensors->baro_cycle == 0 ? BEGIN_TEMPERATURE : BEGIN_PRESSURE;
+    sensors->baro_due_us = sensors->baro_at_us + (BARO_EVERY_US - PRESSURE_US / 2);
+    return SENSOR_NEWS_BARO;
+}
+
+void restart_baro(Sensors *sensors) {
+    sensors->baro_step = BEGIN_TEMPERATURE;
+    sensors->baro_due_us = clock_us() + BARO_EVERY_US;
+}
+
+uint8_t end_baro(Sensors *sensors, bool ok, SensorReadings *readings) {
+    note(&sensors->states[SENSOR_BARO], ok);
+    if (!ok) {
+        restart_baro(sensors);
+        return 0;
+    }
+    if (sensors->job == BARO_COMMAND) {
+        baro_commanded(sensors);
+        return 0;
+    }
+    return baro_read(sensors, readings);
+}
+
+uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
+    switch (sensors->job) {
+        case IMU_READ:
+            note(&sensors->states[SENSOR_IMU], ok);
+            imu_read_bytes(sensors->bytes, &readings->imu);
+            readings->imu_us = sensors->imu_taken_us;
+            return ok ? SENSOR_NEWS_IMU : 0;
+        case MAG_READ:
+            note(&sensors->states[SENSOR_MAG], ok);
+            if (ok) {
+                hmc5883l_read_bytes(sensors->bytes, readings->mag);
+            }
+            return ok ? SENSOR_NEWS_MAG : 0;
+        default:
+            return end_baro(sensors, ok, readings);
+    }
+}
+
+void watch_imu(Sensors *sensors, uint32_t now_us) {
+    SensorState *imu = &sensors->states[SENSOR_IMU];
+    if (imu->answering && clock_passed(now_us, sensors->imu_taken_us + IMU_SILENT_US)) {
+        imu->answering = false;
+        imu->retry_us = now_us;
+    }
+}
+
+void begin_job(Sensors *sensors) {
+    const uint32_t now_us = clock_us();
+    const uint32_t imu_us = lines_imu_us();
+    if (sensors->states[SENSOR_IMU].answering && imu_us != sensors->imu_taken_us) {
+        sensors->imu_taken_us = imu_us;
+        read(sensors, IMU_READ, MPU6050_ADDRESS, MPU6050_DATA, MPU6050_DATA_SIZE);
+    } else if (sensors->states[SENSOR_MAG].answering && clock_passed(now_us, sensors->mag_due_us)) {
+        sensors->mag_due_us += MAG_EVERY_US;
+        if (clock_passed(now_us, sensors->mag_due_us)) {
+            sensors->mag_due_us = now_us + MAG_EVERY_US;  // it was away: do not catch up
+        }
+        read(sensors, MAG_READ, HMC5883L_ADDRESS, HMC5883L_DATA, HMC5883L_DATA_SIZE);
+    } else if (sensors->states[SENSOR_BARO].answering && clock_passed(now_us, sensors->baro_due_us)) {
+        begin_baro(sensors);
+    } else {
+        watch_imu(sensors, now_us);
+    }
+}
+
+}  // namespace
+
+void sensors_start(Sensors *sensors, bool self_test) {
+    memset(sensors, 0, sizeof *sensors);
+    twi_start();
+    if (self_test) {
+        mpu6050_reset();
+    }
+    try_set_up(sensors, SENSOR_IMU);
+    if (self_test && sensors->states[SENSOR_IMU].answering) {
+        sensors->self_test_failed = !mpu6050_self_test();
+    }
+    try_set_up(sensors, SENSOR_MAG);
+    try_set_up(sensors, SENSOR_BARO);
+    lines_start_imu();
+    sensors->imu_taken_us = lines_imu_us();
+    sensors->mag_due_us = clock_us();
+}
+
+uint8_t sensors_poll(Sensors *sensors, SensorReadings *readings) {
+    uint8_t news = 0;
+    if (sensors->job != NO_JOB) {
+        const TwiState state = twi_poll();
+        if (state == TWI_BUSY) {
+            return 0;
+        }
+        news = end_job(sensors, state == TWI_DONE, readings);
+        sensors->job = NO_JOB;
+    }
+    retry_absent(sensors);
+    begin_job(sensors);
+    return news;
+}
+
+uint8_t sensors_present(const Sensors *sensors) {
+    uint8_t bits = 0;
+    for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
+        bits = static_cast<uint8_t>(bits | (sensors->states[index].seen ? 1 << index : 0));
+    }
+    return bits;
+}
+
+uint8_t sensors_failed(const Sensors *sensors) {
+    uint8_t bits = sensors->self_test_failed ? WIRE_SENSOR_MPU6050 : 0;
+    for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
+        bits = static_cast<uint8_t>(bits | (sensors->states[index].answering ? 0 : 1 << index));
+    }
+    return bits;
+}

@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: Apache-2.0
+// The three sensors of the GY-87 on one bus: who may use it when, and who is there at all.
+//
+// One transfer runs at a time. The MPU6050's goes first, since its registers hold a reading for
+// one period only; magnetometer and barometer fill the gaps. A sensor that fails three times in a
+// row, or an MPU6050 whose interrupt stays away, counts as absent and is set up again every 0.2 s.
+#pragma once
+
+#include <stdint.h>
+
+#include "common/bmp180_math.h"
+#include "common/imu_reducer.h"
+#include "drivers/mpu6050.h"
+
+enum SensorIndex : uint8_t { SENSOR_IMU, SENSOR_MAG, SENSOR_BARO, SENSOR_COUNT };
+
+struct SensorState {
+    bool answering;
+    bool seen;  // since the start
+    uint8_t failures;
+    uint32_t retry_us;
+};
+
+struct Sensors {
+    uint8_t job;
+    uint8_t baro_step;
+    uint8_t baro_cycle;
+    bool self_test_failed;
+    SensorState states[SENSOR_COUNT];
+    uint32_t imu_taken_us;  // interrupt time of the reading last taken
+    uint32_t mag_due_us;
+    uint32_t baro_due_us;
+    uint32_t baro_at_us;  // middle of the conversion now running
+    int32_t baro_b5;
+    Bmp180Words words;
+    uint8_t bytes[MPU6050_DATA_SIZE];  // the transfer now running
+};
+
+// What a call of sensors_poll brought, one bit each.
+enum SensorNews : uint8_t {
+    SENSOR_NEWS_IMU = 1 << 0,
+    SENSOR_NEWS_MAG = 1 << 1,
+    SENSOR_NEWS_BARO = 1 << 2,
+};
+
+struct SensorReadings {
+    uint32_t imu_us;
+    ImuReading imu;
+    int16_t mag[3];
+    uint32_t baro_us;
+    uint32_t pressure_centipa;
+    int16_t temperature_ddegc;
+};
+
+// Finds and sets up the sensors; with the self-test if the board started cold.
+void sensors_start(Sensors *sensors, bool self_test);
+
+// To be called at every event; returns SensorNews and fills what they tell.
+uint8_t sensors_poll(Sensors *sensors, SensorReadings *readings);
+
+// WireSensor bits.
+uint8_t sensors_present(const Sensors *sensors);
+uint8_t sensors_failed(const Sensors *sensors);

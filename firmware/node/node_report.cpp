@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "node/node_report.h"
+
+#include "hal/board.h"
+#include "hal/clock.h"
+#include "hal/events.h"
+
+namespace {
+
+constexpr uint32_t EVERY_US = 1000000;
+
+}  // namespace
+
+uint8_t node_report_wait(NodeReport *report) {
+    const uint32_t loop_us = clock_us() - report->loop_began_us;
+    if (loop_us > report->loop_max_us) {
+        report->loop_max_us = loop_us;
+    }
+    const uint8_t events = events_wait();
+    report->loop_began_us = clock_us();
+    board_feed_watchdog();
+    return events;
+}
+
+void node_report_poll(NodeReport *report, const NodeHealth &health, RadioSender *sender) {
+    const uint32_t now_us = clock_us();
+    if (!clock_passed(now_us, report->due_us)) {
+        return;
+    }
+    report->due_us += EVERY_US;
+    WireNodeStatus status = {};
+    status.version_major = FIRMWARE_VERSION_MAJOR;
+    status.version_minor = FIRMWARE_VERSION_MINOR;
+    status.reset_cause = board_reset_cause();
+    status.sensors_present = health.sensors_present;
+    status.sensors_failed = health.sensors_failed;
+    status.bus_errors = health.bus_errors;
+    status.radio_failed = sender->failed;
+    status.radio_retries = sender->retries;
+    status.loop_max_us = report->loop_max_us > UINT16_MAX
+                             ? static_cast<uint16_t>(UINT16_MAX)
+                             : static_cast<uint16_t>(report->loop_max_us);
+    status.sample_rate_hz = report->samples;
+    status.supply_mv = board_supply_mv();
+    report->loop_max_us = 0;
+    report->samples = 0;
+    radio_sender_push(sender, WIRE_NODE_STATUS, now_us, &status, sizeof status);
+}

@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: Apache-2.0
+// The once-a-second status that every node sends, and the watch over its loop.
+#pragma once
+
+#include <stdint.h>
+
+#include "node/radio_sender.h"
+
+constexpr uint8_t FIRMWARE_VERSION_MAJOR = 1;
+constexpr uint8_t FIRMWARE_VERSION_MINOR = 0;
+
+struct NodeReport {
+    uint32_t due_us;
+    uint32_t loop_began_us;
+    uint32_t loop_max_us;
+    uint16_t samples;
+};
+
+struct NodeHealth {
+    uint8_t sensors_present;
+    uint8_t sensors_failed;
+    uint16_t bus_errors;
+};
+
+// Sleeps until the next event, feeds the watchdog and times the loop's waking part.
+uint8_t node_report_wait(NodeReport *report);
+
+// Sends the status if a second has passed.
+void node_report_poll(NodeReport *report, const NodeHealth &health, RadioSender *sender);

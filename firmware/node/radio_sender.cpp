@@ -1,0 +1,110 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "node/radio_sender.h"
+
+#include <string.h>
+
+#include "common/random16.h"
+#include "drivers/nrf24.h"
+#include "hal/clock.h"
+#include "hal/lines.h"
+#include "settings.h"
+
+namespace {
+
+enum State : uint8_t { ABSENT, IDLE, SENDING };
+
+constexpr uint8_t RETRIES = 4;
+constexpr uint8_t ROUNDS = 4;
+// Pauses in units of 250 us: steps longer than a packet's air time, the shortest long enough for
+// the acknowledgement (table 18 of the chip's specification).
+constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 6 : RADIO_KBPS == 1000 ? 2 : 1;
+constexpr uint8_t PAUSE_FIRST = RADIO_KBPS == 250 ? 2 : PAUSE_STEP;
+constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 4;
+static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
+
+constexpr uint32_t LOST_US = 50000;
+constexpr uint32_t SET_UP_EVERY_US = 500000;
+
+uint8_t draw_pause(RadioSender *sender) {
+    sender->random = random16_next(sender->random);
+    return static_cast<uint8_t>(PAUSE_FIRST + PAUSE_STEP * ((sender->random >> 4) % PAUSES));
+}
+
+void count_lost(RadioSender *sender) {
+    ++sender->failed;
+    payload_queue_pop(&sender->queue);
+    nrf24_stop_sending();
+    sender->state = IDLE;
+}
+
+void set_up(RadioSender *sender) {
+    sender->state = nrf24_start_sender(sender->pipe) ? IDLE : ABSENT;
+    sender->since_us = clock_us();
+}
+
+void begin(RadioSender *sender, const Payload *payload) {
+    // The clock's low bits at an event differ from board to board: they seed the pauses.
+    sender->random ^= static_cast<uint16_t>(clock_us());
+    if (sender->random == 0) {
+        sender->random = 1;
+    }
+    sender->rounds = 1;
+    sender->state = SENDING;
+    sender->since_us = clock_us();
+    nrf24_send(payload->bytes, payload->size, draw_pause(sender), RETRIES);
+}
+
+void follow(RadioSender *sender) {
+    if (!lines_radio_low()) {
+        if (clock_passed(clock_us(), sender->since_us + LOST_US)) {
+            count_lost(sender);
+            sender->state = ABSENT;
+        }
+        return;
+    }
+    const uint8_t causes = nrf24_take_causes();
+    sender->retries = static_cast<uint16_t>(sender->retries + nrf24_retries());
+    if ((causes & NRF24_SENT) != 0) {
+        payload_queue_pop(&sender->queue);
+        nrf24_stop_sending();
+        sender->state = IDLE;
+    } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
+        ++sender->rounds;
+        nrf24_send_again(draw_pause(sender), RETRIES);
+    } else {
+        count_lost(sender);
+    }
+}
+
+}  // namespace
+
+void radio_sender_start(RadioSender *sender, uint8_t pipe, uint8_t vehicle_node) {
+    memset(sender, 0, sizeof *sender);
+    sender->pipe = pipe;
+    sender->vehicle_node = vehicle_node;
+    sender->random = static_cast<uint16_t>(vehicle_node * 0x0101U);
+    set_up(sender);
+}
+
+void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us, void *payload,
+                       uint8_t size) {
+    const WireHeader header = {wire_version_kind(kind), sender->vehicle_node, sender->sequence++,
+                               node_time_us};
+    memcpy(payload, &header, sizeof header);
+    const uint16_t dropped = sender->queue.dropped;
+    payload_queue_push(&sender->queue, payload, size);
+    sender->failed = static_cast<uint16_t>(sender->failed + (sender->queue.dropped - dropped));
+}
+
+void radio_sender_poll(RadioSender *sender) {
+    if (sender->state == SENDING) {
+        follow(sender);
+    }
+    if (sender->state == ABSENT && clock_passed(clock_us(), sender->since_us + SET_UP_EVERY_US)) {
+        set_up(sender);
+    }
+    const Payload *payload = payload_queue_front(&sender->queue);
+    if (sender->state == IDLE && payload != nullptr) {
+        begin(sender, payload);
+    }
+}

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sends payloads in order, each until it is acknowledged or hopeless.
+//
+// | state   | event                    | action                                | next    |
+// | ------- | ------------------------ | ------------------------------------- | ------- |
+// | ABSENT  | 0.5 s passed             | set the chip up                       | IDLE    |
+// | IDLE    | a payload waits          | put it on the air                     | SENDING |
+// | SENDING | sent                     | forget it                             | IDLE    |
+// | SENDING | given up, rounds left    | new random pause, again               | SENDING |
+// | SENDING | given up, no round left  | count it, forget it                   | IDLE    |
+// | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
+//
+// Two nodes whose packets collided would collide again if both paused for the same time; so every
+// round of retries draws its pause, in steps longer than a packet.
+#pragma once
+
+#include <stdint.h>
+
+#include "common/payload_queue.h"
+
+struct RadioSender {
+    uint8_t state;
+    uint8_t pipe;
+    uint8_t vehicle_node;
+    uint8_t rounds;
+    uint16_t random;
+    uint16_t sequence;
+    uint16_t failed;   // payloads given up, wraps
+    uint16_t retries;  // wraps
+    uint32_t since_us;
+    PayloadQueue queue;
+};
+
+void radio_sender_start(RadioSender *sender, uint8_t pipe, uint8_t vehicle_node);
+
+// Numbers the payload, fills its header and queues it.
+void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us, void *payload,
+                       uint8_t size);
+
+// To be called at every event.
+void radio_sender_poll(RadioSender *sender);

@@ -1,0 +1,1 @@
+"""The simulated bench: the boards' own programs on simulated chips, sensors and radio."""

@@ -1,0 +1,150 @@
+"""The three boards: a chip, its program, and what is soldered to it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from firmware.rig.air import Air
+from firmware.rig.bench import Bench, Timer
+from firmware.rig.bmp180 import Bmp180
+from firmware.rig.hmc5883l import Hmc5883l
+from firmware.rig.i2c import I2cBus
+from firmware.rig.m8n import M8n
+from firmware.rig.mcu import FIRMWARE, Mcu
+from firmware.rig.mpu6050 import Mpu6050
+from firmware.rig.nrf24 import Nrf24
+from firmware.rig.world import World
+
+_CE: Final = 1 << 1
+_CSN: Final = 1 << 2
+_IMU_LINE: Final = 2
+_RADIO_LINE: Final = 3
+
+
+@dataclass
+class Setup:
+    """What the boards share.
+
+    Parameters
+    ----------
+    seed : int
+        Of everything random; boards draw from streams of their own.
+    build : Path
+        Where the programs are.
+    """
+
+    seed: int = 1
+    loss: float = 0.0
+    noise: float = 0.0
+    world: World = field(default_factory=World)
+    build: Path = FIRMWARE / "build"
+    frequency_hz: int = 16_000_000
+
+    def __post_init__(self) -> None:
+        self.bench = Bench()
+        self._seeds = np.random.SeedSequence(self.seed)
+        self.air = Air(self.bench, self.rng(), self.loss, self.noise)
+
+    def rng(self) -> np.random.Generator:
+        """Return the next independent stream."""
+        return np.random.default_rng(self._seeds.spawn(1)[0])
+
+
+class Board:
+    """A chip with a radio.
+
+    Parameters
+    ----------
+    setup : Setup
+    program : str
+        Name of the `.hex` file.
+    clock_ppm : float
+        Error of the board's crystal.
+    """
+
+    def __init__(self, setup: Setup, program: str, clock_ppm: float = 0.0) -> None:
+        self.setup = setup
+        self.mcu = Mcu(setup.build / f"{program}.hex", setup.frequency_hz)
+        self.timer = Timer(self.mcu, clock_ppm)
+        setup.bench.timers.append(self.timer)
+        self._radio_line = True
+        self.radio = Nrf24(setup.bench, setup.air, lambda: self.timer.now_ps, self._drive_radio_line)
+        self.mcu.on_spi = self.radio.exchange
+        self.mcu.on_port_b = self._port_b
+        Board._restore_lines(self)
+        self.mcu.on_reset = self._restore_lines
+
+    def reset(self, cause: int) -> None:
+        """Restart the chip; radio and sensors keep their state."""
+        self.mcu.reset(cause)
+
+    def close(self) -> None:
+        """Free the chip."""
+        self.mcu.close()
+
+    def _port_b(self, value: int) -> None:
+        self.radio.enable(bool(value & _CE))
+        self.radio.select(not value & _CSN)
+
+    def _drive_radio_line(self, high: bool) -> None:
+        self._radio_line = high
+        self.mcu.set_pin("D", _RADIO_LINE, high)
+
+    def _restore_lines(self) -> None:
+        self.mcu.set_pin("D", _RADIO_LINE, self._radio_line)
+
+
+class ImuNode(Board):
+    """ATmega328P, GY-87, radio."""
+
+    def __init__(
+        self, setup: Setup, clock_ppm: float = 0.0, program: str = "imu_node", noise: bool = True
+    ) -> None:
+        super().__init__(setup, program, clock_ppm)
+        bench, world = setup.bench, setup.world
+        self.mpu6050 = Mpu6050(bench, world, setup.rng(), self._drive_imu_line, noise)
+        self.hmc5883l = Hmc5883l(world, lambda: self.timer.now_ps, self.mpu6050)
+        self.bmp180 = Bmp180(world, lambda: self.timer.now_ps)
+        self.bus = I2cBus(self.mcu, [self.mpu6050, self.hmc5883l, self.bmp180])
+
+    def _drive_imu_line(self, high: bool) -> None:
+        self.mcu.set_pin("D", _IMU_LINE, high)
+
+    def _restore_lines(self) -> None:
+        super()._restore_lines()
+        self.bus.restore_lines()
+
+
+class GpsNode(Board):
+    """ATmega328P, NEO-M8N, radio."""
+
+    def __init__(self, setup: Setup, clock_ppm: float = 0.0, program: str = "gps_node") -> None:
+        super().__init__(setup, program, clock_ppm)
+        self.m8n = M8n(
+            setup.bench, setup.world, setup.rng(), self.mcu.uart_feed, lambda: self.mcu.uart_baud
+        )
+        setup.bench.after_step.append(self._pass_bytes)
+
+    def _pass_bytes(self) -> None:
+        for _, byte in self.mcu.uart_take():
+            self.m8n.hear(byte)
+
+
+class Receiver(Board):
+    """ATmega328P, radio, serial line to the gateway."""
+
+    def __init__(self, setup: Setup, clock_ppm: float = 0.0, program: str = "receiver") -> None:
+        super().__init__(setup, program, clock_ppm)
+        self._sent: list[tuple[int, int]] = []
+        setup.bench.after_step.append(self._take)
+
+    def take_bytes(self) -> list[tuple[int, int]]:
+        """Return what it sent since the last call: the end of each byte in ps, and the byte."""
+        sent, self._sent = self._sent, []
+        return sent
+
+    def _take(self) -> None:
+        time_of = self.timer.time_of
+        self._sent += [(time_of(cycle), byte) for cycle, byte in self.mcu.uart_take()]

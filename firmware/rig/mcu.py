@@ -1,0 +1,237 @@
+"""One simulated ATmega328P: libsimavr through the shim."""
+
+import ctypes
+import functools
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+FIRMWARE: Final = Path(__file__).resolve().parent.parent
+LIBRARY: Final = FIRMWARE / "build" / "libshim.so"
+
+POWER_ON: Final = 1 << 0
+EXTERNAL: Final = 1 << 1
+BROWN_OUT: Final = 1 << 2
+WATCHDOG: Final = 1 << 3
+"""Bits of MCUSR."""
+
+BUS_START, BUS_ADDRESS, BUS_WRITE, BUS_READ, BUS_STOP = range(5)
+
+_RUNNING: Final = (2, 3)
+_UART_OUT: Final = 4096
+_SRAM_OFFSET: Final = 0x800000
+_RJMP_TO_ITSELF: Final = 0xCFFF
+
+_SPI = ctypes.CFUNCTYPE(ctypes.c_uint8, ctypes.c_uint8)
+_TWI = ctypes.CFUNCTYPE(ctypes.c_uint8, ctypes.c_uint8, ctypes.c_uint8)
+_PIN = ctypes.CFUNCTYPE(None, ctypes.c_uint8, ctypes.c_uint8)
+
+
+class CrashedError(RuntimeError):
+    """The program left the rails: an invalid opcode or a jump out of the flash."""
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Load the shim that `make -C firmware rig` builds.
+
+    Raises
+    ------
+    OSError
+        If it is not built, or libsimavr is not installed.
+    """
+    lib = ctypes.CDLL(str(LIBRARY))
+    pointer, u8, u16, u32, u64 = (
+        ctypes.c_void_p, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64,
+    )  # fmt: skip
+    signatures: dict[str, tuple[type | None, tuple[type, ...]]] = {
+        "board_new": (pointer, (u32,)),
+        "board_free": (None, (pointer,)),
+        "board_connect": (None, (pointer, _SPI, _TWI, _PIN)),
+        "board_load": (None, (pointer, ctypes.c_char_p, u32)),
+        "board_reset": (None, (pointer, u8)),
+        "board_run": (ctypes.c_int, (pointer, u64)),
+        "board_cycle": (u64, (pointer,)),
+        "board_slept": (u64, (pointer,)),
+        "board_resets": (u32, (pointer,)),
+        "board_pc": (u32, (pointer,)),
+        "board_peek": (u8, (pointer, u16)),
+        "board_poke": (None, (pointer, u16, u8)),
+        "board_flash_word": (u16, (pointer, u32)),
+        "board_patch_flash": (None, (pointer, u32, u16)),
+        "board_set_pin": (None, (pointer, ctypes.c_char, u8, u8)),
+        "board_hold_sda": (None, (pointer, u8)),
+        "board_uart_feed": (None, (pointer, u8)),
+        "board_uart_cycles_per_byte": (u32, (pointer,)),
+        "board_uart_take": (u32, (pointer, ctypes.c_char_p, ctypes.POINTER(u64))),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(lib, name)
+        function.restype, function.argtypes = result, arguments
+    return lib
+
+
+def read_hex(path: Path) -> bytes:
+    """Read the code of an Intel HEX file that begins at address 0."""
+    code = bytearray()
+    for line in path.read_text(encoding="ascii").split():
+        record = bytes.fromhex(line[1:])
+        size, address, kind = record[0], int.from_bytes(record[1:3], "big"), record[3]
+        if kind == 0:
+            code[address : address + size] = record[4 : 4 + size]
+    return bytes(code)
+
+
+def read_symbols(path: Path) -> dict[str, int]:
+    """Read the symbols of an ELF file: flash addresses, or 0x800000 and more for RAM."""
+    listing = subprocess.run(
+        ["avr-nm", "-C", str(path)], capture_output=True, text=True, check=True, timeout=30
+    ).stdout
+    found = re.findall(r"^([0-9a-f]+) \w (\S+)$", listing, re.MULTILINE)
+    return {name: int(address, 16) for address, name in found}
+
+
+class Mcu:
+    """A chip with a program in it.
+
+    Parameters
+    ----------
+    program : Path
+        The `.hex` file; the `.elf` beside it gives the symbols.
+    frequency_hz : int
+        What the program was built for.
+    """
+
+    def __init__(self, program: Path, frequency_hz: int) -> None:
+        self.program = program
+        self.frequency_hz = frequency_hz
+        self.on_spi: Callable[[int], int] = lambda _byte: 0xFF
+        self.on_twi: Callable[[int, int], int] = lambda _event, _byte: 0
+        self.on_port_b: Callable[[int], None] = lambda _value: None
+        self.on_turn_c: Callable[[int], None] = lambda _value: None
+        self.on_reset: Callable[[], None] = lambda: None
+        self.failure: BaseException | None = None
+        self._lib = library()
+        self._board = self._lib.board_new(frequency_hz)
+        # ctypes keeps no reference to a callback: these must live as long as the board.
+        self._callbacks = (_SPI(self._spi), _TWI(self._twi), _PIN(self._pin))
+        code = read_hex(program)
+        self._lib.board_load(self._board, code, len(code))
+        self._lib.board_connect(self._board, *self._callbacks)
+        self._bytes = ctypes.create_string_buffer(_UART_OUT)
+        self._cycles = (ctypes.c_uint64 * _UART_OUT)()
+
+    def close(self) -> None:
+        """Free the chip."""
+        if self._board:
+            self._lib.board_free(self._board)
+            self._board = None
+
+    def reset(self, cause: int = POWER_ON) -> None:
+        """Restart the program; `cause` is what it finds in MCUSR."""
+        self._lib.board_reset(self._board, cause)
+
+    def run(self, cycle: int) -> None:
+        """Run to at least this cycle.
+
+        Raises
+        ------
+        CrashedError
+            If the program crashed; any exception of a model that its callbacks met.
+        """
+        state = self._lib.board_run(self._board, cycle)
+        if self.failure is not None:
+            failure, self.failure = self.failure, None
+            raise failure
+        if state not in _RUNNING:
+            raise CrashedError(f"{self.program.stem} stopped at {self._lib.board_pc(self._board):#x}")
+
+    @property
+    def cycle(self) -> int:
+        """Cycles since the chip was made; goes on over resets."""
+        return int(self._lib.board_cycle(self._board))
+
+    @property
+    def slept(self) -> int:
+        """Cycles spent asleep."""
+        return int(self._lib.board_slept(self._board))
+
+    @property
+    def resets(self) -> int:
+        """How often it was reset, from outside or by its watchdog."""
+        return int(self._lib.board_resets(self._board))
+
+    def set_pin(self, port: str, bit: int, level: bool) -> None:
+        """Drive an input pin."""
+        self._lib.board_set_pin(self._board, port.encode(), bit, level)
+
+    def hold_sda(self, held: bool) -> None:
+        """Let somebody hold the I2C data line low, or let it go."""
+        self._lib.board_hold_sda(self._board, held)
+        self.set_pin("C", 4, not held)
+
+    def uart_feed(self, byte: int) -> None:
+        """Start one byte on the receive line; the program has it a byte's time later."""
+        self._lib.board_uart_feed(self._board, byte)
+
+    @property
+    def uart_baud(self) -> float:
+        """The speed that the program has set."""
+        cycles: int = self._lib.board_uart_cycles_per_byte(self._board)
+        return 10 * self.frequency_hz / cycles if cycles else 0.0
+
+    def uart_take(self) -> list[tuple[int, int]]:
+        """Return what was sent since the last call: the cycle of each stop bit's end, the byte."""
+        count = self._lib.board_uart_take(self._board, self._bytes, self._cycles)
+        return list(zip(self._cycles[:count], self._bytes.raw[:count], strict=True))
+
+    @functools.cached_property
+    def symbols(self) -> dict[str, int]:
+        """Addresses by name."""
+        return read_symbols(self.program.with_suffix(".elf"))
+
+    def read_variable(self, name: str, size: int) -> int:
+        """Read a variable of the program."""
+        start = self.symbols[name] - _SRAM_OFFSET
+        data = bytes(self._lib.board_peek(self._board, start + i) for i in range(size))
+        return int.from_bytes(data, "little")
+
+    def write_variable(self, name: str, value: int, size: int) -> None:
+        """Set a variable of the program."""
+        start = self.symbols[name] - _SRAM_OFFSET
+        for i, byte in enumerate(value.to_bytes(size, "little")):
+            self._lib.board_poke(self._board, start + i, byte)
+
+    def hang(self, function: str) -> Callable[[], None]:
+        """Patch an endless loop into the start of a function; returns the way to take it out."""
+        address = self.symbols[function]
+        before = self._lib.board_flash_word(self._board, address)
+        self._lib.board_patch_flash(self._board, address, _RJMP_TO_ITSELF)
+        return lambda: self._lib.board_patch_flash(self._board, address, before)
+
+    def _spi(self, byte: int) -> int:
+        try:
+            return self.on_spi(byte)
+        except BaseException as error:  # noqa: BLE001 - ctypes would swallow it: raised by run()
+            self.failure = self.failure or error
+            return 0xFF
+
+    def _twi(self, event: int, byte: int) -> int:
+        try:
+            return self.on_twi(event, byte)
+        except BaseException as error:  # noqa: BLE001 - as above
+            self.failure = self.failure or error
+            return 0
+
+    def _pin(self, port: int, value: int) -> None:
+        try:
+            if port == ord("B"):
+                self.on_port_b(value)
+            elif port == ord("C"):
+                self.on_turn_c(value)
+            else:
+                self.on_reset()
+        except BaseException as error:  # noqa: BLE001 - as above
+            self.failure = self.failure or error

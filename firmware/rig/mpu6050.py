@@ -1,0 +1,147 @@
+"""MPU6050 at its registers: register map RM-MPU-6000A revision 4.2."""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from firmware.rig.bench import PS_PER_S, PS_PER_US, Bench
+from firmware.rig.i2c import RegisterDevice, big_endian, hold
+from firmware.rig.world import World
+
+SELF_TEST, SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG = 0x0D, 0x19, 0x1A, 0x1B, 0x1C
+INT_PIN_CFG, INT_ENABLE, DATA, PWR_MGMT_1, WHO_AM_I = 0x37, 0x38, 0x3B, 0x6B, 0x75
+
+_ASLEEP: Final = 0x40
+_RESET: Final = 0x80
+_GRAVITY_MPS2: Final = 9.80665
+_DLPF_HZ: Final = (260, 184, 94, 44, 21, 10, 5)
+_INT_PULSE_PS: Final = 50 * PS_PER_US
+_NOISE_COUNTS: Final = 1.5
+_TRIM_CODES: Final = (14, 17, 20)
+"""Factory codes of all six axes, taken in turn."""
+
+
+def accel_trim_g(code: int) -> float:
+    """Return the factory trim of the accelerometer, section 4.1."""
+    return float(0.34 * (0.92 / 0.34) ** ((code - 1) / 30))
+
+
+def gyro_trim_dps(code: int) -> float:
+    """Return the factory trim of the gyroscope, section 4.1."""
+    return float(25 * 1.046 ** (code - 1))
+
+
+class Mpu6050(RegisterDevice):
+    """The chip; it samples the world by its own clock and pulses its interrupt line."""
+
+    address = 0x68
+
+    def __init__(
+        self,
+        bench: Bench,
+        world: World,
+        rng: np.random.Generator,
+        set_irq: Callable[[bool], None],
+        noise: bool = True,
+    ) -> None:
+        super().__init__()
+        self._bench, self._world, self._rng, self._set_irq = bench, world, rng, set_irq
+        self._noise = _NOISE_COUNTS if noise else 0.0
+        self.self_test_works = True
+        self.sampled_ps: list[int] = []
+        """When the samples were taken: the start of every latency."""
+        self._generation = 0
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Return to the state after power-on: asleep."""
+        self._registers = {PWR_MGMT_1: _ASLEEP, WHO_AM_I: self.address}
+        a, g = _TRIM_CODES, _TRIM_CODES[::-1]
+        for axis in range(3):
+            self._registers[SELF_TEST + axis] = a[axis] >> 2 << 5 | g[axis]
+        self._registers[SELF_TEST + 3] = (a[0] & 3) << 4 | (a[1] & 3) << 2 | a[2] & 3
+        self._trims = (
+            [accel_trim_g(code) for code in a],
+            [gyro_trim_dps(code) * sign for code, sign in zip(g, (1, -1, 1), strict=True)],
+        )
+        self._filtered: list[float] | None = None
+        self._restart()
+
+    @property
+    def bypass(self) -> bool:
+        """Whether the magnetometer behind the chip is on the bus."""
+        return bool(self._registers.get(INT_PIN_CFG, 0) & 2) and not self.absent
+
+    def read_register(self, register: int) -> int:
+        """Return what a register holds."""
+        return self._registers.get(register, 0)
+
+    def write_register(self, register: int, value: int) -> None:
+        """Set a register; rate and sleep restart the sampling."""
+        if register == PWR_MGMT_1 and value & _RESET:
+            self.power_cycle()
+            return
+        self._registers[register] = value
+        if register in (PWR_MGMT_1, SMPLRT_DIV, CONFIG):
+            self._restart()
+
+    @property
+    def _period_ps(self) -> int:
+        base_hz = 8000 if self._registers.get(CONFIG, 0) & 7 in (0, 7) else 1000
+        return (1 + self._registers.get(SMPLRT_DIV, 0)) * PS_PER_S // base_hz
+
+    def _restart(self) -> None:
+        self._generation += 1
+        if self._registers[PWR_MGMT_1] & _ASLEEP:
+            return
+        generation = self._generation
+
+        def sample() -> None:
+            if generation == self._generation:
+                self._sample()
+                self._bench.at(self._bench.now_ps + self._period_ps, sample)
+
+        self._bench.at(self._bench.now_ps + self._period_ps, sample)
+
+    def _sample(self) -> None:
+        if self.absent:
+            return
+        now_ps = self._bench.now_ps
+        moment = self._world.moment(now_ps / PS_PER_S)
+        values = self._low_pass([*moment.accel_mps2, *moment.gyro_radps])
+        self._store(values, moment.temperature_degc)
+        if self._registers.get(INT_ENABLE, 0) & 1:
+            self.sampled_ps.append(now_ps)
+            self._set_irq(True)
+            self._bench.at(now_ps + _INT_PULSE_PS, lambda: self._set_irq(False))
+
+    def _low_pass(self, values: list[float]) -> list[float]:
+        """Filter as the chip's DLPF would, to first order."""
+        cutoff_hz = _DLPF_HZ[min(self._registers.get(CONFIG, 0) & 7, 6)]
+        gain = 1 - math.exp(-2 * math.pi * cutoff_hz * self._period_ps / PS_PER_S)
+        before = values if self._filtered is None else self._filtered
+        self._filtered = [b + gain * (v - b) for b, v in zip(before, values, strict=True)]
+        return self._filtered
+
+    def _store(self, values: list[float], temperature_degc: float) -> None:
+        accel_config = self._registers.get(ACCEL_CONFIG, 0)
+        gyro_config = self._registers.get(GYRO_CONFIG, 0)
+        per_g = 16384 >> (accel_config >> 3 & 3)
+        per_dps = 131 / (1 << (gyro_config >> 3 & 3))
+        noise = self._rng.normal(0.0, self._noise, 6) if self._noise else np.zeros(6)
+        words = []
+        for axis in range(3):
+            g = values[axis] / _GRAVITY_MPS2
+            if accel_config & 0x80 >> axis and self.self_test_works:
+                g += self._trims[0][axis]
+            words.append(hold(g * per_g + noise[axis]))
+        words.append(hold((temperature_degc - 36.53) * 340))
+        for axis in range(3):
+            dps = math.degrees(values[3 + axis])
+            if gyro_config & 0x80 >> axis and self.self_test_works:
+                dps += self._trims[1][axis]
+            words.append(hold(dps * per_dps + noise[3 + axis]))
+        for i, word in enumerate(words):
+            self._registers[DATA + 2 * i], self._registers[DATA + 2 * i + 1] = big_endian(word)

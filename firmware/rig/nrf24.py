@@ -1,0 +1,292 @@
+"""nRF24L01+ at its registers: Enhanced ShockBurst with dynamic lengths.
+
+Times and rules are those of the product specification 1.0; section numbers stand beside them.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from firmware.rig.air import Air, Packet
+from firmware.rig.bench import PS_PER_US, Bench
+
+SETTLING_PS: Final = 130 * PS_PER_US
+"""From standby to sending or receiving: table 16."""
+CONFIG, EN_AA, EN_RXADDR, SETUP_AW, SETUP_RETR, RF_CH, RF_SETUP, STATUS = range(8)
+OBSERVE_TX, RPD, RX_ADDR_P0 = 8, 9, 0x0A
+TX_ADDR, FIFO_STATUS, DYNPD, FEATURE = 0x10, 0x17, 0x1C, 0x1D
+RX_DR, TX_DS, MAX_RT = 1 << 6, 1 << 5, 1 << 4
+_CAUSES: Final = RX_DR | TX_DS | MAX_RT
+_EN_DPL: Final = 1 << 2
+_FIFO_DEPTH: Final = 3
+_RESET_VALUES: Final = {
+    CONFIG: 0x08, EN_AA: 0x3F, EN_RXADDR: 0x03, SETUP_AW: 0x03, SETUP_RETR: 0x03, RF_CH: 0x02,
+    RF_SETUP: 0x0E, OBSERVE_TX: 0, DYNPD: 0, FEATURE: 0,
+}  # fmt: skip
+_PIPES: Final = 6
+
+
+class Nrf24:
+    """One chip.
+
+    Parameters
+    ----------
+    bench : Bench
+    air : Air
+    board_now_ps : callable
+        The present of the board that talks to the chip: within a step it is ahead of the bench's.
+    set_irq : callable
+        Drives the interrupt line; True is high, at rest.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        air: Air,
+        board_now_ps: Callable[[], int],
+        set_irq: Callable[[bool], None],
+    ) -> None:
+        self._bench, self._air = bench, air
+        self._board_now_ps, self._set_irq = board_now_ps, set_irq
+        self.absent = False
+        air.listeners.append(self)
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Lose everything, as when the supply dips."""
+        self.registers = dict(_RESET_VALUES)
+        self.addresses = {RX_ADDR_P0 + pipe: b"\xe7" * 5 for pipe in range(_PIPES)}
+        self.addresses[TX_ADDR] = b"\xe7" * 5
+        self._causes = 0
+        self._tx: deque[tuple[bytes, int]] = deque()
+        self._rx: deque[tuple[int, bytes]] = deque()
+        self._identity = 0
+        self._heard: dict[int, tuple[int, bytes]] = {}
+        self._ce = self._selected = False
+        self._command: int | None = None
+        self._data: list[int] = []
+        self._out: list[int] = []
+        self._listening_ps: int | None = None
+        self._attempt = 0
+        self._job = 0
+        self._carrier_latched = False
+        self._drive_irq()
+
+    # --- The pins -----------------------------------------------------------------------------
+
+    def select(self, selected: bool) -> None:
+        """Move CSN; True is low."""
+        if selected == self._selected or self.absent:
+            return
+        self._selected = selected
+        if selected:
+            self._command, self._data, self._out = None, [], []
+        elif self._command is not None:
+            self._finish(self._command, bytes(self._data))
+
+    def enable(self, ce: bool) -> None:
+        """Move CE."""
+        if ce == self._ce or self.absent:
+            return
+        self._ce = ce
+        if ce and self._receiving_mode():
+            self._listening_ps = self._board_now_ps() + SETTLING_PS
+            self._carrier_latched = False
+        elif not ce:
+            self._listening_ps = None
+        if ce and self._tx and not self._receiving_mode() and not self._causes & MAX_RT:
+            self._begin_job()
+
+    def exchange(self, byte: int) -> int:
+        """Exchange one SPI byte."""
+        if not self._selected or self.absent:
+            return 0xFF
+        if self._command is None:
+            self._command = byte
+            self._out = self._answer(byte)
+            return self._status()
+        self._data.append(byte)
+        at = len(self._data) - 1
+        return self._out[at] if at < len(self._out) else 0
+
+    # --- Commands: table 20 -------------------------------------------------------------------
+
+    def _answer(self, command: int) -> list[int]:
+        if command < 0x20:
+            if command in self.addresses:
+                return list(self.addresses[command])
+            return [self._read_register(command)]
+        if command == 0x60:
+            return [len(self._rx[0][1]) if self._rx else 0]
+        if command == 0x61 and self._rx:
+            return list(self._rx.popleft()[1])
+        return []
+
+    def _finish(self, command: int, data: bytes) -> None:
+        if 0x20 <= command < 0x40 and data:
+            self._write_register(command & 0x1F, data)
+        elif command == 0xA0 and len(self._tx) < _FIFO_DEPTH:
+            self._identity = (self._identity + 1) % 4
+            self._tx.append((data, self._identity))
+            if self._ce and not self._receiving_mode() and len(self._tx) == 1:
+                self._begin_job()
+        elif command == 0xE1:
+            self._tx.clear()
+            self._job += 1
+        elif command == 0xE2:
+            self._rx.clear()
+
+    def _read_register(self, register: int) -> int:
+        if register == STATUS:
+            return self._status()
+        if register == FIFO_STATUS:
+            full, empty = len(self._rx) == _FIFO_DEPTH, not self._rx
+            tx_full, tx_empty = len(self._tx) == _FIFO_DEPTH, not self._tx
+            return tx_full << 5 | tx_empty << 4 | full << 1 | empty
+        if register == RPD:
+            return int(self._carrier())
+        return self.registers.get(register, 0)
+
+    def _write_register(self, register: int, data: bytes) -> None:
+        if register in self.addresses:
+            whole = self.addresses[register]
+            self.addresses[register] = data[:5] + whole[len(data) :]
+            if register == RX_ADDR_P0 + 1:
+                for pipe in range(2, _PIPES):
+                    lowest = self.addresses[RX_ADDR_P0 + pipe][:1]
+                    self.addresses[RX_ADDR_P0 + pipe] = lowest + data[1:5]
+        elif register == STATUS:
+            self._causes &= ~data[0]
+            self._drive_irq()
+        elif register not in (OBSERVE_TX, RPD, FIFO_STATUS):
+            self.registers[register] = data[0]
+
+    def _status(self) -> int:
+        pipe = self._rx[0][0] if self._rx else 7
+        return self._causes | pipe << 1 | (len(self._tx) == _FIFO_DEPTH)
+
+    def _carrier(self) -> bool:
+        if self._listening_ps is None:
+            return False
+        return self._carrier_latched or self._air.carrier(self._channel, self._board_now_ps())
+
+    # --- Sending: section 7.4.1, figure 5 -----------------------------------------------------
+
+    def _begin_job(self) -> None:
+        self._job += 1
+        self._attempt = 0
+        self._begin_attempt(self._job, self._board_now_ps() + SETTLING_PS)
+
+    def _begin_attempt(self, job: int, at_ps: int) -> None:
+        def send() -> None:
+            if job == self._job and self._tx:
+                payload, identity = self._tx[0]
+                packet = Packet(
+                    self._channel, self._kbps, self.addresses[TX_ADDR], payload, identity, False
+                )
+                self._listening_ps = None
+                self._air.send(packet, self, lambda: self._sent(job))
+
+        self._bench.at(at_ps, send)
+
+    def _sent(self, job: int) -> None:
+        if job != self._job:
+            return
+        if not self.registers[EN_AA] & 1:
+            self._end_job(TX_DS)
+            return
+        self._listening_ps = self._bench.now_ps + SETTLING_PS
+        pause_us = 250 * (1 + (self.registers[SETUP_RETR] >> 4))
+        self._bench.at(self._bench.now_ps + pause_us * PS_PER_US, lambda: self._unanswered(job))
+
+    def _unanswered(self, job: int) -> None:
+        if job != self._job:
+            return
+        if self._attempt >= self.registers[SETUP_RETR] & 0x0F:
+            self._listening_ps = None
+            self._causes |= MAX_RT
+            self._drive_irq()
+            return
+        self._attempt += 1
+        self.registers[OBSERVE_TX] = self._attempt
+        self._begin_attempt(job, self._bench.now_ps)
+
+    def _end_job(self, cause: int) -> None:
+        self._job += 1
+        self.registers[OBSERVE_TX] = self._attempt
+        self._listening_ps = None
+        if self._tx:
+            self._tx.popleft()
+        self._causes |= cause
+        self._drive_irq()
+        if self._ce and self._tx:
+            self._begin_job()
+
+    # --- Receiving: section 7.4.2 -------------------------------------------------------------
+
+    def listens(self, channel: int, kbps: int, start_ps: int) -> bool:
+        """Whether it has been receiving there since `start_ps`."""
+        since = self._listening_ps
+        return (
+            since is not None
+            and since <= start_ps
+            and (channel, kbps) == (self._channel, self._kbps)
+        )
+
+    def hear(self, packet: Packet, start_ps: int) -> None:
+        """Take an undamaged packet."""
+        if self._receiving_mode():
+            self._hear_data(packet)
+        elif packet.is_ack and packet.address == self.addresses[RX_ADDR_P0]:
+            self._end_job(TX_DS)
+
+    def _hear_data(self, packet: Packet) -> None:
+        pipe = self._pipe_of(packet.address)
+        if packet.is_ack or pipe is None or not self._takes_dynamic_lengths(pipe):
+            return
+        self._carrier_latched = True
+        content = (packet.identity, packet.payload)
+        duplicate = self._heard.get(pipe) == content
+        if not duplicate:
+            if len(self._rx) == _FIFO_DEPTH:
+                return
+            self._heard[pipe] = content
+            self._rx.append((pipe, packet.payload))
+            self._causes |= RX_DR
+            self._drive_irq()
+        if self.registers[EN_AA] >> pipe & 1:
+            self._acknowledge(packet)
+
+    def _acknowledge(self, packet: Packet) -> None:
+        ack = Packet(packet.channel, packet.kbps, packet.address, b"", packet.identity, True)
+        now_ps = self._bench.now_ps
+        self._listening_ps = now_ps + 2 * SETTLING_PS + ack.duration_ps
+        self._bench.at(now_ps + SETTLING_PS, lambda: self._air.send(ack, self, lambda: None))
+
+    def _pipe_of(self, address: bytes) -> int | None:
+        for pipe in range(_PIPES):
+            enabled = self.registers[EN_RXADDR] >> pipe & 1
+            if enabled and self.addresses[RX_ADDR_P0 + pipe] == address:
+                return pipe
+        return None
+
+    def _takes_dynamic_lengths(self, pipe: int) -> bool:
+        return bool(self.registers[FEATURE] & _EN_DPL and self.registers[DYNPD] >> pipe & 1)
+
+    # --- State --------------------------------------------------------------------------------
+
+    @property
+    def _channel(self) -> int:
+        return self.registers[RF_CH]
+
+    @property
+    def _kbps(self) -> int:
+        low, high = self.registers[RF_SETUP] >> 5 & 1, self.registers[RF_SETUP] >> 3 & 1
+        return 250 if low else 2000 if high else 1000
+
+    def _receiving_mode(self) -> bool:
+        return self.registers[CONFIG] & 0x03 == 0x03
+
+    def _drive_irq(self) -> None:
+        masked = self.registers[CONFIG] & _CAUSES
+        self._set_irq(not self._causes & ~masked)
