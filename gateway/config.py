@@ -7,17 +7,17 @@ refused with all its errors at once, each with file, key, value and what is allo
 import difflib
 import textwrap
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final
 
 import msgspec
 import tomlkit
 
 from gateway.edges.serial_link import SerialSettings
 from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import AircraftSettings
 from gateway.routing.settings import HubSettings
-from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.settings import SimulatorSettings
@@ -25,8 +25,6 @@ from gateway.vehicle.settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)
-
-Kind = TypeVar("Kind", bound=Settings)
 
 
 class GatewaySettings(Settings, frozen=True):
@@ -38,13 +36,21 @@ class GatewaySettings(Settings, frozen=True):
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
     simulator: SimulatorSettings = SimulatorSettings()
-    calibration_folder: Annotated[
+    aircraft_folder: Annotated[
         str,
         setting(
-            "Folder of the IMU nodes' calibrations, one file an aircraft, named by its id: "
-            '"1.toml". An aircraft without a file is taken as ideal.'
+            "Folder of what differs between aircraft: one file each, named by its vehicle id "
+            '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
+            "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too."
         ),
-    ] = "~/.config/mavgate/calibration"
+    ] = "~/.config/mavgate/aircraft"
+
+    @property
+    def default_aircraft(self) -> AircraftSettings:
+        """The settings of an aircraft that has no file of its own."""
+        return AircraftSettings(
+            vehicle=self.vehicle, sensing=self.sensing, estimation=self.estimation
+        )
 
 
 class ConfigError(Exception):
@@ -68,20 +74,20 @@ def load(path: Path) -> GatewaySettings:
     ConfigError
         If the file cannot be read, is no TOML, or has a key, type or value that is not allowed.
     """
-    return _load(path, GatewaySettings)
+    return msgspec.convert(_read(path, GatewaySettings), GatewaySettings)
 
 
-def load_calibrations(folder: Path) -> dict[int, NodeCalibration]:
-    """Read the calibrations of all aircraft.
+def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
+    """Read the files of all aircraft that have one.
 
     Parameters
     ----------
-    folder : Path
-        Holds `1.toml` to `31.toml`, any of them or none.
+    settings : GatewaySettings
+        Names the folder, and gives what an aircraft's file leaves out.
 
     Returns
     -------
-    dict of int to NodeCalibration
+    dict of int to AircraftSettings
         By vehicle id.
 
     Raises
@@ -89,12 +95,55 @@ def load_calibrations(folder: Path) -> dict[int, NodeCalibration]:
     ConfigError
         As `load`.
     """
-    files = {vehicle_id: folder / f"{vehicle_id}.toml" for vehicle_id in VEHICLE_IDS}
-    return {
-        vehicle_id: _load(file, NodeCalibration)
-        for vehicle_id, file in files.items()
-        if file.exists()
-    }
+    default = msgspec.to_builtins(settings.default_aircraft)
+    found = {}
+    for vehicle_id in VEHICLE_IDS:
+        file = aircraft_file(settings, vehicle_id)
+        if file.exists():
+            table = _read(file, AircraftSettings)
+            found[vehicle_id] = msgspec.convert(_merged(default, table), AircraftSettings)
+    return found
+
+
+def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: AircraftSettings) -> Path:
+    """Write what an aircraft has different from the settings file.
+
+    Comments and order of a file that is there already are kept; it is replaced whole or not at all.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        The settings that the aircraft would have without its file.
+    vehicle_id : int
+        1 to 31.
+    aircraft : AircraftSettings
+        What it has.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    file = aircraft_file(settings, vehicle_id)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    document = tomlkit.parse(file.read_text(encoding="utf-8")) if file.exists() else None
+    document = document or tomlkit.document()
+    default = msgspec.to_builtins(settings.default_aircraft)
+    _write_difference(document, default, msgspec.to_builtins(aircraft))
+    fresh = file.with_suffix(".new")
+    fresh.write_text(tomlkit.dumps(document), encoding="utf-8")
+    fresh.replace(file)
+    return file
+
+
+def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:
+    """Name the file of one aircraft."""
+    return Path(settings.aircraft_folder).expanduser() / f"{vehicle_id}.toml"
 
 
 def render(settings: GatewaySettings) -> str:
@@ -116,7 +165,7 @@ def render(settings: GatewaySettings) -> str:
     return "\n".join([*head, *_render_section(settings, "")]) + "\n"
 
 
-def _load(path: Path, kind: type[Kind]) -> Kind:
+def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -128,7 +177,31 @@ def _load(path: Path, kind: type[Kind]) -> Kind:
     errors = [f"{path}: {error}" for error in _check(table, kind, "")]
     if errors:
         raise ConfigError("\n".join(errors))
-    return msgspec.convert(table, kind)
+    return table
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Lay one tree of settings over another."""
+    merged = dict(base)
+    for key, value in over.items():
+        below = merged.get(key)
+        both = isinstance(value, dict) and isinstance(below, dict)
+        merged[key] = _merged(below or {}, value) if both else value
+    return merged
+
+
+def _write_difference(
+    table: MutableMapping[str, Any], default: Mapping[str, Any], value: Mapping[str, Any]
+) -> None:
+    """Put into a TOML table what differs from the default, and take out what does not."""
+    for key, new in value.items():
+        old = default.get(key)
+        if new == old:
+            table.pop(key, None)
+        elif isinstance(new, dict) and isinstance(old, dict):
+            _write_difference(table.setdefault(key, tomlkit.table()), old, new)
+        else:
+            table[key] = new
 
 
 def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Iterator[str]:

@@ -8,17 +8,25 @@ from typing import Final
 
 import msgspec
 
-from gateway.config import GatewaySettings
-from gateway.edges.clock import GatewayClock
+from gateway.config import GatewaySettings, save_aircraft
+from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.hub import Hub
 from gateway.edges.pty_port import PtyPort
 from gateway.edges.serial_link import SerialLink
-from gateway.pipeline import Action, Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, GpsFix, Incoming, Outgoing
-from gateway.sensing.calibration import NodeCalibration
+from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
+from gateway.records import (
+    BaroRaw,
+    ClientInterval,
+    FusedSample,
+    GpsFix,
+    Incoming,
+    Outgoing,
+)
 from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
+from gateway.vehicle.actions import RecordingRequest, SaveSettings
+from gateway.vehicle.events import NOTICE, WARNING, Told
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +42,8 @@ class Daemon:
     ----------
     settings : GatewaySettings
         Everything that can be set.
-    calibrations : mapping of int to NodeCalibration
-        By vehicle id.
+    aircraft : mapping of int to AircraftSettings
+        What is different for single aircraft, by vehicle id.
     line : iterator of TimedFrame, optional
         What a simulated receiver says; it then takes the place of the serial port.
     """
@@ -43,7 +51,7 @@ class Daemon:
     def __init__(
         self,
         settings: GatewaySettings,
-        calibrations: Mapping[int, NodeCalibration],
+        aircraft: Mapping[int, AircraftSettings],
         line: Iterator[TimedFrame] | None = None,
     ) -> None:
         self.now_us = GatewayClock()
@@ -51,8 +59,9 @@ class Daemon:
         serial = settings.serial
         if self._receiver is not None:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
+        self._settings = settings
         self._pipeline = Pipeline(
-            PipelineSettings(settings.sensing, settings.estimation, settings.vehicle, calibrations)
+            PipelineSettings(settings.default_aircraft, aircraft, unix_time_us() - self.now_us())
         )
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(settings.hub, self._on_frame, self.now_us)
@@ -114,5 +123,23 @@ class Daemon:
                 case Outgoing():
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
-                case FusedSample() | BaroRaw() | GpsFix():
+                case ClientInterval():
+                    self._hub.set_interval(action)
+                case SaveSettings():
+                    self._save(action.vehicle_id)
+                case RecordingRequest() | FusedSample() | BaroRaw() | GpsFix():
                     pass
+
+    def _save(self, vehicle_id: int) -> None:
+        """Write an aircraft's settings to its file, and tell how that went."""
+        aircraft = self._pipeline.aircraft[vehicle_id]
+        try:
+            file = save_aircraft(self._settings, vehicle_id, aircraft.settings)
+        except OSError as error:
+            log.warning("settings of aircraft %d cannot be saved: %s", vehicle_id, error)
+            told = Told(WARNING, f"Settings not saved: {error.strerror}")
+        else:
+            log.info("settings of aircraft %d saved to %s", vehicle_id, file)
+            told = Told(NOTICE, f"Settings saved: {file.name}")
+        now_us = self.now_us()
+        self._perform(aircraft.perform(aircraft.vehicle.say(told, now_us), now_us))

@@ -10,14 +10,17 @@ order. An aircraft comes into being with its first payload. Live, demo and playb
 who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
+
+import msgspec
 
 from gateway.estimation.interface import Estimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import (
     BaroRaw,
+    ClientInterval,
     FusedSample,
     GpsFix,
     ImuRaw,
@@ -30,37 +33,62 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.remainder import absorb
+from gateway.settings import Settings
 from gateway.units import US_PER_S
+from gateway.vehicle.actions import Action as VehicleAction
+from gateway.vehicle.actions import (
+    CalibrationMeasured,
+    RecordingRequest,
+    SaveSettings,
+    SettingsChange,
+)
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
-Action = Outgoing | FusedSample | BaroRaw | GpsFix
-"""Frames to send, and what a recording keeps, in the order in which the estimator took it."""
+Action = (
+    Outgoing | ClientInterval | RecordingRequest | SaveSettings | FusedSample | BaroRaw | GpsFix
+)
+"""Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
+
+
+class AircraftSettings(Settings, frozen=True):
+    """The settings of one aircraft's stages; ground stations may change them as parameters."""
+
+    vehicle: VehicleSettings = VehicleSettings()
+    sensing: SensingSettings = SensingSettings()
+    estimation: EstimationSettings = EstimationSettings()
+    calibration: NodeCalibration = NodeCalibration()
 
 
 @dataclass(frozen=True, slots=True)
 class PipelineSettings:
-    """The settings of all stages."""
+    """The settings of every aircraft."""
 
-    sensing: SensingSettings
-    estimation: EstimationSettings
-    vehicle: VehicleSettings
-    calibrations: Mapping[int, NodeCalibration]
-    """Calibration of the IMU node by vehicle id; an aircraft without one is taken as ideal."""
+    default: AircraftSettings
+    aircraft: Mapping[int, AircraftSettings] = field(default_factory=dict)
+    """By vehicle id, in place of the default."""
+    unix_us_at_zero: int = 0
+    """Civil time at the gateway clock's zero, as well as it is known."""
 
 
 class Aircraft:
     """The stages of one aircraft, from its raw records on."""
 
-    def __init__(self, vehicle_id: int, settings: PipelineSettings) -> None:
-        calibration = settings.calibrations.get(vehicle_id, NodeCalibration())
+    def __init__(self, vehicle_id: int, settings: AircraftSettings, unix_us_at_zero: int) -> None:
         self.vehicle_id = vehicle_id
+        self.settings = settings
         self.state: NavState | None = None
-        self.vehicle = Vehicle(settings.vehicle, vehicle_id)
-        self._chain = SensorChain(settings.sensing, calibration)
+        sections = {
+            name: getattr(settings, name) for name in ("sensing", "estimation", "calibration")
+        }
+        self.vehicle = Vehicle(
+            settings.vehicle, vehicle_id, sections=sections, unix_us_at_zero=unix_us_at_zero
+        )
+        self._chain = SensorChain(settings.sensing, settings.calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
 
     def take(self, record: RawRecord, now_us: int) -> list[Action]:
@@ -71,19 +99,53 @@ class Aircraft:
             case BaroRaw():
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
-                return [*self.vehicle.on_baro(baro, now_us), record]
+                return [*self.perform(self.vehicle.on_baro(baro, now_us), now_us), record]
             case GpsFix():
                 self._estimator.update_gps(record)
-                return [*self.vehicle.on_gps(record, now_us), record]
+                return [*self.perform(self.vehicle.on_gps(record, now_us), now_us), record]
             case NodeStatus():
-                return [*self.vehicle.on_node_status(record, now_us)]
+                return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
 
     def _take_imu(self, raw: ImuRaw, now_us: int) -> list[Action]:
         sample = self._chain.imu(raw)
         self.state = self._estimator.update_imu(sample)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
-        return [*self.vehicle.on_state(self.state, sample, now_us), fused]
+        return [*self.perform(self.vehicle.on_state(self.state, sample, now_us), now_us), fused]
+
+    def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
+        """Carry out what the vehicle asks of the other stages; hand the rest on.
+
+        Parameters
+        ----------
+        wanted : iterable of VehicleAction
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Action
+        """
+        actions: list[Action] = []
+        for action in wanted:
+            if isinstance(action, SettingsChange):
+                self._change(action.section, action.settings)
+            elif isinstance(action, CalibrationMeasured):
+                calibration = absorb(self.settings.calibration, action.kind, action.error_b)
+                self._change("calibration", calibration)
+                told = self.vehicle.take_settings("calibration", calibration, now_us)
+                actions += self.perform(told, now_us)
+            else:
+                actions.append(action)
+        return actions
+
+    def _change(self, section: str, settings: Settings) -> None:
+        """Rebuild the stage whose settings changed; the others go on undisturbed."""
+        self.settings = msgspec.structs.replace(self.settings, **{section: settings})
+        if section in ("sensing", "calibration"):
+            self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
+        elif section == "estimation":
+            self._estimator = make_estimator(self.settings.estimation)
 
 
 class Pipeline:
@@ -117,7 +179,9 @@ class Pipeline:
         vehicle_id = record.node.vehicle_id
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
-            aircraft = self.aircraft[vehicle_id] = Aircraft(vehicle_id, self._settings)
+            settings = self._settings.aircraft.get(vehicle_id, self._settings.default)
+            aircraft = Aircraft(vehicle_id, settings, self._settings.unix_us_at_zero)
+            self.aircraft[vehicle_id] = aircraft
         return aircraft.take(record, now_us)
 
     def connect(self, port: str) -> None:
@@ -133,18 +197,27 @@ class Pipeline:
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Let every aircraft answer a client's frame if it is the one addressed."""
-        return []
+        actions: list[Action] = []
+        for aircraft in self.aircraft.values():
+            actions += aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us)
+        return actions
+
+    def forget_client(self, client_id: int) -> None:
+        """Drop what was kept for a client that has gone."""
+        for aircraft in self.aircraft.values():
+            aircraft.vehicle.forget_client(client_id)
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""
         actions: list[Action] = []
-        if now_us >= self._report_due_us:
+        reporting = now_us >= self._report_due_us
+        if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
             self.report = self._link.report(now_us, connected=self._connected, port=self._port)
-            for aircraft in self.aircraft.values():
-                actions += aircraft.vehicle.on_link(self.report, now_us)
         for aircraft in self.aircraft.values():
-            actions += aircraft.vehicle.poll(now_us)
+            if reporting:
+                actions += aircraft.perform(aircraft.vehicle.on_link(self.report, now_us), now_us)
+            actions += aircraft.perform(aircraft.vehicle.poll(now_us), now_us)
         return actions
 
     def next_due_us(self) -> int:

@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "status": FOUNDATION | {"routing"},
     "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "routing", "simulator", "status"},
     "analysis": FOUNDATION | STAGES | {"pipeline"},
-    "config": FOUNDATION | STAGES | {"edges"},
+    "config": FOUNDATION | STAGES | {"pipeline", "edges"},
     "daemon": FOUNDATION | STAGES | {"pipeline", "status", "edges", "config"},
     "cli": FOUNDATION | STAGES | {"pipeline", "status", "edges", "config", "daemon", "analysis"},
 }

@@ -8,10 +8,13 @@ import pytest
 from gateway.config import (
     ConfigError,
     GatewaySettings,
+    aircraft_file,
     load,
-    load_calibrations,
+    load_aircraft,
     render,
+    save_aircraft,
 )
+from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -109,10 +112,60 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
         load(file)
 
 
-def test_calibrations_are_found_by_vehicle_id(tmp_path: Path) -> None:
-    (tmp_path / "3.toml").write_text("gyro_bias_radps = [0.1, 0.0, -0.1]\n")
-    (tmp_path / "99.toml").write_text("nonsense")
-    calibrations = load_calibrations(tmp_path)
-    assert list(calibrations) == [3]
-    assert calibrations[3].gyro_bias_radps == (0.1, 0.0, -0.1)
-    assert load_calibrations(tmp_path / "missing") == {}
+@pytest.fixture
+def settings(tmp_path: Path) -> GatewaySettings:
+    return GatewaySettings(aircraft_folder=str(tmp_path / "aircraft"))
+
+
+def test_aircraft_files_lie_over_the_common_settings(settings: GatewaySettings) -> None:
+    sensing = msgspec.structs.replace(settings.sensing, accel_cutoff_hz=7.0)
+    settings = msgspec.structs.replace(settings, sensing=sensing)
+    folder = Path(settings.aircraft_folder)
+    folder.mkdir()
+    (folder / "3.toml").write_text(
+        '[vehicle]\ntype = "quadrotor"\n[calibration]\ngyro_bias_radps = [0.1, 0.0, -0.1]\n'
+    )
+    (folder / "99.toml").write_text("nonsense")
+    found = load_aircraft(settings)
+    assert list(found) == [3]
+    assert found[3].calibration.gyro_bias_radps == (0.1, 0.0, -0.1)
+    assert found[3].vehicle.type == "quadrotor"
+    assert found[3].sensing.accel_cutoff_hz == 7.0
+
+
+def test_no_folder_is_no_aircraft(settings: GatewaySettings) -> None:
+    assert load_aircraft(settings) == {}
+
+
+def test_a_wrong_aircraft_file_is_refused(settings: GatewaySettings) -> None:
+    Path(settings.aircraft_folder).mkdir()
+    (Path(settings.aircraft_folder) / "1.toml").write_text("[calibration]\nbias = 3\n")
+    with pytest.raises(ConfigError, match=r"1\.toml: calibration\.bias: no such setting"):
+        load_aircraft(settings)
+
+
+def test_only_what_differs_is_saved_and_comments_stay(settings: GatewaySettings) -> None:
+    file = aircraft_file(settings, 2)
+    file.parent.mkdir()
+    file.write_text("# my plane\n[sensing]\naccel_cutoff_hz = 4.0 # slow\n")
+    aircraft = load_aircraft(settings)[2]
+    calibration = NodeCalibration(accel_bias_mps2=(0.1, 0.2, 0.3))
+    aircraft = msgspec.structs.replace(aircraft, calibration=calibration)
+    assert save_aircraft(settings, 2, aircraft) == file
+    assert load_aircraft(settings)[2] == aircraft
+    text = file.read_text()
+    assert "# my plane" in text
+    assert "# slow" in text
+    assert "accel_bias_mps2" in text
+    assert "mounting" not in text
+
+
+def test_a_setting_put_back_leaves_the_file(settings: GatewaySettings) -> None:
+    default = settings.default_aircraft
+    slow = msgspec.structs.replace(
+        default, sensing=msgspec.structs.replace(default.sensing, accel_cutoff_hz=4.0)
+    )
+    save_aircraft(settings, 1, slow)
+    save_aircraft(settings, 1, default)
+    assert "accel_cutoff_hz" not in aircraft_file(settings, 1).read_text()
+    assert load_aircraft(settings)[1] == default

@@ -2,15 +2,14 @@
 
 import math
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.estimation.select import EstimationSettings
-from gateway.pipeline import Action, Pipeline, PipelineSettings
+from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, NodeId, Outgoing
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings
-from gateway.vehicle.settings import VehicleSettings
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
@@ -47,10 +46,10 @@ class Tracker:
 @pytest.fixture
 def pipeline() -> Pipeline:
     tilted = NodeCalibration(mounting=((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
-    settings = PipelineSettings(
-        SensingSettings(), EstimationSettings(), VehicleSettings(), {2: tilted}
-    )
-    return Pipeline(settings)
+    # The paper's estimator knows roll and pitch from the first sample on.
+    default = AircraftSettings(estimation=EstimationSettings(estimator="paper"))
+    second = msgspec.structs.replace(default, calibration=tilted)
+    return Pipeline(PipelineSettings(default, {2: second}))
 
 
 def decode(actions: list[Action]) -> list[mavlink.MAVLink_message]:

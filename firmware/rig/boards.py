@@ -70,7 +70,9 @@ class Board:
         self.timer = Timer(self.mcu, clock_ppm)
         setup.bench.timers.append(self.timer)
         self._radio_line = True
-        self.radio = Nrf24(setup.bench, setup.air, lambda: self.timer.now_ps, self._drive_radio_line)
+        self.radio = Nrf24(
+            setup.bench, setup.air, lambda: self.timer.now_ps, self._drive_radio_line
+        )
         self.mcu.on_spi = self.radio.exchange
         self.mcu.on_port_b = self._port_b
         Board._restore_lines(self)

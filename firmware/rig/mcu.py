@@ -146,7 +146,9 @@ class Mcu:
             failure, self.failure = self.failure, None
             raise failure
         if state not in _RUNNING:
-            raise CrashedError(f"{self.program.stem} stopped at {self._lib.board_pc(self._board):#x}")
+            raise CrashedError(
+                f"{self.program.stem} stopped at {self._lib.board_pc(self._board):#x}"
+            )
 
     @property
     def cycle(self) -> int:

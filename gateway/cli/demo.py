@@ -1,8 +1,7 @@
 """`mavgate demo`: the whole gateway on a simulated receiver."""
 
 import asyncio
-from pathlib import Path
-from typing import Annotated
+import tempfile
 
 import msgspec
 import typer
@@ -15,13 +14,13 @@ from gateway.cli.run import (
     serve,
     with_endpoints,
 )
+from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
+from gateway.pipeline import AircraftSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import Aircraft
 from gateway.simulator.receiver import simulate
-from gateway.simulator.sensors import SensorErrors
-from gateway.simulator.settings import SimulatorSettings
 
 
 def register(app: typer.Typer) -> None:
@@ -41,15 +40,20 @@ def demo(
     """
     settings = with_endpoints(read_settings(config), endpoint)
     line = simulate(settings.simulator, unix_time_us()).frames()
-    calibrations = ideal_calibrations(settings.simulator)
-    asyncio.run(serve(lambda: Daemon(settings, calibrations, line), plain=plain))
+    aircraft = calibrated_aircraft(settings)
+    # What a ground station has the demo save must not become the real aircraft's calibration.
+    with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
+        settings = msgspec.structs.replace(settings, aircraft_folder=folder)
+        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), plain=plain))
 
 
-def ideal_calibrations(settings: SimulatorSettings) -> dict[int, NodeCalibration]:
+def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
     """Calibrate the simulated aircraft as their owner would have done before the flight."""
-    aircraft = (Aircraft(settings, index) for index in range(settings.vehicles))
-    return {a.vehicle_id: _calibration(a.errors) for a in aircraft}
-
-
-def _calibration(errors: SensorErrors) -> NodeCalibration:
-    return msgspec.convert(errors, NodeCalibration, from_attributes=True)
+    found = {}
+    for index in range(settings.simulator.vehicles):
+        simulated = Aircraft(settings.simulator, index)
+        calibration = msgspec.convert(simulated.errors, NodeCalibration, from_attributes=True)
+        found[simulated.vehicle_id] = msgspec.structs.replace(
+            settings.default_aircraft, calibration=calibration
+        )
+    return found

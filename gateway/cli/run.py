@@ -13,10 +13,10 @@ import typer
 from rich.live import Live
 
 from gateway.cli.errors import refuse
-from gateway.config import ConfigError, GatewaySettings, load, load_calibrations
+from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
 from gateway.daemon import Daemon
 from gateway.edges.live_view import LiveView, summary_line
-from gateway.sensing.calibration import NodeCalibration
+from gateway.pipeline import AircraftSettings
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +55,8 @@ def run_gateway(
         serial = msgspec.structs.replace(settings.serial, port=port)
         settings = msgspec.structs.replace(settings, serial=serial)
     settings = with_endpoints(settings, endpoint)
-    calibrations = read_calibrations(settings)
-    asyncio.run(serve(lambda: Daemon(settings, calibrations), plain=plain))
+    aircraft = read_aircraft(settings)
+    asyncio.run(serve(lambda: Daemon(settings, aircraft), plain=plain))
 
 
 def read_settings(file: Path | None) -> GatewaySettings:
@@ -71,10 +71,10 @@ def read_settings(file: Path | None) -> GatewaySettings:
         refuse(str(error))
 
 
-def read_calibrations(settings: GatewaySettings) -> dict[int, NodeCalibration]:
-    """Load the calibrations of all aircraft."""
+def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
+    """Load what is different for single aircraft."""
     try:
-        return load_calibrations(Path(settings.calibration_folder).expanduser())
+        return load_aircraft(settings)
     except ConfigError as error:
         refuse(str(error))
 
