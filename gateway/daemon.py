@@ -9,12 +9,12 @@ from typing import Final
 import msgspec
 
 from gateway.config import GatewaySettings
-from gateway.edges.clock import GatewayClock
+from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.hub import Hub
 from gateway.edges.pty_port import PtyPort
 from gateway.edges.serial_link import SerialLink
 from gateway.pipeline import Action, Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, GpsFix, Incoming, Outgoing
+from gateway.records import BaroRaw, ClientInterval, FusedSample, GpsFix, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
@@ -52,7 +52,13 @@ class Daemon:
         if self._receiver is not None:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._pipeline = Pipeline(
-            PipelineSettings(settings.sensing, settings.estimation, settings.vehicle, calibrations)
+            PipelineSettings(
+                settings.sensing,
+                settings.estimation,
+                settings.vehicle,
+                calibrations,
+                unix_us_at_zero=unix_time_us() - self.now_us(),
+            )
         )
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(settings.hub, self._on_frame, self.now_us)
@@ -114,5 +120,7 @@ class Daemon:
                 case Outgoing():
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
+                case ClientInterval():
+                    self._hub.set_interval(action)
                 case FusedSample() | BaroRaw() | GpsFix():
                     pass

@@ -25,20 +25,36 @@ from gateway.records import (
     LinkReport,
     NavState,
     NodeStatus,
-    Outgoing,
     RawRecord,
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.recalibration import (
+    absorb_accel_error,
+    absorb_gyro_error,
+    absorb_mag_error,
+    absorb_tilt,
+)
+from gateway.settings import Settings
 from gateway.units import US_PER_S
+from gateway.vehicle.actions import Action as VehicleAction
+from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured, SettingsChange
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
-Action = Outgoing | FusedSample | BaroRaw | GpsFix
-"""Frames to send, and what a recording keeps, in the order in which the estimator took it."""
+Action = VehicleAction | FusedSample | BaroRaw | GpsFix
+"""What the vehicles ask for, and what a recording keeps, in the order in which the estimator
+took it. Changes of settings and calibration are carried out here already."""
+
+ABSORB: Final = {
+    CalibrationKind.GYRO: absorb_gyro_error,
+    CalibrationKind.ACCEL: absorb_accel_error,
+    CalibrationKind.LEVEL: absorb_tilt,
+    CalibrationKind.MAG: absorb_mag_error,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,18 +66,30 @@ class PipelineSettings:
     vehicle: VehicleSettings
     calibrations: Mapping[int, NodeCalibration]
     """Calibration of the IMU node by vehicle id; an aircraft without one is taken as ideal."""
+    unix_us_at_zero: int = 0
+    """Unix time when the gateway clock was zero, for the time stamps of signed frames."""
 
 
 class Aircraft:
     """The stages of one aircraft, from its raw records on."""
 
     def __init__(self, vehicle_id: int, settings: PipelineSettings) -> None:
-        calibration = settings.calibrations.get(vehicle_id, NodeCalibration())
         self.vehicle_id = vehicle_id
         self.state: NavState | None = None
-        self.vehicle = Vehicle(settings.vehicle, vehicle_id)
-        self._chain = SensorChain(settings.sensing, calibration)
+        self._sensing = settings.sensing
+        self._calibration = settings.calibrations.get(vehicle_id, NodeCalibration())
+        self._chain = SensorChain(self._sensing, self._calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
+        self.vehicle = Vehicle(
+            settings.vehicle,
+            vehicle_id,
+            sections={
+                "sensing": settings.sensing,
+                "estimation": settings.estimation,
+                "calibration": self._calibration,
+            },
+            unix_us_at_zero=settings.unix_us_at_zero,
+        )
 
     def take(self, record: RawRecord, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
@@ -83,7 +111,49 @@ class Aircraft:
         self.state = self._estimator.update_imu(sample)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
-        return [*self.vehicle.on_state(self.state, sample, now_us), fused]
+        told = self.vehicle.on_state(self.state, sample, now_us)
+        return [*self._carry_out(told, now_us), fused]
+
+    def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
+        """Let the vehicle answer a client's frame."""
+        return self._carry_out(self.vehicle.handle(incoming, now_us), now_us)
+
+    def poll(self, now_us: int) -> list[Action]:
+        """Do what is due by time."""
+        return self._carry_out(self.vehicle.poll(now_us), now_us)
+
+    def _carry_out(self, actions: list[VehicleAction], now_us: int) -> list[Action]:
+        """Take live what the vehicle wants changed; the rest is for others to do."""
+        rest: list[Action] = []
+        for action in actions:
+            match action:
+                case SettingsChange():
+                    self._change(action.settings)
+                case CalibrationMeasured():
+                    self._change(ABSORB[action.kind](self._calibration, action.error_b))
+                    rest += self.vehicle.take_settings("calibration", self._calibration, now_us)
+                case _:
+                    rest.append(action)
+        return rest
+
+    def _change(self, settings: Settings) -> None:
+        match settings:
+            case EstimationSettings():
+                self._estimator = _succeed(self._estimator, make_estimator(settings))
+            case SensingSettings():
+                self._sensing = settings
+            case NodeCalibration():
+                self._calibration = settings
+        if isinstance(settings, SensingSettings | NodeCalibration):
+            self._chain = SensorChain(self._sensing, self._calibration)
+
+
+def _succeed(old: Estimator, new: Estimator) -> Estimator:
+    """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
+    state = getattr(old, "state", None)
+    if state is not None and type(new) is type(old):
+        new.state = state  # type: ignore[attr-defined]
+    return new
 
 
 class Pipeline:
@@ -133,7 +203,10 @@ class Pipeline:
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Let every aircraft answer a client's frame if it is the one addressed."""
-        return []
+        actions: list[Action] = []
+        for aircraft in self.aircraft.values():
+            actions += aircraft.handle(incoming, now_us)
+        return actions
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""
@@ -144,7 +217,7 @@ class Pipeline:
             for aircraft in self.aircraft.values():
                 actions += aircraft.vehicle.on_link(self.report, now_us)
         for aircraft in self.aircraft.values():
-            actions += aircraft.vehicle.poll(now_us)
+            actions += aircraft.poll(now_us)
         return actions
 
     def next_due_us(self) -> int:
