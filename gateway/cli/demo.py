@@ -1,8 +1,6 @@
 """`mavgate demo`: the whole gateway on a simulated receiver."""
 
 import asyncio
-from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import typer
