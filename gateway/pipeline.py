@@ -33,11 +33,17 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
-from gateway.sensing.remainder import absorb
+from gateway.sensing.recalibration import (
+    absorb_accel_error,
+    absorb_gyro_error,
+    absorb_mag_error,
+    absorb_tilt,
+)
 from gateway.settings import Settings
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import Action as VehicleAction
 from gateway.vehicle.actions import (
+    CalibrationKind,
     CalibrationMeasured,
     RecordingRequest,
     SaveSettings,
@@ -53,6 +59,13 @@ Action = (
     Outgoing | ClientInterval | RecordingRequest | SaveSettings | FusedSample | BaroRaw | GpsFix
 )
 """Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
+
+ABSORB: Final = {
+    CalibrationKind.GYRO: absorb_gyro_error,
+    CalibrationKind.ACCEL: absorb_accel_error,
+    CalibrationKind.LEVEL: absorb_tilt,
+    CalibrationKind.MAG: absorb_mag_error,
+}
 
 
 class AircraftSettings(Settings, frozen=True):
@@ -131,7 +144,7 @@ class Aircraft:
             if isinstance(action, SettingsChange):
                 self._change(action.section, action.settings)
             elif isinstance(action, CalibrationMeasured):
-                calibration = absorb(self.settings.calibration, action.kind, action.error_b)
+                calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
                 self._change("calibration", calibration)
                 told = self.vehicle.take_settings("calibration", calibration, now_us)
                 actions += self.perform(told, now_us)
@@ -145,7 +158,15 @@ class Aircraft:
         if section in ("sensing", "calibration"):
             self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
         elif section == "estimation":
-            self._estimator = make_estimator(self.settings.estimation)
+            self._estimator = _succeed(self._estimator, make_estimator(self.settings.estimation))
+
+
+def _succeed(old: Estimator, new: Estimator) -> Estimator:
+    """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
+    state = getattr(old, "state", None)
+    if state is not None and type(new) is type(old):
+        new.state = state  # type: ignore[attr-defined]
+    return new
 
 
 class Pipeline:

@@ -97,7 +97,8 @@ class Calibrator:
             (0, 0, 4): (CalibrationKind.ACCEL, False),
         }.get((gyro, mag, accel))
         if asked is None:
-            nothing = (gyro, mag, accel) == (0, 0, 0) and whole(command.params[2]) == 0
+            values = (*command.params, *command.extra, command.height_m)
+            nothing = not any(whole(value) for value in values)
             return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
         kind, six_sides = asked
         if self._run is not None:

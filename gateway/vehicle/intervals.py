@@ -17,7 +17,7 @@ from gateway.vehicle.telemetry import STATE_MESSAGES, Telemetry
 MAX_FAST_STREAMS: Final = 64
 """Each costs an encoding of its own."""
 MIN_INTERVAL_US: Final = 1000
-MAX_WISHES: Final = 4096
+MAX_WISHES: Final = 1024
 """Clients come and go; the oldest wishes are forgotten first."""
 KEEPS_CLIENTS_US: Final = 1_000_000
 """A client that gets fewer heartbeats loses the vehicle."""

@@ -7,6 +7,7 @@ integers for PX4 alone. An integer that a client encodes byte-wise is understood
 
 import math
 import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -160,7 +161,7 @@ class ParameterTable:
 
 def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
     fields = fields_of(type(tree))
-    keys = [field.name for field in fields]
+    bare_keys = Counter(without_unit(field.name) for field in fields)
     for field in fields:
         inner = (*path, field.name)
         if field.section is not None:
@@ -169,7 +170,7 @@ def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[
         group = path[-1] if path else section
         default = field.default
         bare = without_unit(field.name)
-        key = field.name if bare in keys else bare
+        key = bare if bare_keys[bare] == 1 else field.name
         if field.choices or isinstance(default, bool | int | float):
             yield Parameter(parameter_name(group, key), section, inner, None, field)
         elif _is_vector(default):

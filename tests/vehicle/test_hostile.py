@@ -1,0 +1,136 @@
+"""Whatever comes in on the listening port: counted, dropped, and nothing else."""
+
+import struct
+import sys
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import Incoming
+from gateway.vehicle.vehicle import Vehicle
+from tests.vehicle.ground_station import GroundStation
+from tests.vehicle.samples import sample_at, state_at
+
+
+def every_message(rng: np.random.Generator) -> list[bytes]:
+    """One well-formed frame of every kind of the dialect, filled with random bytes."""
+    frames = []
+    for message_id, kind in sorted(mavlink.mavlink_map.items()):
+        payload = bytearray(rng.bytes(kind.unpacker.size))
+        names = kind.ordered_fieldnames
+        if "target_system" in names:
+            fields = list(kind.unpacker.unpack(bytes(payload)))
+            offset = 0
+            for name in names:
+                length = kind.lengths[names.index(name)]
+                if name in ("target_system", "target_component"):
+                    fields[offset] = 1
+                is_text = kind.fieldtypes[kind.fieldnames.index(name)] == "char"
+                offset += 1 if is_text else length
+            payload = bytearray(kind.unpacker.pack(*fields))
+        while len(payload) > 1 and payload[-1] == 0:
+            payload.pop()
+        head = struct.pack("<BBBBBBB", 0xFD, len(payload), 0, 0, 7, 255, 190)
+        body = head + message_id.to_bytes(3, "little") + bytes(payload)
+        crc = mavlink.x25crc(bytearray(body[1:]) + bytes([kind.crc_extra])).crc
+        frames.append(body + struct.pack("<H", crc))
+    return frames
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+@pytest.mark.parametrize("seed", range(4))
+def test_random_values_in_every_message(station: GroundStation, seed: int, trusted: bool) -> None:
+    rng = np.random.default_rng(seed)
+    station.trusted = trusted
+    for frame in every_message(rng):
+        station.send_bytes(frame)
+        station.wait(0.001)
+    station.wait(5.0)
+    assert station.vehicle.faults["broken"] == 0, "the frames are well-formed"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_bytes(station: GroundStation, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for size in rng.integers(0, 300, 2000):
+        data = bytearray(rng.bytes(int(size)))
+        if data and rng.random() < 0.7:
+            data[0] = rng.choice([0xFD, 0xFE])
+        assert station.send_bytes(bytes(data)) == []
+    assert station.vehicle.faults.total() == 2000
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_cut_and_broken_frames(station: GroundStation, version: int) -> None:
+    station.version = version
+    frame = station.frame(mavlink.MAVLink_param_request_list_message(1, 1))
+    for size in range(len(frame)):
+        assert station.send_bytes(frame[:size]) == []
+    for position in range(1, len(frame)):
+        broken = bytearray(frame)
+        broken[position] ^= 0x80
+        assert station.send_bytes(bytes(broken)) == []
+    assert station.send_bytes(frame) != []
+
+
+def test_unknown_messages_and_flags(station: GroundStation) -> None:
+    head = bytes([0xFD, 1, 0, 0, 0, 255, 190]) + (70_000).to_bytes(3, "little")
+    assert station.send_bytes(head + b"\x01\x00\x00") == []
+    assert station.vehicle.faults["unknown"] == 1
+    flagged = bytearray(station.frame(mavlink.MAVLink_ping_message(0, 0, 0, 0)))
+    flagged[2] = 0x02
+    assert station.send_bytes(bytes(flagged)) == []
+    assert station.vehicle.faults["malformed"] == 1
+
+
+def test_somebody_with_our_own_id_is_not_answered(station: GroundStation) -> None:
+    twin = GroundStation(station.vehicle, station.clock, system_id=1)
+    assert twin.send(mavlink.MAVLink_param_request_list_message(1, 1)) == []
+
+
+def test_ten_thousand_clients_leave_no_mark(vehicle: Vehicle) -> None:
+    mav = mavlink.MAVLink(None, 255, 190)
+    asks = [
+        mavlink.MAVLink_param_request_list_message(1, 1).pack(mav),
+        mavlink.MAVLink_command_long_message(1, 1, 511, 0, 31, 9000, *[0] * 5).pack(mav),
+        mavlink.MAVLink_command_long_message(1, 1, 511, 0, 30, 900_000, *[0] * 5).pack(mav),
+        mavlink.MAVLink_mission_count_message(1, 1, 5, 0).pack(mav),
+        mavlink.MAVLink_file_transfer_protocol_message(
+            0, 1, 1, (struct.pack("<HBBBBBxI", 1, 0, 4, 13, 0, 0, 0) + b"/general.json").ljust(251)
+        ).pack(mav),
+    ]
+
+    def flood(first: int, last: int) -> None:
+        for client_id in range(first, last):
+            now_us = client_id * 1000
+            frame = asks[client_id % len(asks)]
+            vehicle.handle(Incoming(client_id, frame, client_id % 2 == 0), now_us)
+            vehicle.poll(now_us)
+
+    flood(0, 5000)
+    before = _size_of(vehicle)
+    flood(5000, 10_000)
+    assert _size_of(vehicle) < 1.05 * before
+    state = state_at(20_000_000)
+    assert vehicle.on_state(state, sample_at(20_000_000), 20_000_000)
+
+
+def _size_of(root: object) -> int:
+    """Add up everything that hangs on an object."""
+    seen: set[int] = set()
+    pending, total = [root], 0
+    while pending:
+        item = pending.pop()
+        if id(item) in seen or isinstance(item, type):
+            continue
+        seen.add(id(item))
+        total += sys.getsizeof(item)
+        if isinstance(item, dict):
+            pending += [*item.keys(), *item.values()]
+        elif isinstance(item, list | tuple | set | frozenset):
+            pending += list(item)
+        pending += list(getattr(item, "__dict__", {}).values())
+        slots = getattr(type(item), "__slots__", ())
+        pending += [getattr(item, s) for s in slots if isinstance(s, str) and hasattr(item, s)]
+    return total

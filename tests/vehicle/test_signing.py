@@ -1,0 +1,143 @@
+"""MAVLink 2 signing, checked against pymavlink as the other side."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.signing import (
+    EPOCH_2015_US,
+    KEY_BYTES,
+    MAX_STREAMS,
+    SigningClock,
+    Verifier,
+    key_from_passphrase,
+)
+from gateway.vehicle.vehicle import Vehicle
+from tests.conftest import ManualClock
+from tests.vehicle.ground_station import GroundStation
+from tests.vehicle.samples import STATE, sample_at
+
+NOW_UNIX_US = 1_790_000_000_000_000
+KEY = key_from_passphrase("correct horse")
+SET = mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 5.0, mavlink.MAV_PARAM_TYPE_REAL32)
+
+
+def ticks(unix_us: int) -> int:
+    return (unix_us - EPOCH_2015_US) // 10
+
+
+@pytest.fixture
+def vehicle() -> Vehicle:
+    settings = VehicleSettings(signing_passphrase="correct horse")
+    return Vehicle(settings, 1, unix_us_at_zero=NOW_UNIX_US)
+
+
+def sign(station: GroundStation, key: bytes = KEY, at_us: int = NOW_UNIX_US) -> None:
+    signing = station.mav.signing
+    signing.secret_key, signing.sign_outgoing, signing.timestamp = key, True, ticks(at_us)
+
+
+def changed(found: list[Any]) -> bool:
+    return [m.param_value for m in found if m.get_type() == "PARAM_VALUE"] == [5.0]
+
+
+def test_the_key_is_the_hash_of_the_passphrase() -> None:
+    assert len(KEY) == KEY_BYTES
+    assert KEY.hex().startswith("4104d36f"), "sha256sum of the passphrase"
+
+
+def test_everything_that_is_sent_is_signed_and_pymavlink_accepts_it(vehicle: Vehicle) -> None:
+    receiver = mavlink.MAVLink(None)
+    receiver.signing.secret_key = KEY
+    receiver.signing.timestamp = ticks(NOW_UNIX_US)
+    for now_us in range(0, 3_000_000, 5_000):
+        actions = vehicle.on_state(replace(STATE, time_us=now_us), sample_at(now_us), now_us)
+        for action in [*actions, *vehicle.poll(now_us)]:
+            assert receiver.decode(bytearray(action.frame)).get_signed()
+
+
+def test_time_stamps_follow_the_clock(vehicle: Vehicle) -> None:
+    for now_us in (0, 1_000_000, 60_000_000):
+        frame = vehicle.poll(now_us)[0].frame
+        stamp = int.from_bytes(frame[-12:-6], "little")
+        assert stamp == pytest.approx(ticks(NOW_UNIX_US + now_us), abs=20)
+
+
+def test_a_signed_request_changes_something(station: GroundStation) -> None:
+    sign(station)
+    assert changed(station.send(SET))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_unsigned_one_does_not_but_may_read(station: GroundStation, version: int) -> None:
+    station.version = version
+    assert not changed(station.send(SET))
+    read = mavlink.MAVLink_param_request_read_message(1, 1, b"RATE_ATT", -1)
+    assert station.send(read)[0].param_value == 50.0
+
+
+def test_a_signature_does_not_make_a_client_trusted(station: GroundStation) -> None:
+    sign(station)
+    station.trusted = False
+    assert not changed(station.send(SET))
+
+
+def test_another_key_is_dropped(station: GroundStation) -> None:
+    sign(station, key_from_passphrase("wrong"))
+    assert station.send(SET) == []
+    assert station.vehicle.faults["bad signature"] == 1
+
+
+def test_a_replayed_frame_is_dropped(station: GroundStation) -> None:
+    sign(station)
+    frame = station.frame(SET)
+    assert changed(station.send_bytes(frame))
+    for _ in range(10):
+        assert station.send_bytes(frame) == []
+    assert station.vehicle.faults["bad signature"] == 10
+
+
+def test_an_old_recording_is_dropped(station: GroundStation) -> None:
+    sign(station, at_us=NOW_UNIX_US - 120_000_000)
+    assert station.send(SET) == []
+
+
+def test_a_forged_frame_does_not_lock_the_true_sender_out(station: GroundStation) -> None:
+    sign(station, key_from_passphrase("wrong"), at_us=NOW_UNIX_US + 10**15)
+    station.send(SET)
+    sign(station)
+    assert changed(station.send(SET))
+
+
+@pytest.mark.parametrize("position", [3, 5, 10, 20, -1, -7, -13])
+def test_a_changed_byte_is_noticed(station: GroundStation, position: int) -> None:
+    sign(station)
+    frame = bytearray(station.frame(SET))
+    frame[position] ^= 0x01
+    assert not changed(station.send_bytes(bytes(frame)))
+
+
+def test_without_a_key_signed_frames_are_taken_as_they_are(clock: ManualClock) -> None:
+    station = GroundStation(Vehicle(VehicleSettings(), 1), clock)
+    sign(station)
+    assert changed(station.send(SET))
+
+
+def test_streams_are_bounded() -> None:
+    verifier = Verifier(KEY, SigningClock(NOW_UNIX_US))
+    mav = mavlink.MAVLink(None, 9, 1)
+    mav.signing.secret_key, mav.signing.sign_outgoing = KEY, True
+    mav.signing.timestamp = ticks(NOW_UNIX_US)
+    accepted = 0
+    for number in range(2 * MAX_STREAMS):
+        mav.srcSystem, mav.srcComponent = number % 256, 1 + number // 256
+        accepted += verifier.accepts(mavlink.MAVLink_ping_message(0, 0, 0, 0).pack(mav), 0)
+    assert accepted == MAX_STREAMS
+
+
+def test_a_short_key_is_a_fault_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="31 bytes"):
+        Verifier(bytes(31), SigningClock(0))
