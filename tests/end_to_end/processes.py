@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
-START_LIMIT_S = 90.0
+START_LIMIT_S = 60.0
 """The first start after an upgrade compiles; everything else takes a second."""
 
 CONFIG = """
