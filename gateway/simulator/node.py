@@ -1,7 +1,7 @@
 """The two radio nodes of an aircraft: samples in, payloads out, each at its moment."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Final
@@ -150,6 +150,27 @@ def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
         imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw,
         imu.temperature_raw, imu.flags,
     )  # fmt: skip
+    return pack_imu(columns, (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN))
+
+
+def pack_imu(
+    columns: Sequence[FloatArray | IntArray], ranges: tuple[int, int, int]
+) -> Iterator[Sent]:
+    """Pack IMU readings.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray
+        True time of sampling in s and node time in us, each (N,); accelerometer, gyroscope and
+        magnetometer counts, each (N, 3); temperature counts and flags, each (N,).
+    ranges : tuple of 3 ints
+        Codes of the accelerometer's and gyroscope's ranges and the magnetometer's gain.
+
+    Yields
+    ------
+    Sent
+    """
+    accel_range, gyro_range, mag_gain = ranges
     for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
         *(column.tolist() for column in columns), strict=True
     ):
@@ -159,16 +180,30 @@ def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
             mag=tuple(mag),
             temperature=temperature,
             flags=ImuFlags(flags),
-            accel_range=ACCEL_RANGE,
-            gyro_range=GYRO_RANGE,
-            mag_gain=MAG_GAIN,
+            accel_range=accel_range,
+            gyro_range=gyro_range,
+            mag_gain=mag_gain,
         )
         yield Sent(time_s + IMU_READING_S, node_us, payload)
 
 
 def baro_payloads(baro: BaroSamples) -> Iterator[Sent]:
     """Pack barometer samples."""
-    columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+    return pack_baro((baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc))
+
+
+def pack_baro(columns: Sequence[FloatArray | IntArray]) -> Iterator[Sent]:
+    """Pack barometer readings.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray, each (N,)
+        True time of sampling in s, node time in us, pressure in Pa, temperature in deg C.
+
+    Yields
+    ------
+    Sent
+    """
     for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
         payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
         yield Sent(time_s + BARO_READING_S, node_us, payload)
