@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -30,6 +31,12 @@ BARO_READING_S: Final = 0.0006
 GPS_READING_S: Final = 0.009
 """100 bytes of UBX-NAV-PVT at 115 200 baud."""
 STATUS_S: Final = 1.0
+
+IMU_AHEAD: Final = 40
+IMU_AHEAD_S: Final = 0.5
+GPS_AHEAD_S: Final = 2.0
+"""How far samples are made ahead: few of them cost no less than many, yet making many at once
+would hold up an event loop."""
 
 IMU_SENSORS: Final = 0b0111
 GPS_SENSORS: Final = 0b1000
@@ -64,25 +71,37 @@ class Node(ABC):
         Bits of the sensors on it.
     rate_hz : int
         What it reports as its sample rate.
+    ahead_s : float
+        How far payloads are made ahead.
     """
 
-    def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
+    def __init__(
+        self,
+        node_id: NodeId,
+        clock: DeviceClock,
+        sensors: int,
+        rate_hz: int,
+        ahead_s: float = 0.0,
+    ) -> None:
         self.node_id = node_id
         self.radio_failed = 0
         self.radio_retries = 0
         self._clock = clock
         self._sensors = sensors
         self._rate_hz = rate_hz
+        self._ahead_s = ahead_s
+        self._made_s = 0.0
         self._waiting: list[Sent] = []
         self._statuses = 0
 
     def take(self, until_s: float) -> list[Sent]:
         """Give every payload handed to the radio before a true time, in order."""
+        made = [*self._waiting, *self._report(until_s)]
+        if until_s > self._made_s:
+            self._made_s = until_s + self._ahead_s
+            made += self._make(self._made_s)
         # Stable: a fix stays behind the quality payload of the same moment.
-        made = sorted(
-            [*self._waiting, *self._make(until_s), *self._report(until_s)],
-            key=lambda sent: sent.time_s,
-        )
+        made.sort(key=attrgetter("time_s"))
         ready = sum(1 for sent in made if sent.time_s < until_s)
         self._waiting = made[ready:]
         return made[:ready]
@@ -114,7 +133,8 @@ class ImuNode(Node):
 
     def __init__(self, aircraft: Aircraft, rate_hz: int) -> None:
         node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
-        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz)
+        ahead_s = min(IMU_AHEAD / rate_hz, IMU_AHEAD_S)
+        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz, ahead_s)
         self._aircraft = aircraft
 
     def _make(self, until_s: float) -> Iterator[Sent]:
@@ -127,7 +147,7 @@ class GpsNode(Node):
 
     def __init__(self, aircraft: Aircraft, geoid_separation_m: float) -> None:
         node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
-        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ)
+        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ, GPS_AHEAD_S)
         self._aircraft = aircraft
         self._geoid_separation_m = geoid_separation_m
 

@@ -42,7 +42,7 @@ class SimulatorSettings(Settings, frozen=True):
         setting("True direction the wind blows from; the runway follows it.", "deg", ge=0, le=360),
     ] = 110.0
     gust_mps: Annotated[
-        float, setting("Standard deviation of the gusts on each axis.", "m/s", ge=0, le=3)
+        float, setting("Standard deviation of the gusts on each axis.", "m/s", ge=0, le=2)
     ] = 0.5
     vibration_mps2: Annotated[
         float,
