@@ -84,7 +84,9 @@ class TestLine:
 class TestRadio:
     @pytest.mark.parametrize(("loss", "burst"), [(0.0, 1.0), (0.01, 1.0), (0.1, 1.0), (0.1, 20.0)])
     def test_loss_is_as_set(self, loss: float, burst: float) -> None:
-        line = frames(100.0, radio_loss=loss, radio_burst=burst, radio_duplicates=0.0)
+        line = frames(
+            60.0, baro_rate_hz=1, radio_loss=loss, radio_burst=burst, radio_duplicates=0.0
+        )
         seqs = [
             c.header.seq for c in decoded(line)
             if isinstance(c, RadioFrame) and c.header.node == NodeId(1, 0)
@@ -93,7 +95,7 @@ class TestRadio:
         assert (gaps >= 0).all()
         share = gaps.sum() / (gaps.sum() + len(seqs))
         # A burst counts as one draw: fewer independent draws, wider bounds.
-        assert share == pytest.approx(loss, abs=4.0 * np.sqrt(2.0 * burst * loss / 12_600) + 1e-9)
+        assert share == pytest.approx(loss, abs=4.0 * np.sqrt(2.0 * burst * loss / 6_120) + 1e-9)
         if loss:
             assert gaps[gaps > 0].mean() == pytest.approx(burst, rel=0.35)
 
