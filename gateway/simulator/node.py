@@ -31,6 +31,8 @@ BARO_READING_S: Final = 0.0006
 GPS_READING_S: Final = 0.009
 """100 bytes of UBX-NAV-PVT at 115 200 baud."""
 STATUS_S: Final = 1.0
+STARTING_US: Final = 600_000
+"""From reset to the first payload: self-test and settling of the sensors."""
 
 IMU_AHEAD: Final = 40
 IMU_AHEAD_S: Final = 0.5
@@ -84,6 +86,8 @@ class Node(ABC):
         ahead_s: float = 0.0,
     ) -> None:
         self.node_id = node_id
+        self.restart_s = 0.0
+        """True time at which its watchdog bites; 0 for never."""
         self.radio_failed = 0
         self.radio_retries = 0
         self._clock = clock
@@ -104,11 +108,20 @@ class Node(ABC):
         made.sort(key=attrgetter("time_s"))
         ready = sum(1 for sent in made if sent.time_s < until_s)
         self._waiting = made[ready:]
-        return made[:ready]
+        return [s for sent in made[:ready] if (s := self._after_restart(sent)) is not None]
 
     @abstractmethod
     def _make(self, until_s: float) -> Iterator[Sent]:
         """Make at least every payload that is handed over before a true time."""
+
+    def _after_restart(self, sent: Sent) -> Sent | None:
+        """Silence a node while it starts anew, and let its clock begin at zero from then on."""
+        if not 0.0 < self.restart_s <= sent.time_s:
+            return sent
+        node_time_us = sent.node_time_us - self._clock.at(self.restart_s)
+        if node_time_us < STARTING_US:
+            return None
+        return Sent(sent.time_s, node_time_us, sent.payload)
 
     def _report(self, until_s: float) -> Iterator[Sent]:
         while (time_s := (self._statuses + 0.5) * STATUS_S) < until_s:
@@ -158,10 +171,9 @@ class GpsNode(Node):
 
 def nodes_of(aircraft: Aircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
     """Put the two nodes into an aircraft."""
-    return (
-        ImuNode(aircraft, settings.imu_rate_hz),
-        GpsNode(aircraft, settings.geoid_separation_m),
-    )
+    imu = ImuNode(aircraft, settings.imu_rate_hz)
+    imu.restart_s = settings.imu_restart_s
+    return (imu, GpsNode(aircraft, settings.geoid_separation_m))
 
 
 def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:

@@ -74,6 +74,10 @@ class SimulatorSettings(Settings, frozen=True):
             le=2000,
         ),
     ] = 120.0
+    imu_restart_s: Annotated[
+        float,
+        setting("When the IMU node restarts, its clock at zero again; 0 for never.", "s", ge=0),
+    ] = 0.0
     radio_loss: Annotated[float, setting("Share of payloads that never arrive.", ge=0, le=0.9)] = (
         0.01
     )

@@ -142,6 +142,21 @@ class TestThroughTheWire:
                         original.lat_dege7, original.utc_us, original.fix_type
                     )  # fmt: skip
 
+    def test_node_restarts(self) -> None:
+        link = Link()
+        imu = [
+            record
+            for frame in frames(30.0, imu_restart_s=12.0)
+            for record in link.feed(frame.data, round(frame.time_s * 1e6))
+            if isinstance(record, ImuRaw)
+        ]
+        restarts = [node.restarts for node in link.report(0, connected=True, port="").nodes]
+        assert restarts == [1, 0]
+        silent_us = max(b.time_us - a.time_us for a, b in itertools.pairwise(imu))
+        assert 590_000 < silent_us < 640_000
+        assert min(r.node_time_us for r in imu) == pytest.approx(600_000, abs=10_000)
+        assert imu[-1].time_us == pytest.approx(30e6, abs=30_000)
+
     def test_three_aircraft_share_the_receiver(self) -> None:
         link = feed(frames(5.0, vehicles=3, vehicle_id=7))
         nodes = link.report(5_000_000, connected=True, port="").nodes
