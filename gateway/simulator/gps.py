@@ -15,6 +15,7 @@ from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 
 GPS_RATE_HZ: Final = 5
 EPOCH_US: Final = 1_000_000 // GPS_RATE_HZ
+MIN_LATENCY_S: Final = 0.01
 TIME_KNOWN_EARLIER_S: Final = 2.0
 """The time is known from fewer satellites than a fix, so this much sooner."""
 
@@ -130,7 +131,7 @@ class GpsSampler:
         speed_acc_mps = SPEED_ACC_MPS * worse
         ground_mps = np.maximum(np.hypot(vel_n_mps[:, 0], vel_n_mps[:, 1]), 1e-3)
         return GpsSamples(
-            time_s=valid_s + s.gps_latency_s + jitter_s,
+            time_s=valid_s + np.maximum(s.gps_latency_s + jitter_s, MIN_LATENCY_S),
             valid_time_s=valid_s,
             itow_ms=(unix_us - GPS_EPOCH_UNIX_US + LEAP_US) // 1000 % WEEK_MS,
             unix_us=unix_us,

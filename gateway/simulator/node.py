@@ -1,9 +1,10 @@
 """The two radio nodes of an aircraft: samples in, payloads out, each at its moment."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -30,6 +31,14 @@ BARO_READING_S: Final = 0.0006
 GPS_READING_S: Final = 0.009
 """100 bytes of UBX-NAV-PVT at 115 200 baud."""
 STATUS_S: Final = 1.0
+STARTING_US: Final = 600_000
+"""From reset to the first payload: self-test and settling of the sensors."""
+
+IMU_AHEAD: Final = 40
+IMU_AHEAD_S: Final = 0.5
+GPS_AHEAD_S: Final = 2.0
+"""How far samples are made ahead: few of them cost no less than many, yet making many at once
+would hold up an event loop."""
 
 IMU_SENSORS: Final = 0b0111
 GPS_SENSORS: Final = 0b1000
@@ -64,32 +73,55 @@ class Node(ABC):
         Bits of the sensors on it.
     rate_hz : int
         What it reports as its sample rate.
+    ahead_s : float
+        How far payloads are made ahead.
     """
 
-    def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
+    def __init__(
+        self,
+        node_id: NodeId,
+        clock: DeviceClock,
+        sensors: int,
+        rate_hz: int,
+        ahead_s: float = 0.0,
+    ) -> None:
         self.node_id = node_id
+        self.restart_s = 0.0
+        """True time at which its watchdog bites; 0 for never."""
         self.radio_failed = 0
         self.radio_retries = 0
         self._clock = clock
         self._sensors = sensors
         self._rate_hz = rate_hz
+        self._ahead_s = ahead_s
+        self._made_s = 0.0
         self._waiting: list[Sent] = []
         self._statuses = 0
 
     def take(self, until_s: float) -> list[Sent]:
         """Give every payload handed to the radio before a true time, in order."""
+        made = [*self._waiting, *self._report(until_s)]
+        if until_s > self._made_s:
+            self._made_s = until_s + self._ahead_s
+            made += self._make(self._made_s)
         # Stable: a fix stays behind the quality payload of the same moment.
-        made = sorted(
-            [*self._waiting, *self._make(until_s), *self._report(until_s)],
-            key=lambda sent: sent.time_s,
-        )
+        made.sort(key=attrgetter("time_s"))
         ready = sum(1 for sent in made if sent.time_s < until_s)
         self._waiting = made[ready:]
-        return made[:ready]
+        return [s for sent in made[:ready] if (s := self._after_restart(sent)) is not None]
 
     @abstractmethod
     def _make(self, until_s: float) -> Iterator[Sent]:
         """Make at least every payload that is handed over before a true time."""
+
+    def _after_restart(self, sent: Sent) -> Sent | None:
+        """Silence a node while it starts anew, and let its clock begin at zero from then on."""
+        if not 0.0 < self.restart_s <= sent.time_s:
+            return sent
+        node_time_us = sent.node_time_us - self._clock.at(self.restart_s)
+        if node_time_us < STARTING_US:
+            return None
+        return Sent(sent.time_s, node_time_us, sent.payload)
 
     def _report(self, until_s: float) -> Iterator[Sent]:
         while (time_s := (self._statuses + 0.5) * STATUS_S) < until_s:
@@ -114,7 +146,8 @@ class ImuNode(Node):
 
     def __init__(self, aircraft: Aircraft, rate_hz: int) -> None:
         node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
-        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz)
+        ahead_s = min(IMU_AHEAD / rate_hz, IMU_AHEAD_S)
+        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz, ahead_s)
         self._aircraft = aircraft
 
     def _make(self, until_s: float) -> Iterator[Sent]:
@@ -127,7 +160,7 @@ class GpsNode(Node):
 
     def __init__(self, aircraft: Aircraft, geoid_separation_m: float) -> None:
         node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
-        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ)
+        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ, GPS_AHEAD_S)
         self._aircraft = aircraft
         self._geoid_separation_m = geoid_separation_m
 
@@ -138,10 +171,9 @@ class GpsNode(Node):
 
 def nodes_of(aircraft: Aircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
     """Put the two nodes into an aircraft."""
-    return (
-        ImuNode(aircraft, settings.imu_rate_hz),
-        GpsNode(aircraft, settings.geoid_separation_m),
-    )
+    imu = ImuNode(aircraft, settings.imu_rate_hz)
+    imu.restart_s = settings.imu_restart_s
+    return (imu, GpsNode(aircraft, settings.geoid_separation_m))
 
 
 def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
@@ -150,6 +182,27 @@ def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
         imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw,
         imu.temperature_raw, imu.flags,
     )  # fmt: skip
+    return pack_imu(columns, (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN))
+
+
+def pack_imu(
+    columns: Sequence[FloatArray | IntArray], ranges: tuple[int, int, int]
+) -> Iterator[Sent]:
+    """Pack IMU readings.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray
+        True time of sampling in s and node time in us, each (N,); accelerometer, gyroscope and
+        magnetometer counts, each (N, 3); temperature counts and flags, each (N,).
+    ranges : tuple of 3 ints
+        Codes of the accelerometer's and gyroscope's ranges and the magnetometer's gain.
+
+    Yields
+    ------
+    Sent
+    """
+    accel_range, gyro_range, mag_gain = ranges
     for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
         *(column.tolist() for column in columns), strict=True
     ):
@@ -159,16 +212,30 @@ def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
             mag=tuple(mag),
             temperature=temperature,
             flags=ImuFlags(flags),
-            accel_range=ACCEL_RANGE,
-            gyro_range=GYRO_RANGE,
-            mag_gain=MAG_GAIN,
+            accel_range=accel_range,
+            gyro_range=gyro_range,
+            mag_gain=mag_gain,
         )
         yield Sent(time_s + IMU_READING_S, node_us, payload)
 
 
 def baro_payloads(baro: BaroSamples) -> Iterator[Sent]:
     """Pack barometer samples."""
-    columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+    return pack_baro((baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc))
+
+
+def pack_baro(columns: Sequence[FloatArray | IntArray]) -> Iterator[Sent]:
+    """Pack barometer readings.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray, each (N,)
+        True time of sampling in s, node time in us, pressure in Pa, temperature in deg C.
+
+    Yields
+    ------
+    Sent
+    """
     for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
         payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
         yield Sent(time_s + BARO_READING_S, node_us, payload)

@@ -52,6 +52,7 @@ REPORT_ROOM_BYTES: Final = 80
 """Kept free for the status frame, or a full line would never tell that it is full."""
 BITS_PER_BYTE: Final = 10
 STATUS_S: Final = 1.0
+LAST_VEHICLE_ID: Final = 31
 CHANNEL: Final = 76
 NOISE_PERCENT: Final = 2
 POWER_ON: Final = 1
@@ -239,7 +240,15 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
     Returns
     -------
     SimulatedReceiver
+
+    Raises
+    ------
+    ValueError
+        If the last aircraft's id is too large.
     """
+    last_id = settings.vehicle_id + settings.vehicles - 1
+    if last_id > LAST_VEHICLE_ID:
+        raise ValueError(f"vehicle ids up to {last_id}; the protocol ends at {LAST_VEHICLE_ID}")
     nodes: list[Node] = []
     for index in range(settings.vehicles):
         nodes += nodes_of(Aircraft(settings, index, start_unix_us), settings)

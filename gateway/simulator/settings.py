@@ -42,7 +42,7 @@ class SimulatorSettings(Settings, frozen=True):
         setting("True direction the wind blows from; the runway follows it.", "deg", ge=0, le=360),
     ] = 110.0
     gust_mps: Annotated[
-        float, setting("Standard deviation of the gusts on each axis.", "m/s", ge=0, le=3)
+        float, setting("Standard deviation of the gusts on each axis.", "m/s", ge=0, le=2)
     ] = 0.5
     vibration_mps2: Annotated[
         float,
@@ -74,6 +74,10 @@ class SimulatorSettings(Settings, frozen=True):
             le=2000,
         ),
     ] = 120.0
+    imu_restart_s: Annotated[
+        float,
+        setting("When the IMU node restarts, its clock at zero again; 0 for never.", "s", ge=0),
+    ] = 0.0
     radio_loss: Annotated[float, setting("Share of payloads that never arrive.", ge=0, le=0.9)] = (
         0.01
     )

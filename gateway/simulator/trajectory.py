@@ -12,7 +12,7 @@ truth is closed form at any time: integrating one quantity gives the other to ma
 
 The lengths of seven straight legs are solved for, so that the aircraft comes to rest where it began
 whatever the wind, after exactly `FLIGHT_S`: the flight can be repeated without a jump. The Earth
-does not rotate here, and is flat around home (below 2 cm in position at one kilometre).
+does not rotate here, and is flat around home (a few centimetres at one kilometre).
 """
 
 import math

@@ -48,7 +48,7 @@ class TestConsistency:
     def test_body_rate_integrates_to_attitude(self, trajectory: Trajectory) -> None:
         # The rate at the middle of a step turns the attitude from its start to its end.
         step_s = 0.001
-        edges = trajectory.truth_at(np.arange(95.0, 130.0, step_s))
+        edges = trajectory.truth_at(np.arange(110.0, 130.0, step_s))
         middles = trajectory.truth_at(edges.time_s[:-1] + 0.5 * step_s)
         steps = Rotation.from_rotvec(middles.rate_b_radps * step_s)
         attitude = Rotation.from_quat(edges.q_nb[0], scalar_first=True)

@@ -1,0 +1,335 @@
+"""A recorded flight through the simulated receiver: SI columns in, the nodes' payloads out.
+
+The recording's times of sampling and of arrival are kept, so its own GPS latency stays in it.
+Vectors become counts in sensor axes, in the finest ranges that hold them; the board is level and
+face up. Heights of the barometer become pressures of the standard atmosphere.
+"""
+
+import heapq
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Final
+
+import numpy as np
+
+from gateway.records import ImuFlags, NodeId
+from gateway.simulator.flight import GPS_BOOT_US, GPS_NODE, IMU_NODE, START_UNIX_US
+from gateway.simulator.gps import GPS_EPOCH_UNIX_US, LEAP_US, WEEK_MS, GpsSamples
+from gateway.simulator.node import (
+    GPS_SENSORS,
+    IMU_SENSORS,
+    UINT16_MAX,
+    Node,
+    Sent,
+    gps_payloads,
+    pack_baro,
+    pack_imu,
+)
+from gateway.simulator.noise import FloatArray
+from gateway.simulator.receiver import SimulatedReceiver
+from gateway.simulator.samplers import IMU_BOOT_US, DeviceClock
+from gateway.simulator.sensors import (
+    FACE_UP,
+    GYRO_LSB_PER_DPS,
+    INT16_MAX,
+    MAG_LIMIT,
+    SEA_LEVEL_PA,
+    UT_PER_GAUSS,
+    BoolArray,
+    IntArray,
+    mag_counts,
+    pressure_at,
+    temperature_counts,
+    to_int16,
+)
+from gateway.simulator.settings import SimulatorSettings
+from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
+
+ROWS: Final = 2048
+"""Rows that become payloads at once: bounds memory on long recordings."""
+TEMPERATURE_DEGC: Final = 25.0
+SATELLITES: Final = 10
+H_ACC_M: Final = 2.0
+V_ACC_M: Final = 3.0
+SPEED_ACC_MPS: Final = 0.3
+PDOP: Final = 1.8
+"""What is told of fixes where the recording says nothing."""
+UNKNOWN: Final = UINT16_MAX / 100.0
+TAIL_S: Final = 0.5
+
+GPS_COLUMNS: Final = ("gps_time_s", "gps_lat", "gps_lon")
+IMU_COLUMNS: Final = ("time_s", "ax", "ay", "az", "gx", "gy", "gz")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFlight:
+    """A tracker's log: N rows of the IMU, M fixes; NaN where there is no new sample."""
+
+    time_s: FloatArray
+    """Shape (N,), since the first row."""
+    accel_b_mps2: FloatArray
+    """Shape (N, 3), specific force in body FRD."""
+    gyro_b_radps: FloatArray
+    mag_b_ut: FloatArray
+    """Shape (N, 3), hard iron removed."""
+    baro_alt_m: FloatArray
+    """Shape (N,)."""
+    gps_time_s: FloatArray
+    """Shape (M,), arrival, since the first row; not negative."""
+    gps_lat_deg: FloatArray
+    gps_lon_deg: FloatArray
+    gps_alt_m: FloatArray
+    gps_vel_n_mps: FloatArray
+    """Shape (M, 3); NaN where the recording has neither velocity nor speed and course."""
+    gps_latency_s: float
+    """From a fix's validity to its arrival; used for its time of week and UTC alone."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the recording runs, with time for the last payloads to come out."""
+        return float(self.time_s[-1]) + TAIL_S
+
+    @property
+    def rate_hz(self) -> float:
+        """Usual rate of the IMU."""
+        return 1.0 / float(np.median(np.diff(self.time_s)))
+
+    @staticmethod
+    def from_columns(
+        columns: Mapping[str, FloatArray], gps_latency_s: float = 0.2
+    ) -> "RecordedFlight":
+        """Make a flight from the columns of a log.
+
+        Parameters
+        ----------
+        columns : mapping of str to ndarray, each (N,)
+            `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s must be there. Known too:
+            `mx` `my` `mz` in uT, `baro_alt_m`, `gps_time_s`, `gps_lat`, `gps_lon`, `gps_alt_m`,
+            `gps_vn` `gps_ve` `gps_vd` or `gps_speed_ms` and `gps_course_deg`. NaN is "no new one".
+        gps_latency_s : float
+            What the log says of its GPS.
+
+        Returns
+        -------
+        RecordedFlight
+
+        Raises
+        ------
+        ValueError
+            If a column is missing, there are less than two rows, or time does not grow.
+        """
+        missing = [name for name in IMU_COLUMNS if name not in columns]
+        if missing:
+            raise ValueError(f"columns missing: {', '.join(missing)}")
+        blank = np.full_like(columns["time_s"], np.nan)
+
+        def stack(*names: str) -> FloatArray:
+            return np.column_stack([columns.get(name, blank) for name in names])
+
+        inertial = stack("ax", "ay", "az", "gx", "gy", "gz")
+        usable = np.isfinite(columns["time_s"]) & _complete(inertial)
+        time_s = columns["time_s"][usable]
+        if len(time_s) < 2:
+            raise ValueError(f"{len(time_s)} rows with acceleration and rate; a flight has more")
+        if (np.diff(time_s) <= 0.0).any():
+            at_s = time_s[int(np.argmax(np.diff(time_s) <= 0.0)) + 1]
+            raise ValueError(f"time_s goes back at {at_s} s")
+        begin_s = time_s[0]
+        fixes = _complete(stack(*GPS_COLUMNS))
+        # A fix from before the first sample has no place on the nodes' clocks.
+        fixes &= columns.get("gps_time_s", blank) >= begin_s
+        return RecordedFlight(
+            time_s=time_s - begin_s,
+            accel_b_mps2=inertial[usable, :3],
+            gyro_b_radps=inertial[usable, 3:],
+            mag_b_ut=stack("mx", "my", "mz")[usable],
+            baro_alt_m=columns.get("baro_alt_m", blank)[usable],
+            gps_time_s=np.maximum.accumulate(columns.get("gps_time_s", blank)[fixes] - begin_s),
+            gps_lat_deg=columns.get("gps_lat", blank)[fixes],
+            gps_lon_deg=columns.get("gps_lon", blank)[fixes],
+            gps_alt_m=columns.get("gps_alt_m", blank)[fixes],
+            gps_vel_n_mps=_velocity(columns, blank)[fixes],
+            gps_latency_s=gps_latency_s,
+        )
+
+
+class RecordedNode(Node):
+    """A node that sends what was recorded."""
+
+    def __init__(
+        self,
+        node_id: NodeId,
+        clock: DeviceClock,
+        sensors: int,
+        rate_hz: int,
+        payloads: Iterator[Sent],
+    ) -> None:
+        super().__init__(node_id, clock, sensors, rate_hz)
+        self._payloads = payloads
+        self._ahead: Sent | None = None
+
+    def _make(self, until_s: float) -> Iterator[Sent]:
+        while True:
+            if self._ahead is None:
+                self._ahead = next(self._payloads, None)
+            if self._ahead is None or self._ahead.time_s >= until_s:
+                return
+            sent, self._ahead = self._ahead, None
+            yield sent
+
+
+def replay(
+    settings: SimulatorSettings, flight: RecordedFlight, start_unix_us: int = START_UNIX_US
+) -> SimulatedReceiver:
+    """Set up the receiver and one aircraft that flies a recording.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+        Vehicle id, radio, line and clocks; its flight and sensors do not matter here.
+    flight : RecordedFlight
+    start_unix_us : int
+        UTC of the first row, which recordings do not tell.
+
+    Returns
+    -------
+    SimulatedReceiver
+        Its `frames(flight.duration_s)` end with the recording.
+    """
+    imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
+    inertial = _imu_payloads(flight, imu_clock)
+    pressures = _baro_payloads(flight, imu_clock)
+    nodes: list[Node] = [
+        RecordedNode(
+            NodeId(settings.vehicle_id, IMU_NODE),
+            imu_clock,
+            _imu_sensors(flight),
+            round(flight.rate_hz),
+            heapq.merge(inertial, pressures, key=attrgetter("time_s")),
+        )
+    ]
+    if len(flight.gps_time_s):
+        gps_clock = DeviceClock(GPS_BOOT_US, -settings.clock_skew_ppm)
+        gps = _gps_samples(flight, start_unix_us)
+        spacing_s = float(np.median(np.diff(gps.time_s))) if len(gps.time_s) > 1 else 1.0
+        nodes.append(
+            RecordedNode(
+                NodeId(settings.vehicle_id, GPS_NODE),
+                gps_clock,
+                GPS_SENSORS,
+                round(1.0 / spacing_s),
+                gps_payloads(gps, gps_clock, settings.geoid_separation_m),
+            )
+        )
+    return SimulatedReceiver(settings, nodes)
+
+
+def _velocity(columns: Mapping[str, FloatArray], blank: FloatArray) -> FloatArray:
+    """Take the GPS velocity, or make it from speed and course; shape (N, 3)."""
+    vel = np.column_stack([columns.get(name, blank) for name in ("gps_vn", "gps_ve", "gps_vd")])
+    speed = columns.get("gps_speed_ms", blank)
+    course_rad = np.radians(columns.get("gps_course_deg", blank))
+    level = np.column_stack([speed * np.cos(course_rad), speed * np.sin(course_rad), 0.0 * speed])
+    return np.where(_complete(vel)[:, np.newaxis], vel, level)
+
+
+def _imu_sensors(flight: RecordedFlight) -> int:
+    absent = (not np.isfinite(flight.mag_b_ut).any()) << 1
+    absent |= (not np.isfinite(flight.baro_alt_m).any()) << 2
+    return IMU_SENSORS & ~absent
+
+
+def _imu_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]:
+    accel_range, gyro_range, mag_gain = ranges = _ranges(flight)
+    mag_new = _complete(flight.mag_b_ut)
+    absent = 0 if mag_new.any() else int(ImuFlags.MAG_ABSENT)
+    if not np.isfinite(flight.baro_alt_m).any():
+        absent |= ImuFlags.BARO_ABSENT
+    mag_raw = _mag_words(flight.mag_b_ut, mag_new, mag_gain)
+    accel_lsb = (INT16_MAX + 1) / (ACCEL_RANGES_G[accel_range] * STANDARD_GRAVITY_MPS2)
+    gyro_lsb = math.degrees(GYRO_LSB_PER_DPS[gyro_range])
+    temperature = temperature_counts(np.full(ROWS, TEMPERATURE_DEGC))
+    for start in range(0, len(flight.time_s), ROWS):
+        rows = slice(start, start + ROWS)
+        time_s = flight.time_s[rows]
+        accel, accel_clipped = to_int16(flight.accel_b_mps2[rows] * FACE_UP * accel_lsb)
+        gyro, gyro_clipped = to_int16(flight.gyro_b_radps[rows] * FACE_UP * gyro_lsb)
+        flags = absent | mag_new[rows] * int(ImuFlags.MAG_NEW)
+        flags |= accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
+        flags |= gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
+        columns = (time_s, _on_clock(clock, time_s), accel, gyro, mag_raw[rows])
+        yield from pack_imu((*columns, temperature[: len(time_s)], flags), ranges)
+
+
+def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
+    """Choose the codes of the finest ranges that hold the whole recording."""
+    accel_limits = [g * STANDARD_GRAVITY_MPS2 * INT16_MAX / (INT16_MAX + 1) for g in ACCEL_RANGES_G]
+    gyro_limits = [math.radians(INT16_MAX / lsb) for lsb in GYRO_LSB_PER_DPS]
+    mag_limits = [MAG_LIMIT * UT_PER_GAUSS / lsb for lsb in MAG_LSB_PER_GAUSS]
+    return (
+        _finest(accel_limits, flight.accel_b_mps2),
+        _finest(gyro_limits, flight.gyro_b_radps),
+        _finest(mag_limits, flight.mag_b_ut),
+    )
+
+
+def _finest(limits: list[float], values: FloatArray) -> int:
+    """Choose the first limit that holds all values, the last if none does."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    return next((code for code, limit in enumerate(limits) if largest < limit), len(limits) - 1)
+
+
+def _mag_words(field_b_ut: FloatArray, new: BoolArray, gain: int) -> IntArray:
+    """Convert to counts and hold each reading until the next one, as the registers do."""
+    words = np.zeros((np.count_nonzero(new) + 1, 3), dtype=np.int64)
+    words[1:] = mag_counts(field_b_ut[new] * FACE_UP, gain)
+    return words[np.cumsum(new)]
+
+
+def _baro_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]:
+    new = np.isfinite(flight.baro_alt_m)
+    time_s = flight.time_s[new]
+    pressure_pa = pressure_at(flight.baro_alt_m[new], SEA_LEVEL_PA)
+    degc = np.full(len(time_s), TEMPERATURE_DEGC)
+    return pack_baro((time_s, _on_clock(clock, time_s), pressure_pa, degc))
+
+
+def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
+    size = len(flight.gps_time_s)
+    valid_s = flight.gps_time_s - flight.gps_latency_s
+    unix_us = start_unix_us + np.rint(valid_s * 1e6).astype(np.int64)
+    has_height = np.isfinite(flight.gps_alt_m)
+    has_velocity = _complete(flight.gps_vel_n_mps)
+    vel = np.where(has_velocity[:, np.newaxis], flight.gps_vel_n_mps, 0.0)
+    ground_mps = np.maximum(np.hypot(vel[:, 0], vel[:, 1]), 1e-3)
+    speed_acc_mps = np.where(has_velocity, SPEED_ACC_MPS, UNKNOWN)
+    return GpsSamples(
+        time_s=flight.gps_time_s,
+        valid_time_s=valid_s,
+        itow_ms=(unix_us - GPS_EPOCH_UNIX_US + LEAP_US) // 1000 % WEEK_MS,
+        unix_us=unix_us,
+        time_valid=np.ones(size, dtype=np.bool_),
+        has_fix=np.ones(size, dtype=np.bool_),
+        satellites=np.full(size, SATELLITES),
+        lat_deg=flight.gps_lat_deg,
+        lon_deg=flight.gps_lon_deg,
+        alt_amsl_m=np.where(has_height, flight.gps_alt_m, 0.0),
+        vel_n_mps=vel,
+        h_acc_m=np.full(size, H_ACC_M),
+        v_acc_m=np.where(has_height, V_ACC_M, UNKNOWN),
+        speed_acc_mps=speed_acc_mps,
+        course_acc_deg=np.minimum(np.degrees(speed_acc_mps / ground_mps), 180.0),
+        pdop=np.full(size, PDOP),
+    )
+
+
+def _complete(vectors: FloatArray) -> BoolArray:
+    """Tell which rows have no NaN."""
+    return np.asarray(np.isfinite(vectors).all(axis=1))
+
+
+def _on_clock(clock: DeviceClock, time_s: FloatArray) -> IntArray:
+    return np.array([clock.at(t) for t in time_s.tolist()], dtype=np.int64)

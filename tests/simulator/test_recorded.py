@@ -1,0 +1,201 @@
+"""A recording comes out of the wire as it went in, at its own times."""
+
+import numpy as np
+import pytest
+
+from gateway.edges.flight_file import read_flight
+from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
+from gateway.simulator.recorded import RecordedFlight, replay
+from gateway.simulator.settings import SimulatorSettings
+from gateway.wire.link import Link
+
+ROWS = 500
+RATE_HZ = 50.0
+QUIET = SimulatorSettings(radio_loss=0.0, radio_duplicates=0.0, vehicle_id=4)
+
+
+def columns(**changes: np.ndarray | None) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(7)
+    time_s = 100.0 + np.arange(ROWS) / RATE_HZ
+    new_mag = np.arange(ROWS) % 5 == 2
+    new_gps = np.arange(ROWS) % 10 == 9
+
+    def only(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return np.where(rows, values, np.nan)
+
+    table = {
+        "time_s": time_s,
+        **{name: rng.normal(0.0, 3.0, ROWS) for name in ("ax", "ay", "gx", "gy", "gz")},
+        "az": rng.normal(-9.8, 3.0, ROWS),
+        **{name: only(new_mag, rng.normal(0.0, 30.0, ROWS)) for name in ("mx", "my", "mz")},
+        "baro_alt_m": only(new_mag, rng.normal(200.0, 5.0, ROWS)),
+        "gps_time_s": only(new_gps, time_s - 0.004),
+        "gps_lat": only(new_gps, rng.normal(47.0, 0.001, ROWS)),
+        "gps_lon": only(new_gps, rng.normal(8.0, 0.001, ROWS)),
+        "gps_alt_m": only(new_gps, rng.normal(500.0, 3.0, ROWS)),
+        **{f"gps_v{axis}": only(new_gps, rng.normal(0.0, 9.0, ROWS)) for axis in "ned"},
+    }
+    table |= {name: values for name, values in changes.items() if values is not None}
+    return {
+        name: v for name, v in table.items() if name not in changes or changes[name] is not None
+    }
+
+
+def fly(flight: RecordedFlight, settings: SimulatorSettings = QUIET) -> list[RawRecord]:
+    link = Link()
+    return [
+        record
+        for frame in replay(settings, flight).frames(flight.duration_s)
+        for record in link.feed(frame.data, round(frame.time_s * 1e6))
+    ]
+
+
+@pytest.fixture(scope="module")
+def flight() -> RecordedFlight:
+    return RecordedFlight.from_columns(columns())
+
+
+@pytest.fixture(scope="module")
+def records(flight: RecordedFlight) -> list[RawRecord]:
+    return fly(flight)
+
+
+class TestThroughTheWire:
+    def test_inertial_samples(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
+        imu = [r for r in records if isinstance(r, ImuRaw)]
+        assert len(imu) == ROWS
+        accel_scale = imu[0].accel_range_g * 9.80665 / 32768
+        lsb_per_dps = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}[imu[0].gyro_range_dps]
+        accel = np.array([r.accel_raw for r in imu]) * accel_scale * (1, -1, -1)
+        gyro = np.radians(np.array([r.gyro_raw for r in imu]) / lsb_per_dps) * (1, -1, -1)
+        np.testing.assert_allclose(accel, flight.accel_b_mps2, atol=0.51 * accel_scale)
+        half_count = np.radians(0.51 / lsb_per_dps)
+        np.testing.assert_allclose(gyro, flight.gyro_b_radps, atol=half_count)
+
+    def test_magnetometer_is_held_until_new(
+        self, flight: RecordedFlight, records: list[RawRecord]
+    ) -> None:
+        imu = [r for r in records if isinstance(r, ImuRaw)]
+        new = np.array([bool(r.flags & ImuFlags.MAG_NEW) for r in imu])
+        np.testing.assert_array_equal(new, np.isfinite(flight.mag_b_ut[:, 0]))
+        scale = 100.0 / imu[0].mag_lsb_per_gauss
+        field = np.array([r.mag_raw for r in imu]) * scale * (1, -1, -1)
+        np.testing.assert_allclose(field[new], flight.mag_b_ut[new], atol=0.51 * scale)
+        np.testing.assert_array_equal(field[3:7], np.tile(field[2], (4, 1)))
+
+    def test_barometer_gives_its_height_back(
+        self, flight: RecordedFlight, records: list[RawRecord]
+    ) -> None:
+        pressures = np.array([r.pressure_pa for r in records if isinstance(r, BaroRaw)])
+        heights = (1.0 - (pressures / 101_325.0) ** (1.0 / 5.255876)) * 288.15 / 0.0065
+        recorded = flight.baro_alt_m[np.isfinite(flight.baro_alt_m)]
+        np.testing.assert_allclose(heights, recorded, atol=0.002)
+
+    def test_fixes(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
+        fixes = [r for r in records if isinstance(r, GpsFix)]
+        lat = [r.lat_dege7 * 1e-7 for r in fixes]
+        np.testing.assert_allclose(lat, flight.gps_lat_deg, atol=1e-7)
+        np.testing.assert_allclose([r.alt_amsl_m for r in fixes], flight.gps_alt_m, atol=1e-3)
+        vel = [r.vel_n_mps for r in fixes]
+        np.testing.assert_allclose(vel, flight.gps_vel_n_mps, atol=0.006)
+        assert all(r.fix_ok and r.h_acc_m == 2.0 and r.speed_acc_mps == 0.3 for r in fixes)
+        assert all(r.node.vehicle_id == 4 for r in fixes)
+
+    def test_times_are_those_of_the_recording(
+        self, flight: RecordedFlight, records: list[RawRecord]
+    ) -> None:
+        for kind, recorded_s in ((ImuRaw, flight.time_s), (GpsFix, flight.gps_time_s)):
+            heard_s = np.array([r.time_us for r in records if isinstance(r, kind)]) * 1e-6
+            late_s = heard_s - recorded_s
+            assert late_s.min() >= 0.0
+            assert late_s.max() < 0.02
+            # Once the clocks are learned: one and the same delay of reading, radio and line.
+            assert np.ptp(late_s[recorded_s > 5.0]) < 0.0001
+
+    def test_status_tells_the_rate(self, records: list[RawRecord]) -> None:
+        status = [r for r in records if isinstance(r, NodeStatus)]
+        rates = {r.node.node_id: (r.sample_rate_hz, r.sensors_present) for r in status}
+        assert rates == {0: (50, 0b0111), 1: (5, 0b1000)}
+
+
+class TestRanges:
+    @pytest.mark.parametrize(
+        ("peak_mps2", "range_g"), [(15.0, 2), (25.0, 4), (60.0, 8), (150.0, 16), (900.0, 16)]
+    )
+    def test_finest_that_holds(self, peak_mps2: float, range_g: int) -> None:
+        calm = np.zeros(ROWS)
+        ax = calm.copy()
+        ax[10] = -peak_mps2
+        found = fly(RecordedFlight.from_columns(columns(ax=ax, ay=calm, az=calm - 9.8)))
+        imu = [r for r in found if isinstance(r, ImuRaw)]
+        assert imu[0].accel_range_g == range_g
+        clipped = [bool(r.flags & ImuFlags.ACCEL_CLIPPED) for r in imu]
+        assert clipped == [k == 10 and peak_mps2 == 900.0 for k in range(ROWS)]
+
+    def test_absent_sensors_are_told(self) -> None:
+        bare = {name: values for name, values in columns().items() if name[0] in "tag" and
+                not name.startswith("gps")}  # fmt: skip
+        found = fly(RecordedFlight.from_columns(bare))
+        assert not any(isinstance(r, GpsFix | BaroRaw) for r in found)
+        imu = [r for r in found if isinstance(r, ImuRaw)]
+        assert imu[0].flags == ImuFlags.MAG_ABSENT | ImuFlags.BARO_ABSENT
+        assert next(r for r in found if isinstance(r, NodeStatus)).sensors_present == 1
+
+
+class TestGpsGaps:
+    def test_velocity_from_speed_and_course(self) -> None:
+        speed, course = np.full(ROWS, 10.0), np.full(ROWS, 90.0)
+        table = columns(
+            gps_vn=None, gps_ve=None, gps_vd=None, gps_speed_ms=speed, gps_course_deg=course
+        )
+        fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
+        assert fixes[0].vel_n_mps == pytest.approx((0.0, 10.0, 0.0))
+
+    def test_what_is_missing_is_told_as_unknown(self) -> None:
+        table = columns(gps_vn=None, gps_alt_m=None)
+        fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
+        assert np.isnan(fixes[0].speed_acc_mps)
+        assert np.isnan(fixes[0].v_acc_m)
+        assert fixes[0].h_acc_m == 2.0
+
+    def test_fixes_from_before_the_start_are_left_out(self) -> None:
+        early = columns()["gps_time_s"] - 5.0
+        assert len(RecordedFlight.from_columns(columns(gps_time_s=early)).gps_time_s) == 25
+
+
+class TestRefusals:
+    def test_missing_columns(self) -> None:
+        with pytest.raises(ValueError, match="columns missing: ay, gz"):
+            RecordedFlight.from_columns(columns(ay=None, gz=None))
+
+    def test_time_that_goes_back(self) -> None:
+        time_s = columns()["time_s"]
+        time_s[20] = time_s[18]
+        with pytest.raises(ValueError, match=r"goes back at 100\.36 s"):
+            RecordedFlight.from_columns(columns(time_s=time_s))
+
+    def test_too_short(self) -> None:
+        with pytest.raises(ValueError, match="0 rows"):
+            RecordedFlight.from_columns(columns(ax=np.full(ROWS, NAN)))
+
+    def test_rows_without_samples_are_skipped(self) -> None:
+        ax = columns()["ax"]
+        ax[5] = NAN
+        assert len(RecordedFlight.from_columns(columns(ax=ax)).time_s) == ROWS - 1
+
+
+@pytest.mark.io
+def test_real_flight_comes_through(data_dir) -> None:  # type: ignore[no-untyped-def]
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    assert flight.gps_latency_s == 0.28
+    link, fixes = Link(), []
+    for frame in replay(QUIET, flight).frames(60.0):
+        found = link.feed(frame.data, round(frame.time_s * 1e6))
+        fixes += [record for record in found if isinstance(record, GpsFix)]
+    lon = np.array([fix.lon_dege7 * 1e-7 for fix in fixes])
+    np.testing.assert_allclose(lon, flight.gps_lon_deg[: len(lon)], atol=1e-7)
+    late_s = np.array([fix.time_us for fix in fixes]) * 1e-6 - flight.gps_time_s[: len(lon)]
+    assert 0.0 < late_s.min() < late_s.max() < 0.03
+    report = link.report(0, connected=True, port="")
+    assert report.faults == ()
+    assert report.nodes[0].lost == 0
