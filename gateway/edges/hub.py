@@ -3,7 +3,6 @@
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 from gateway.edges.hub_express import Express
@@ -14,12 +13,13 @@ from gateway.edges.hub_stream import TcpLink, TcpListener
 from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, HubCounters
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import LoopGuard, Origin, RoutingTable
+from gateway.routing.trouble import TroubleWatch
 from gateway.routing.vehicles import GREETING, HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
@@ -51,22 +51,6 @@ LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener]]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class HubCounters:
-    """What the hub as a whole has seen since it started."""
-
-    published: int
-    """Frames of ours."""
-    forwarded: int
-    """Frames of other systems that were passed on."""
-    duplicates: int
-    """Copies that came a second way."""
-    looped: int
-    """Frames of ours that came back."""
-    unroutable: int
-    """Frames for a system that nobody has heard, or from one who may not."""
-
-
 class Hub:
     """Send MAVLink to many clients, take theirs, and pass between them what concerns them.
 
@@ -80,6 +64,10 @@ class Hub:
         The gateway clock.
     on_foreign : callable, optional
         Called with every frame of another system, once, byte for byte, as for a recorder.
+    on_gone : callable, optional
+        Called with the id of a client that has gone for good.
+    on_trouble : callable, optional
+        Called with a short text when clients come into trouble or out of it.
     """
 
     def __init__(
@@ -88,11 +76,16 @@ class Hub:
         on_frame: Callable[[Incoming], None],
         now_us: Callable[[], int],
         on_foreign: Callable[[bytes], None] | None = None,
+        on_gone: Callable[[int], None] | None = None,
+        on_trouble: Callable[[str], None] | None = None,
     ) -> None:
         self.settings = settings
         self.now_us = now_us
         self._on_frame = on_frame
         self._on_foreign = on_foreign
+        self._on_gone = on_gone
+        self._on_trouble = on_trouble
+        self._trouble = TroubleWatch()
         self._fanout = Fanout()
         self._table = RoutingTable()
         self._guard = LoopGuard()
@@ -291,6 +284,8 @@ class Hub:
         self._table.forget(link.client_id)
         if self._links.pop(link.client_id, None):
             log.info("client %s has gone: %s", link.client_id, link.remote)
+            if self._on_gone is not None:
+                self._on_gone(link.client_id)
         link.close()
 
     def _route_addressed(self, link: Link, frame: bytes, now_us: int) -> None:
@@ -354,11 +349,18 @@ class Hub:
                 endpoint.tick(now_us)
         for link in list(self._links.values()):
             link.tick(now_us)
+        self._tell_trouble(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         if interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
             self._ask_round_trips(now_us)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _tell_trouble(self, now_us: int) -> None:
+        for text in self._trouble.update(self.clients(), now_us):
+            log.warning("%s", text)
+            if self._on_trouble is not None:
+                self._on_trouble(text)
 
     def _ask_round_trips(self, now_us: int) -> None:
         """Ask every client that speaks; one that does not listens to nothing but telemetry."""
