@@ -20,6 +20,7 @@ class TroubleWatch:
         self._away_since_us: dict[int, int] = {}
         self._away_told: set[int] = set()
         self._dropped: dict[int, int] = {}
+        """Drops at the last look, of clients that were open then."""
         self._slow_until_us: dict[int, int] = {}
 
     def update(self, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
@@ -60,8 +61,9 @@ class TroubleWatch:
 
     def _slow(self, client: ClientStats, now_us: int) -> list[str]:
         key = client.client_id
-        before = self._dropped.setdefault(key, client.dropped)
-        self._dropped[key] = client.dropped
+        before = self._dropped.pop(key, client.dropped)
+        if client.state == "open":
+            self._dropped[key] = client.dropped
         if client.dropped == before or client.state != "open":
             if self._slow_until_us.get(key, now_us + 1) <= now_us:
                 del self._slow_until_us[key]

@@ -63,10 +63,18 @@ def test_drops_are_told_once_until_they_have_ceased() -> None:
     assert len(watch.update(client(dropped=91), 60 * S)) == 1
 
 
+def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
+    watch = TroubleWatch()
+    watch.update(client(state="unreachable", dropped=10), 0)
+    assert watch.update(client(dropped=20), S) == []
+    assert watch.update(client(dropped=20), 2 * S) == []
+
+
 def test_a_client_that_left_is_forgotten() -> None:
     watch = TroubleWatch()
     for n in range(10):
         watch.update(client(state="unreachable", dropped=n), n * S)
+        watch.update(client(dropped=n), n * S)
     assert watch.update((), 11 * S) == []
     assert not watch._away_told
     assert not watch._dropped
