@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gateway.records import LinkReport, NavState
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, HubCounters
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,3 +17,4 @@ class Snapshot:
     clients: tuple[ClientStats, ...]
     sent: tuple[tuple[int, int], ...]
     """MAVLink message id and how many were sent since the start."""
+    hub: HubCounters = HubCounters()

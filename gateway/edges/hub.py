@@ -3,9 +3,9 @@
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
+from gateway.edges.hub_express import Express
 from gateway.edges.hub_group import GroupLink
 from gateway.edges.hub_link import Link, Listener
 from gateway.edges.hub_serial import SerialLink
@@ -13,18 +13,28 @@ from gateway.edges.hub_stream import TcpLink, TcpListener
 from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, HubCounters
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import LoopGuard, Origin, RoutingTable
+from gateway.routing.trouble import TroubleWatch
 from gateway.routing.vehicles import GREETING, HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of, target_of
+from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_splitter import (
+    is_station_heartbeat,
+    key_of,
+    message_id_of,
+    origin_of,
+    target_of,
+)
 
 log = logging.getLogger(__name__)
 
+MAX_EXPRESS: Final = 1024
+"""Kinds of frame a client; beyond a few hundred they are forged."""
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
 
@@ -41,22 +51,6 @@ LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener]]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class HubCounters:
-    """What the hub as a whole has seen since it started."""
-
-    published: int
-    """Frames of ours."""
-    forwarded: int
-    """Frames of other systems that were passed on."""
-    duplicates: int
-    """Copies that came a second way."""
-    looped: int
-    """Frames of ours that came back."""
-    unroutable: int
-    """Frames for a system that nobody has heard, or from one who may not."""
-
-
 class Hub:
     """Send MAVLink to many clients, take theirs, and pass between them what concerns them.
 
@@ -65,11 +59,15 @@ class Hub:
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame for our vehicles, and every broadcast.
+        Called with every frame for our vehicles, every request to all, and every heartbeat.
     now_us : callable
         The gateway clock.
     on_foreign : callable, optional
         Called with every frame of another system, once, byte for byte, as for a recorder.
+    on_gone : callable, optional
+        Called with the id of a client that has gone for good.
+    on_trouble : callable, optional
+        Called with a short text when clients come into trouble or out of it.
     """
 
     def __init__(
@@ -78,11 +76,16 @@ class Hub:
         on_frame: Callable[[Incoming], None],
         now_us: Callable[[], int],
         on_foreign: Callable[[bytes], None] | None = None,
+        on_gone: Callable[[int], None] | None = None,
+        on_trouble: Callable[[str], None] | None = None,
     ) -> None:
         self.settings = settings
         self.now_us = now_us
         self._on_frame = on_frame
         self._on_foreign = on_foreign
+        self._on_gone = on_gone
+        self._on_trouble = on_trouble
+        self._trouble = TroubleWatch()
         self._fanout = Fanout()
         self._table = RoutingTable()
         self._guard = LoopGuard()
@@ -119,13 +122,15 @@ class Hub:
         if outgoing.client_id is not None:
             self._fanout.answer(frame, outgoing.client_id)
             return
-        if outgoing.message_id in GREETING:
-            self._vehicles.note(frame, outgoing.message_id, self.now_us())
+        greets = outgoing.message_id in GREETING
+        if greets and self._vehicles.note(frame, outgoing.message_id, self.now_us()):
+            self._forget_express()
         self._fanout.publish(frame, self.now_us())
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
         self._fanout.set_interval(wish)
+        self._forget_express()
 
     def add(self, url: str) -> None:
         """Open one more endpoint.
@@ -188,6 +193,7 @@ class Hub:
 
     def clients(self) -> tuple[ClientStats, ...]:
         """Describe every client at this moment, in the order of their ids."""
+        self._settle_express()
         return tuple(
             self._links[key].stats(self._table.origins(key)) for key in sorted(self._links)
         )
@@ -198,6 +204,7 @@ class Hub:
 
     def counters(self) -> HubCounters:
         """Return the totals since the start."""
+        self._settle_express()
         return HubCounters(
             published=self._published,
             forwarded=self._forwarded,
@@ -221,14 +228,24 @@ class Hub:
         """Tell whether a system and component is one of our vehicles."""
         return self._vehicles.is_own(origin, self.now_us())
 
-    def deliver(self, link: Link, frame: bytes) -> None:
+    def deliver(self, link: Link, frame: bytes, now_us: int) -> None:
         """Take one frame that a link received, and pass it on to whom it concerns."""
+        express = link.express.get(key_of(frame))
+        if express is None:
+            self._judge(link, frame, now_us)
+            return
+        express.send(frame)
+        if self._on_foreign is not None:
+            self._on_foreign(frame)
+
+    def _judge(self, link: Link, frame: bytes, now_us: int) -> None:
+        """Find out what a frame is, and whether it has been here before."""
         origin = origin_of(frame)
-        if self.is_own(origin):
+        if self._vehicles.is_own(origin, now_us):
             self._looped += 1
             return
-        now_us = self.now_us()
-        self._table.hear(link.client_id, origin, now_us)
+        if self._table.hear(link.client_id, origin, now_us):
+            self._forget_express()
         message_id = message_id_of(frame)
         if message_id == HEARTBEAT_ID:
             self._table.note_kind(origin, is_station=is_station_heartbeat(frame))
@@ -236,15 +253,19 @@ class Hub:
         if round_trip_us is not None:
             link.round_trip_us = round_trip_us
             return
-        if self._guard.is_copy(frame, link.client_id, now_us):
+        shared = self._table.is_shared(origin, now_us)
+        if shared and self._guard.is_copy(frame, link.client_id, now_us):
             self._duplicates += 1
-            return
-        self._route(link, frame, now_us)
+        elif target_of(frame)[0]:
+            self._route_addressed(link, frame, now_us)
+        else:
+            self._route_broadcast(link, frame, now_us)
 
     def appear(self, link: Link) -> None:
         """Let a link take part."""
         self._links[link.client_id] = link
         self._fanout.add(link.client_id, link.transmit, link.endpoint)
+        self._forget_express()
         log.info("client %s: %s", link.client_id, link.remote)
 
     def greet(self, link: Link) -> None:
@@ -254,38 +275,65 @@ class Hub:
     def reconfigure(self, link: Link) -> None:
         """Let a link's changed lists and rates hold from the next frame on."""
         self._fanout.reconfigure(link.client_id, link.endpoint)
+        self._forget_express()
 
     def vanish(self, link: Link) -> None:
         """Close a link and forget it."""
         self._fanout.remove(link.client_id)
+        self._forget_express()
         self._table.forget(link.client_id)
         if self._links.pop(link.client_id, None):
             log.info("client %s has gone: %s", link.client_id, link.remote)
+            if self._on_gone is not None:
+                self._on_gone(link.client_id)
         link.close()
 
-    def _route(self, link: Link, frame: bytes, now_us: int) -> None:
+    def _route_addressed(self, link: Link, frame: bytes, now_us: int) -> None:
         target = target_of(frame)
         ours = target[0] in self._vehicles.systems(now_us)
-        if ours or not target[0]:
+        if ours:
+            self._on_frame(Incoming(link.client_id, frame, link.trusted))
+        ways = self._table.ways_to(target, link.client_id, now_us) if link.trusted else []
+        if ways:
+            self._tap(frame)
+            self._fanout.deliver(frame, ways)
+        elif not ours:
+            self._unroutable += 1
+
+    def _route_broadcast(self, link: Link, frame: bytes, now_us: int) -> None:
+        message_id = message_id_of(frame)
+        from_station = self._table.is_station(origin_of(frame))
+        telemetry = message_id != HEARTBEAT_ID and message_id not in TARGET_OFFSETS
+        if from_station or not telemetry:
             self._on_frame(Incoming(link.client_id, frame, link.trusted))
         if not link.trusted:
-            self._unroutable += not ours and target[0] != 0
             return
+        self._tap(frame)
+        if from_station:
+            self._fanout.deliver(frame, self._table.ways_to_vehicles(link.client_id))
+            return
+        self._fanout.forward(frame, link.client_id, now_us)
+        if telemetry and not self._table.is_shared(origin_of(frame), now_us):
+            takers = self._fanout.takers(frame, link.client_id)
+            if takers is not None and len(link.express) < MAX_EXPRESS:
+                links = [self._links[taker] for taker in takers]
+                link.express[key_of(frame)] = Express(message_id, links)
+
+    def _tap(self, frame: bytes) -> None:
+        self._forwarded += 1
         if self._on_foreign is not None:
             self._on_foreign(frame)
-        if target[0]:
-            ways = self._table.ways_to(target, link.client_id, now_us)
-        elif self._table.is_station(origin_of(frame)):
-            ways = self._table.ways_to_vehicles(link.client_id)
-        else:
-            self._forwarded += 1
-            self._fanout.forward(frame, link.client_id, now_us)
-            return
-        if ways:
-            self._forwarded += 1
-            self._fanout.deliver(frame, ways)
-        elif target[0] and not ours:
-            self._unroutable += 1
+
+    def _forget_express(self) -> None:
+        """Judge every frame anew: somebody came, went or changed."""
+        self._settle_express()
+        for link in self._links.values():
+            link.express.clear()
+
+    def _settle_express(self) -> None:
+        for link in self._links.values():
+            for express in link.express.values():
+                self._forwarded += express.settle()
 
     def _welcome(self, frame: bytes) -> None:
         clients, greeting = self._vehicles.greet(frame)
@@ -301,11 +349,18 @@ class Hub:
                 endpoint.tick(now_us)
         for link in list(self._links.values()):
             link.tick(now_us)
+        self._tell_trouble(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         if interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
             self._ask_round_trips(now_us)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _tell_trouble(self, now_us: int) -> None:
+        for text in self._trouble.update(self.clients(), now_us):
+            log.warning("%s", text)
+            if self._on_trouble is not None:
+                self._on_trouble(text)
 
     def _ask_round_trips(self, now_us: int) -> None:
         """Ask every client that speaks; one that does not listens to nothing but telemetry."""

@@ -87,7 +87,7 @@ class GroupLink(DatagramLink):
             except OSError:
                 return
             if address[:2] != self._own_address:
-                self.accept(data)
+                self.accept(data, self.context.now_us())
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> str:

@@ -2,9 +2,11 @@
 
 import asyncio
 import ipaddress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
+from gateway.edges.hub_express import Express
 from gateway.routing.clients import ClientStats
 from gateway.routing.endpoint import Endpoint, EndpointKind
 from gateway.routing.settings import HubSettings
@@ -20,6 +22,14 @@ OPEN_TO_ALL: Final = frozenset(
     }
 )
 """Kinds whose peers nobody has named."""
+
+
+Write = Callable[[bytes], object]
+
+
+def not_open(data: bytes) -> int:
+    """Stand in for the write function of a socket that is not open."""
+    raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
 
 
 @dataclass(slots=True)
@@ -49,6 +59,10 @@ class Link:
     heard_us: int | None = None
     round_trip_us: int | None = None
     counters: LinkCounters = field(default_factory=LinkCounters)
+    express: dict[bytes, Express] = field(default_factory=dict)
+    """The hub's short ways for frames from here, by `key_of`."""
+    write: Write = field(default=not_open)
+    """Sends one datagram at once or raises OSError; only of a link that is direct."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
 
     def __post_init__(self) -> None:
@@ -76,21 +90,30 @@ class Link:
         """Do what is due a few times a second: connect again, expire."""
 
     @property
+    def is_direct(self) -> bool:
+        """Whether a frame may go to `write` without further ado."""
+        return False
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Judge a failed `write` that will be counted as sent all the same."""
+        raise NotImplementedError
+
+    @property
     def queued(self) -> int:
         """Frames that wait for a slow link."""
         return 0
 
-    def receive(self, events: list[bytes | SplitFault], size: int) -> None:
+    def receive(self, events: list[bytes | SplitFault], size: int, now_us: int) -> None:
         """Count what came in and pass the frames on."""
-        counters, context = self.counters, self.context
+        counters = self.counters
         counters.bytes_received += size
         for event in events:
             if isinstance(event, SplitFault):
                 counters.bytes_garbage += event.size
             else:
                 counters.received += 1
-                self.heard_us = context.now_us()
-                context.deliver(self, event)
+                self.heard_us = now_us
+                self.context.deliver(self, event, now_us)
 
     def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
         """Describe the link at this moment; the hub knows which systems are behind it."""
@@ -132,7 +155,7 @@ class HubContext(Protocol):
     def is_own(self, origin: Origin) -> bool:
         """Tell whether a system and component is one of our vehicles."""
 
-    def deliver(self, link: Link, frame: bytes) -> None:
+    def deliver(self, link: Link, frame: bytes, now_us: int) -> None:
         """Take one received frame."""
 
     def appear(self, link: Link) -> None:

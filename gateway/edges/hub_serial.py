@@ -151,6 +151,6 @@ class SerialLink(Link):
             self._broke(error)
             return
         if data:
-            self.receive(self._splitter.feed(data), len(data))
+            self.receive(self._splitter.feed(data), len(data), self.context.now_us())
         else:
             self._broke(OSError("the device hung up"))

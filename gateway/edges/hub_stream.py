@@ -138,7 +138,7 @@ class StreamLink(Link):
             if not data:
                 self.broke()
                 return
-            self.receive(self._splitter.feed(data), len(data))
+            self.receive(self._splitter.feed(data), len(data), self.context.now_us())
             if self._socket is not sock:
                 return
 

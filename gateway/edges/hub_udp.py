@@ -8,14 +8,13 @@ behind a slow interface from filling everybody's.
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Callable
 from typing import Final
 
-from gateway.edges.hub_link import HubContext, Link
+from gateway.edges.hub_link import HubContext, Link, Write, not_open
 from gateway.routing.endpoint import Endpoint
 from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import split_datagram
+from gateway.wire.mavlink_splitter import is_frame, split_datagram
 
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
@@ -28,12 +27,6 @@ BACKLOG_DATAGRAMS: Final = 256
 """Waiting behind a full socket buffer; what is older is of no use to a ground station."""
 PACK_DELAY_S: Final = 0.02
 """How long a packed frame waits for company: one frame of the fastest stream."""
-
-Write = Callable[[bytes], object]
-
-
-def _not_open(data: bytes) -> int:
-    raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
 
 
 class DatagramLink(Link):
@@ -61,11 +54,15 @@ class DatagramLink(Link):
         super().__init__(client_id, endpoint, remote, context, name, state="resolving")
         self.refused_us: int | None = None
         self._socket: socket.socket | None = None
-        self._write: Write = _not_open
-        self._direct: Write = _not_open
+        self._direct: Write = not_open
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
         self._packer = Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
         self._flush_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether a frame may go to `write` without further ado."""
+        return self._packer is None
 
     @property
     def queued(self) -> int:
@@ -78,7 +75,7 @@ class DatagramLink(Link):
             self._pack(frame)
             return
         try:
-            self._write(frame)
+            self.write(frame)
         except OSError as error:
             self._recover(frame, 1, error)
             return
@@ -88,7 +85,7 @@ class DatagramLink(Link):
 
     def close(self) -> None:
         """Close the socket."""
-        self._write = _not_open
+        self.write = not_open
         self.counters.dropped += len(self._backlog)
         self._backlog.clear()
         if self._flush_timer is not None:
@@ -109,16 +106,28 @@ class DatagramLink(Link):
     def adopt(self, sock: socket.socket, write: Write) -> None:
         """Use an open socket from now on."""
         self._socket = sock
-        self._write = self._direct = write
+        self.write = self._direct = write
         self.state = "open"
         self.refused_us = None
         self.loop.add_reader(sock, self._on_readable, sock)
 
-    def accept(self, data: bytes) -> None:
+    def accept(self, data: bytes, now_us: int) -> None:
         """Take one datagram that this peer sent."""
         self.state = "open"
         self.refused_us = None
-        self.receive(split_datagram(data), len(data))
+        if is_frame(data):
+            counters = self.counters
+            counters.received += 1
+            counters.bytes_received += len(data)
+            self.heard_us = now_us
+            self.context.deliver(self, data, now_us)
+        else:
+            self.receive(split_datagram(data), len(data), now_us)
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Judge a failed send that will be counted as sent all the same."""
+        self._count_sent(-1, -len(data))
+        self._recover(data, 1, error)
 
     def _pack(self, frame: bytes) -> None:
         assert self._packer is not None
@@ -136,26 +145,26 @@ class DatagramLink(Link):
             return
         data = b"".join(frames)
         try:
-            self._write(data)
+            self.write(data)
         except OSError as error:
             self._recover(data, len(frames), error)
             return
-        self._count_sent(data, len(frames))
+        self._count_sent(len(frames), len(data))
 
-    def _count_sent(self, data: bytes, frames: int) -> None:
+    def _count_sent(self, frames: int, size: int) -> None:
         self.counters.sent += frames
-        self.counters.bytes_sent += len(data)
+        self.counters.bytes_sent += size
 
     def _recover(self, data: bytes, frames: int, error: OSError) -> None:
         """Judge a failed send: wait for room, try again, or give the frames up."""
         if isinstance(error, BlockingIOError) and self._socket is not None:
-            self._write = self._wait
+            self.write = self._wait
             self.loop.add_writer(self._socket, self._on_writable, self._socket)
             self._wait(data)
-            self._count_sent(data, frames)
+            self._count_sent(frames, len(data))
             return
         if isinstance(error, ConnectionRefusedError) and self._sends_after_refusal(data):
-            self._count_sent(data, frames)
+            self._count_sent(frames, len(data))
             return
         if self._socket is not None and not isinstance(error, ConnectionRefusedError):
             self.state = "unreachable"
@@ -165,7 +174,7 @@ class DatagramLink(Link):
         """Send again: a refusal that is told now belongs to an earlier datagram."""
         self._note_refusal()
         try:
-            self._write(data)
+            self.write(data)
         except OSError:
             return False
         return True
@@ -192,9 +201,10 @@ class DatagramLink(Link):
                 self.counters.sent -= 1
             self._backlog.popleft()
         self.loop.remove_writer(sock)
-        self._write = self._direct
+        self.write = self._direct
 
     def _on_readable(self, sock: socket.socket) -> None:
+        now_us = self.context.now_us()
         for _ in range(READ_BUDGET):
             try:
                 data = sock.recv(MAX_DATAGRAM)
@@ -206,7 +216,7 @@ class DatagramLink(Link):
             except OSError:
                 self.state = "unreachable"
                 return
-            self.accept(data)
+            self.accept(data, now_us)
             if self._socket is not sock:
                 return
 

@@ -128,7 +128,7 @@ class UdpListener:
         if presence is None:
             presence = self._admit(data, address, local_host)
         if presence is not None:
-            self._links[presence.client_id].accept(data)
+            self._links[presence.client_id].accept(data, self._context.now_us())
 
     def _admit(self, data: bytes, address: Address, local_host: str) -> Presence | None:
         """Take in a new client if what it says is MAVLink and there is room."""

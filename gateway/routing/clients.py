@@ -45,6 +45,22 @@ class ClientStats:
     round_trip_us: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class HubCounters:
+    """What the hub as a whole has seen since it started."""
+
+    published: int = 0
+    """Frames of ours."""
+    forwarded: int = 0
+    """Frames of other systems that were passed on."""
+    duplicates: int = 0
+    """Copies that came a second way."""
+    looped: int = 0
+    """Frames of ours that came back."""
+    unroutable: int = 0
+    """Frames for a system that nobody has heard, or from one who may not."""
+
+
 @dataclass(slots=True)
 class Presence:
     """A client of a listening port."""

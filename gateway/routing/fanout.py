@@ -153,6 +153,13 @@ class Fanout:
             if lane.client_id != source_id and lane.is_due(now_us):
                 lane.transmit(frame, plan.message_id)
 
+    def takers(self, frame: bytes, source_id: int) -> list[int] | None:
+        """Return who gets all frames like this one from a source; None if that varies."""
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        if plan.limited:
+            return None
+        return [lane.client_id for lane in plan.open if lane.client_id != source_id]
+
     def deliver(self, frame: bytes, client_ids: Iterable[int]) -> None:
         """Pass a frame on to some outlets, past their filters, untouched."""
         message_id = message_id_of(frame)

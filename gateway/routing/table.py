@@ -3,7 +3,8 @@
 Routing follows the MAVLink guide: a frame that names nobody goes to everybody but its sender; a
 frame that names a system goes only where that system (and component, if it was ever heard) speaks.
 Two ways to one system, or a cable that leads back, bring the same bytes twice; the second copy is
-dropped if it comes from elsewhere.
+dropped if it comes from elsewhere. Memory of frames is kept only for systems that are heard by more
+than one way; the very first copy, which tells that there is another way, passes.
 
 One deviation: what a ground station says to everybody goes only where there are vehicles. Stations
 have nothing to tell each other, and scripts take the first heartbeat they hear for the vehicle's.
@@ -34,11 +35,23 @@ class RoutingTable:
         self._heard: dict[int, dict[Origin, int]] = {}
         self._stations: set[Origin] = set()
 
-    def hear(self, client_id: int, origin: Origin, now_us: int) -> None:
-        """Note that a client has brought a frame of a system."""
+    def hear(self, client_id: int, origin: Origin, now_us: int) -> bool:
+        """Note that a client has brought a frame of a system; tell whether that is news."""
         origins = self._heard.setdefault(client_id, {})
-        if origin in origins or len(origins) < MAX_ORIGINS:
+        before_us = origins.get(origin)
+        if before_us is not None or len(origins) < MAX_ORIGINS:
             origins[origin] = now_us
+        return before_us is None or now_us - before_us > ROUTE_FRESH_US
+
+    def is_shared(self, origin: Origin, now_us: int) -> bool:
+        """Tell whether a system has been heard of late by more than one way."""
+        return (
+            sum(
+                origin in origins and now_us - origins[origin] <= ROUTE_FRESH_US
+                for origins in self._heard.values()
+            )
+            > 1
+        )
 
     def note_kind(self, origin: Origin, *, is_station: bool) -> None:
         """Note what a heartbeat says of its sender."""

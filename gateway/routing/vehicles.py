@@ -31,11 +31,13 @@ class OwnVehicles:
         """Whether any newcomer waits."""
         return bool(self._newcomers)
 
-    def note(self, frame: bytes, message_id: int, now_us: int) -> None:
-        """Remember a frame of ours that belongs to the greeting."""
+    def note(self, frame: bytes, message_id: int, now_us: int) -> bool:
+        """Remember a frame of ours that belongs to the greeting; tell whether a vehicle is new."""
         origin = origin_of(frame)
+        is_new = not self.is_own(origin, now_us)
         self._seen_us[origin] = now_us
         self._frames.setdefault(origin, {})[message_id] = frame
+        return is_new
 
     def is_own(self, origin: Origin, now_us: int) -> bool:
         """Tell whether a system and component is one of our vehicles."""

@@ -37,6 +37,11 @@ TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
     message_id: (system, _offset_of(message, "target_component"))
     for message_id, message in dialect.mavlink_map.items()
     if (system := _offset_of(message, "target_system")) != NO_TARGET
+} | {
+    dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: (
+        _offset_of(dialect.MAVLink_manual_control_message, "target"),
+        NO_TARGET,
+    )
 }
 """Payload offsets of target system and target component (`NO_TARGET` if it has none)."""
 

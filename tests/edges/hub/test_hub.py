@@ -71,11 +71,15 @@ async def test_what_a_station_says_to_all_reaches_vehicles_only(world: Any) -> N
 
 async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     hub = world.world
+    echo = world.autopilot.sender.attitude()
+    world.second.say(echo)
+    assert [await world.first.receive(), await world.autopilot.receive()] == [echo, echo]
     frame = world.autopilot.sender.attitude()
     world.autopilot.say(frame)
     assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
     world.second.say(frame)
     await world.until(lambda: hub.counters().duplicates == 1)
+    assert world.first.is_silent()
     ours = world.vehicle.attitude()
     world.first.say(ours)
     await world.until(lambda: hub.counters().looped == 1)
@@ -187,3 +191,67 @@ class TestChangesAtRunTime:
         hub.add(f"udp:127.0.0.1:{station.port}")
         hub.apply(hub.settings)
         assert len(hub.endpoints()) == 1
+
+
+class TestExpress:
+    """Telemetry that comes often takes a short way; nobody may notice."""
+
+    async def test_counts_are_right_and_everybody_gets_all(self, world: Any) -> None:
+        hub = world.world
+        frames = [world.autopilot.sender.attitude() for _ in range(50)]
+        for frame in frames:
+            world.autopilot.say(frame)
+            assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+        assert hub.counters().forwarded == 50 + 3
+        by_remote = {client.remote: client for client in hub.clients()}
+        first = by_remote[f"127.0.0.1:{world.first.port}"]
+        assert (first.sent, first.dropped) == (51, 0)
+        assert by_remote[f"127.0.0.1:{world.autopilot.port}"].received == 51
+        assert world.foreign[-50:] == frames
+
+    async def test_a_refusal_on_the_way_is_counted_and_hurts_nobody(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert [(await s.receive())[7] for s in (world.first, world.second)] == [30, 30]
+        world.second.socket.close()
+        for _ in range(20):
+            frame = world.autopilot.sender.attitude()
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+        by_remote = {client.remote: client for client in hub.clients()}
+        gone = by_remote[f"127.0.0.1:{world.second.port}"]
+        assert gone.state == "refused"
+        assert gone.sent + gone.dropped == 22
+        assert by_remote[f"127.0.0.1:{world.first.port}"].dropped == 0
+
+    async def test_changes_hold_from_the_next_frame_on(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        late = world.station()
+        hub.add(f"udp:127.0.0.1:{late.port}?deny=RAW_IMU")
+        await world.until_open(hub)
+        for frame in (world.autopilot.sender.raw_imu(), world.autopilot.sender.attitude()):
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+        assert (await late.receive())[7] == 30
+        hub.reconfigure(hub._links[hub.clients()[-1].client_id])
+        hub.remove(f"udp:127.0.0.1:{late.port}")
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        assert late.is_silent()
+
+    async def test_a_second_way_ends_it(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        other = world.station(hub.listening_ports()[0])
+        other.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        for _ in range(5):
+            frame = world.autopilot.sender.attitude()
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+            other.say(frame)
+        await world.until(lambda: hub.counters().duplicates == 5)
+        assert world.first.is_silent()

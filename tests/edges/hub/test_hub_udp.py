@@ -127,8 +127,10 @@ async def test_at_most_so_many(rig: Any) -> None:
     stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
     for station in stations:
         station.say(station.sender.heartbeat())
-    stations[0].say(stations[0].sender.attitude())
     await rig.until(lambda: len(rig.incoming) == 2)
+    last = stations[0].sender.heartbeat()
+    stations[0].say(last)
+    await rig.until(lambda: rig.incoming[-1].frame == last)
     assert len(hub.clients()) == 2
 
 
@@ -225,7 +227,7 @@ async def test_a_full_socket_buffer_drops_the_oldest(rig: Any) -> None:
         room[0] -= 1
         return direct(data)
 
-    link._write = link._direct = stuffed
+    link.write = link._direct = stuffed
     frames = [rig.vehicle.attitude() for _ in range(300)]
     for frame in frames:
         hub.send(rig.out(frame))

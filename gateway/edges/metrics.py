@@ -1,0 +1,170 @@
+"""Prometheus text of the daemon's state, on a loopback port."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from gateway.routing.clients import ClientStats
+from gateway.status import Snapshot
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+REQUEST_LIMIT_S: Final = 5.0
+MAX_REQUEST_LINES: Final = 100
+
+Sample = tuple[dict[str, str], float]
+
+
+class MetricsServer:
+    """Answer every HTTP GET with the state of the moment.
+
+    Parameters
+    ----------
+    snapshot : callable
+        Describes the daemon now.
+    """
+
+    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+        self._snapshot = snapshot
+        self._server: asyncio.Server | None = None
+        self.port = 0
+        """The port that is bound, or 0."""
+
+    async def listen(self, port: int) -> None:
+        """Serve on a loopback port; 0 ends it. Another port replaces the former one."""
+        self.close()
+        if not port:
+            return
+        try:
+            self._server = await asyncio.start_server(self._serve, "127.0.0.1", port)
+        except OSError as error:
+            log.warning("no metrics: %s", error)
+            return
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+            self.port = 0
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(REQUEST_LIMIT_S):
+                request = await reader.readline()
+                for _ in range(MAX_REQUEST_LINES):
+                    if await reader.readline() in (b"\r\n", b"\n", b""):
+                        break
+                writer.write(self._respond(request))
+                await writer.drain()
+        except (OSError, TimeoutError, ValueError) as error:
+            log.debug("metrics request failed: %s", error)
+        finally:
+            writer.close()
+
+    def _respond(self, request: bytes) -> bytes:
+        words = request.split()
+        if words[:1] != [b"GET"]:
+            return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
+        body = prometheus_text(self._snapshot()).encode()
+        head = (
+            f"HTTP/1.1 200 OK\r\nContent-Type: {CONTENT_TYPE}\r\n"
+            f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+        )
+        return head.encode() + body
+
+
+def prometheus_text(snapshot: Snapshot) -> str:
+    """Write a snapshot in the Prometheus text format.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The daemon's state now.
+
+    Returns
+    -------
+    str
+        One line a sample, with help and type before each family.
+    """
+    lines: list[str] = []
+    for name, kind, meaning, samples in _families(snapshot):
+        lines += [f"# HELP mavgate_{name} {meaning}", f"# TYPE mavgate_{name} {kind}"]
+        for labels, value in samples:
+            text = ",".join(f'{key}="{_escaped(label)}"' for key, label in labels.items())
+            lines.append(f"mavgate_{name}{f'{{{text}}}' if text else ''} {value:.15g}")
+    return "\n".join(lines) + "\n"
+
+
+def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]]:
+    report, hub, now_us = snapshot.report, snapshot.hub, snapshot.time_us
+    yield "up_seconds", "counter", "Time since the start.", [({}, now_us / US_PER_S)]
+    yield "receiver_connected", "gauge", "Receiver's port is open.", [({}, report.connected)]
+    yield "receiver_frames_total", "counter", "Frames of the receiver.", [({}, report.frames)]
+    faults = [({"kind": kind}, float(count)) for kind, count in report.faults]
+    yield "receiver_faults_total", "counter", "Damaged bytes on the line, by kind.", faults
+    for field, kind, meaning in (
+        ("received", "counter", "Radio payloads of a node."),
+        ("lost", "counter", "Radio payloads of a node that never came."),
+        ("rate_hz", "gauge", "Radio payloads of a node a second."),
+    ):
+        suffix = "_total" if kind == "counter" else ""
+        nodes: list[Sample] = [
+            (
+                {"vehicle": str(node.node.vehicle_id), "node": str(node.node.node_id)},
+                float(getattr(node, field)),
+            )
+            for node in report.nodes
+        ]
+        yield f"node_{field}{suffix}", kind, meaning, nodes
+    for field in ("published", "forwarded", "duplicates", "looped", "unroutable"):
+        yield f"hub_{field}_total", "counter", f"Frames {field}.", [({}, getattr(hub, field))]
+    yield from _client_families(snapshot.clients, now_us)
+
+
+def _client_families(
+    clients: tuple[ClientStats, ...], now_us: int
+) -> Iterator[tuple[str, str, str, list[Sample]]]:
+    labels = {
+        client.client_id: {
+            "client": str(client.client_id),
+            "name": client.name,
+            "remote": client.remote,
+        }
+        for client in clients
+    }
+    for field, kind, meaning in (
+        ("sent", "counter", "Frames sent to a client."),
+        ("dropped", "counter", "Frames that a client was too slow or too far for."),
+        ("bytes_sent", "counter", "Bytes sent to a client."),
+        ("received", "counter", "Frames of a client."),
+        ("bytes_garbage", "counter", "Bytes of a client that were no MAVLink."),
+        ("queued", "gauge", "Frames that wait for a client."),
+    ):
+        suffix = "_total" if kind == "counter" else ""
+        samples: list[Sample] = [
+            (labels[client.client_id], float(getattr(client, field))) for client in clients
+        ]
+        yield f"client_{field}{suffix}", kind, meaning, samples
+    is_open: list[Sample] = [(labels[c.client_id], float(c.state == "open")) for c in clients]
+    yield "client_open", "gauge", "Frames reach the client as far as is known.", is_open
+    trips: list[Sample] = [
+        (labels[c.client_id], c.round_trip_us / US_PER_S)
+        for c in clients
+        if c.round_trip_us is not None
+    ]
+    yield "client_round_trip_seconds", "gauge", "Newest answer to PING or TIMESYNC.", trips
+    ages: list[Sample] = [
+        (labels[c.client_id], (now_us - c.heard_us) / US_PER_S)
+        for c in clients
+        if c.heard_us is not None
+    ]
+    yield "client_silent_seconds", "gauge", "Time since the client's newest frame.", ages
+
+
+def _escaped(label: str) -> str:
+    return label.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

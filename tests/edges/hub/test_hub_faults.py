@@ -1,0 +1,204 @@
+"""Whatever happens to one client, the others lose nothing."""
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from typing import Any
+
+import msgspec
+import pytest
+
+pytestmark = pytest.mark.io
+
+FRAMES = 2000
+
+TCP_CLIENT = """
+import socket, sys
+link = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+print("up", flush=True)
+while link.recv(4096):
+    pass
+"""
+
+
+class Healthy:
+    """Clients to which nothing happens: two configured, one that called."""
+
+    def __init__(self, rig: Any, *endpoints: str, **settings: object) -> None:
+        self.rig = rig
+        self.stations = [rig.station() for _ in range(2)]
+        configured = [f"udp:127.0.0.1:{station.port}" for station in self.stations]
+        self.hub = rig.hub("udp-listen:127.0.0.1:0", *configured, *endpoints, **settings)
+        self.stations.append(rig.station(self.hub.listening_ports()[0]))
+        self.sent: list[bytes] = []
+        self.heard: list[list[int]] = [[] for _ in self.stations]
+
+    async def start(self) -> None:
+        caller = self.stations[-1]
+        caller.say(caller.sender.heartbeat())
+        await self.rig.until(lambda: len(self.hub.clients()) >= 3)
+        await self.rig.until(lambda: all(c.state == "open" for c in self.hub.clients()[:2]))
+
+    async def fly(self, frames: int) -> None:
+        """Publish frames, letting the loop and the clients run between them."""
+        for _ in range(frames):
+            frame = self.rig.vehicle.attitude()
+            self.sent.append(frame)
+            self.hub.send(self.rig.out(frame))
+            await asyncio.sleep(0)
+            self.listen()
+
+    def listen(self) -> bool:
+        """Read what has come to the clients; tell whether that is all."""
+        for station, heard in zip(self.stations, self.heard, strict=True):
+            heard += _sequences(station.socket)
+        return all(len(heard) >= len(self.sent) for heard in self.heard)
+
+    async def lost(self) -> int:
+        """Count the clients that did not get every frame in order."""
+        with contextlib.suppress(TimeoutError):
+            await self.rig.until(self.listen)
+        whole = [frame[4] for frame in self.sent]
+        return sum(heard != whole for heard in self.heard)
+
+
+def _sequences(sock: socket.socket) -> list[int]:
+    found = []
+    while True:
+        try:
+            found.append(sock.recv(4096)[4])
+        except BlockingIOError:
+            return found
+
+
+async def test_a_client_is_killed(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    victim = rig.station(flight.hub.listening_ports()[0])
+    victim.say(rig.sender(200, 190).heartbeat())
+    await rig.until(lambda: len(flight.hub.clients()) == 4)
+    await flight.fly(FRAMES // 2)
+    victim.socket.close()
+    await flight.fly(FRAMES // 2)
+    assert await flight.lost() == 0
+    assert flight.hub.clients()[-1].state == "refused"
+
+
+async def test_a_client_is_stopped_with_tcp_open_and_goes_on(rig: Any) -> None:
+    flight = Healthy(rig, "tcp-listen:127.0.0.1:0", queue_bytes=2048)
+    await flight.start()
+    port = flight.hub.listening_ports()[1]
+    with subprocess.Popen(
+        [sys.executable, "-c", TCP_CLIENT, str(port)], stdout=subprocess.PIPE
+    ) as client:
+        assert client.stdout
+        try:
+            assert await asyncio.to_thread(client.stdout.readline) == b"up\n"
+            await rig.until(lambda: len(flight.hub.clients()) == 4)
+            os.kill(client.pid, signal.SIGSTOP)
+            while not flight.hub.clients()[-1].dropped:
+                await flight.fly(500)
+                assert len(flight.sent) < 2_000_000
+            assert await flight.lost() == 0
+            os.kill(client.pid, signal.SIGCONT)
+            await rig.until(lambda: flight.hub.clients()[-1].queued == 0)
+            before = flight.hub.clients()[-1]
+            await flight.fly(50)
+            after = flight.hub.clients()[-1]
+            assert (after.sent, after.dropped) == (before.sent + 50, before.dropped)
+        finally:
+            client.kill()
+
+
+async def test_a_port_is_refused_and_a_name_unknown(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = rig.station()
+    closed.socket.close()
+    flight = Healthy(rig, f"udp:127.0.0.1:{closed.port}", f"tcp:127.0.0.1:{closed.port}")
+    await flight.start()
+    await flight.fly(FRAMES)
+    assert await flight.lost() == 0
+    assert {client.state for client in flight.hub.clients()} == {"open", "refused"}
+
+
+async def test_odd_datagrams_rain(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    caller, stranger = flight.stations[-1], rig.station(flight.hub.listening_ports()[0])
+    for _ in range(20):
+        for data in (b"", b"\xfe" * 65507, b"\xfd" * 65507, bytes(65507)):
+            caller.say(data)
+            stranger.say(data)
+        await flight.fly(20)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) == 3
+
+
+async def test_a_thousand_clients_appear_and_vanish(rig: Any) -> None:
+    flight = Healthy(rig, max_clients=16)
+    await flight.start()
+    target = ("127.0.0.1", flight.hub.listening_ports()[0])
+    for visit in range(1000):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as visitor:
+            visitor.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
+        if visit % 10 == 0:
+            rig.clock.us += 1_000_000
+            caller = flight.stations[-1]
+            caller.say(caller.sender.heartbeat())
+        await flight.fly(1)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) <= 2 + 16
+
+
+async def test_settings_are_reloaded_under_load(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    original = flight.hub.settings
+    extra = rig.station()
+    changed = msgspec.structs.replace(
+        original,
+        endpoints=(*original.endpoints, f"udp:127.0.0.1:{extra.port}?deny=ATTITUDE"),
+        max_clients=3,
+        idle_timeout_s=5.0,
+    )
+    for _ in range(50):
+        flight.hub.apply(changed)
+        await flight.fly(20)
+        flight.hub.apply(original)
+        await flight.fly(20)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) == 3
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or not all(map(shutil.which, ("unshare", "ip", "nsenter"))),
+    reason="only root can make network namespaces, with iproute2 and util-linux",
+)
+@pytest.mark.slow
+async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
+    """Run in a network namespace of its own: see `interface_world.py` beside this file."""
+    program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
+    run = await asyncio.to_thread(
+        subprocess.run,
+        ["unshare", "--net", sys.executable, program],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    if "not permitted" in run.stderr:
+        pytest.skip("this machine forbids network namespaces")
+    assert run.returncode == 0, run.stderr
+    seen = json.loads(run.stdout)
+    assert seen["state while down"] == "unreachable"
+    assert seen["loopback lost"] == 0
+    before_and_after = seen["far end could hear"]
+    assert before_and_after - 50 <= seen["far end heard"] <= before_and_after
+    assert seen["far end heard"] >= seen["sent after"] - 5

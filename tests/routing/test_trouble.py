@@ -1,0 +1,80 @@
+"""What is told of clients in trouble, on the manual clock."""
+
+import dataclasses
+
+from gateway.routing.clients import ClientStats
+from gateway.routing.trouble import PATIENCE_US, QUIET_US, TroubleWatch
+
+S = 1_000_000
+
+CLIENT = ClientStats(
+    client_id=1,
+    name="tablet",
+    endpoint="udp:10.0.0.7:14550",
+    remote="10.0.0.7:14550",
+    state="open",
+    trusted=True,
+    systems=(),
+    sent=0,
+    dropped=0,
+    bytes_sent=0,
+    received=0,
+    bytes_received=0,
+    bytes_garbage=0,
+    queued=0,
+    since_us=0,
+    heard_us=None,
+    round_trip_us=None,
+)
+
+
+def client(**changes: object) -> tuple[ClientStats, ...]:
+    return (dataclasses.replace(CLIENT, **changes),)
+
+
+def test_a_short_absence_is_not_told() -> None:
+    watch = TroubleWatch()
+    assert watch.update(client(state="unreachable"), 0) == []
+    assert watch.update(client(state="unreachable"), PATIENCE_US - 1) == []
+    assert watch.update(client(), PATIENCE_US) == []
+    assert watch.update(client(state="unreachable"), PATIENCE_US + 1) == []
+
+
+def test_a_long_absence_is_told_once_and_so_is_the_return() -> None:
+    watch = TroubleWatch()
+    texts = [text for n in range(20) for text in watch.update(client(state="unreachable"), n * S)]
+    assert texts == ["tablet: unreachable"]
+    assert watch.update(client(), 21 * S) == ["tablet is back"]
+    assert watch.update(client(), 22 * S) == []
+
+
+def test_a_station_that_is_not_running_is_no_trouble() -> None:
+    watch = TroubleWatch()
+    assert all(not watch.update(client(state="refused"), n * S) for n in range(20))
+
+
+def test_drops_are_told_once_until_they_have_ceased() -> None:
+    watch = TroubleWatch()
+    texts = [text for n in range(10) for text in watch.update(client(dropped=n * 10), n * S)]
+    assert texts == ["tablet is too slow: telemetry dropped"]
+    for n in range(40):
+        assert watch.update(client(dropped=90), 10 * S + n * S) == []
+    assert QUIET_US < 40 * S
+    assert len(watch.update(client(dropped=91), 60 * S)) == 1
+
+
+def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
+    watch = TroubleWatch()
+    watch.update(client(state="unreachable", dropped=10), 0)
+    assert watch.update(client(dropped=20), S) == []
+    assert watch.update(client(dropped=20), 2 * S) == []
+
+
+def test_a_client_that_left_is_forgotten() -> None:
+    watch = TroubleWatch()
+    for n in range(10):
+        watch.update(client(state="unreachable", dropped=n), n * S)
+        watch.update(client(dropped=n), n * S)
+    assert watch.update((), 11 * S) == []
+    assert not watch._away_told
+    assert not watch._dropped

@@ -1,0 +1,434 @@
+"""Measure how the hub forwards MAVLink over UDP, beside a plain blocking-socket forwarder.
+
+A source sends frames of a foreign vehicle to the forwarder, which passes them to N clients, all on
+loopback. Three figures for each forwarder and N:
+
+* the lossless maximum: the source keeps at most a window of frames under way, so nothing can be
+  lost and the forwarder sets the pace;
+* the CPU time that the forwarder uses for each delivered message meanwhile;
+* latency and CPU share at a fixed rate, from the source's clock before the send to the kernel's
+  stamp at the client's socket, so that the clients' own wake-ups do not count.
+
+The plain forwarder receives with a blocking `recvfrom` and sends with a blocking `sendto` for each
+client, looking at nothing. Forwarders take turns in short rounds, so that other load on the
+machine meets them alike; the median round counts.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import shlex
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+CLIENTS = (1, 4, 16)
+RATE_HZ = 1000
+SOURCE_SYSTEM = 42
+FRAMES = 20_000
+"""Distinct frames, so that the hub's memory of duplicates works as it does in life."""
+WINDOWS = (128, 32, 8)
+"""Frames under way; a forwarder that loses some of the first window is given a smaller one."""
+STALL_S = 0.5
+START_LIMIT_S = 20.0
+SO_TIMESTAMPNS = 35
+
+PLAIN = """
+import socket, sys
+place = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+place.bind(("127.0.0.1", int(sys.argv[1])))
+clients = [("127.0.0.1", int(port)) for port in sys.argv[2:]]
+while True:
+    data, _ = place.recvfrom(65535)
+    for client in clients:
+        place.sendto(data, client)
+"""
+
+HUB = """
+import asyncio, sys
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub import Hub
+from gateway.routing.settings import HubSettings
+
+async def main():
+    clients = tuple(f"udp:127.0.0.1:{port}" for port in sys.argv[2:])
+    endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", *clients)
+    hub = Hub(HubSettings(endpoints=endpoints), lambda incoming: None, GatewayClock())
+    hub.start()
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+Command = Callable[[int, list[int]], list[str]]
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """One windowed run."""
+
+    delivered_per_s: float
+    cpu_us_per_message: float
+    lost: int
+
+
+@dataclass(frozen=True)
+class Latency:
+    """One run at a fixed rate."""
+
+    p50_us: float
+    p99_us: float
+    max_us: float
+    cpu_percent: float
+    lost: int
+
+
+def python(code: str) -> Command:
+    """Make the command line of a forwarder written above."""
+    return lambda port, clients: [sys.executable, "-c", code, str(port), *map(str, clients)]
+
+
+def mavlink_router(command: str) -> Command:
+    """Make the command line of mavlink-routerd."""
+
+    def build(port: int, clients: list[int]) -> list[str]:
+        endpoints = [part for client in clients for part in ("-e", f"127.0.0.1:{client}")]
+        return [*shlex.split(command), "-t", "0", *endpoints, f"127.0.0.1:{port}"]
+
+    return build
+
+
+def mavproxy(command: str) -> Command:
+    """Make the command line of MAVProxy."""
+
+    def build(port: int, clients: list[int]) -> list[str]:
+        outs = [f"--out=udp:127.0.0.1:{client}" for client in clients]
+        options = ["--daemon", "--non-interactive", "--streamrate=-1", "--state-basedir=/tmp"]
+        return [*shlex.split(command), f"--master=udpin:127.0.0.1:{port}", *outs, *options]
+
+    return build
+
+
+def source_frames() -> list[bytes]:
+    """Encode the frames that the source sends."""
+    link = mavlink.MAVLink(None, SOURCE_SYSTEM, 1)
+    frames = []
+    for number in range(FRAMES):
+        link.seq = number % 256
+        angle = number / FRAMES
+        message = mavlink.MAVLink_attitude_quaternion_message(
+            number, 1.0, angle, -angle, angle, 0.1, 0.2, 0.3
+        )
+        frames.append(bytes(message.pack(link)))
+    return frames
+
+
+def heartbeat() -> bytes:
+    """Encode a heartbeat: some forwarders pass nothing on before they have heard one."""
+    message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
+    return bytes(message.pack(mavlink.MAVLink(None, SOURCE_SYSTEM, 1)))
+
+
+def udp_socket() -> socket.socket:
+    """Open a socket on a free loopback port."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+    sock.bind(("127.0.0.1", 0))
+    sock.setblocking(False)
+    return sock
+
+
+def cpu_ns(pid: int) -> int:
+    """Tell how long a process has been on a processor."""
+    return sum(
+        int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")
+    )
+
+
+def resident_kib(pid: int) -> int:
+    """Tell how much memory a process has in use."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0])
+
+
+class Bench:
+    """A running forwarder with its source and its clients."""
+
+    def __init__(self, command: Command, clients: int, frames: list[bytes]) -> None:
+        self._frames = frames
+        self._length = len(frames[0])
+        self._sinks = [udp_socket() for _ in range(clients)]
+        self._poll = select.poll()
+        self._by_fd = {sink.fileno(): place for place, sink in enumerate(self._sinks)}
+        for sink in self._sinks:
+            sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+            self._poll.register(sink, select.POLLIN)
+        with udp_socket() as probe:
+            port = probe.getsockname()[1]
+        self._source = udp_socket()
+        self._source.connect(("127.0.0.1", port))
+        self._counts = [0] * clients
+        self._stamps: list[list[int]] | None = None
+        self.process = subprocess.Popen(
+            command(port, [sink.getsockname()[1] for sink in self._sinks]),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL,
+        )
+        self._wait_until_up()
+
+    def close(self) -> None:
+        """End the forwarder."""
+        self.process.terminate()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        for sock in (*self._sinks, self._source):
+            sock.close()
+
+    def throughput(self, seconds: float, window: int) -> Throughput:
+        """Keep a window of frames under way and see how fast it moves."""
+        self._counts = [0] * len(self._counts)
+        sent, lost = 0, 0
+        begin_ns, begin_cpu = time.perf_counter_ns(), cpu_ns(self.process.pid)
+        end_ns = begin_ns + round(seconds * 1e9)
+        moved_ns = begin_ns
+        while (now_ns := time.perf_counter_ns()) < end_ns:
+            while sent - lost - min(self._counts) < window:
+                self._send(self._frames[sent % FRAMES])
+                sent += 1
+            if self._drain(20):
+                moved_ns = now_ns
+            elif now_ns - moved_ns > STALL_S * 1e9:
+                lost = sent - min(self._counts)
+                moved_ns = now_ns
+        elapsed_s = (time.perf_counter_ns() - begin_ns) / 1e9
+        used_ns = cpu_ns(self.process.pid) - begin_cpu
+        delivered = sum(self._counts)
+        self._settle()
+        lost = sent * len(self._sinks) - sum(self._counts)
+        return Throughput(delivered / elapsed_s, used_ns / max(1, delivered) / 1000, lost)
+
+    def latency(self, seconds: float, rate_hz: int) -> Latency:
+        """Send at a fixed rate and compare the kernel's stamps with the times of sending."""
+        self._counts = [0] * len(self._counts)
+        self._stamps = [[] for _ in self._sinks]
+        sent_ns: list[int] = []
+        begin_cpu, begin_ns = cpu_ns(self.process.pid), time.time_ns()
+        for number in range(round(seconds * rate_hz)):
+            due_ns = begin_ns + number * 1_000_000_000 // rate_hz
+            while (wait_ns := due_ns - time.time_ns()) > 0:
+                time.sleep(wait_ns / 1e9)
+            sent_ns.append(time.time_ns())
+            self._send(self._frames[number % FRAMES])
+            if number % 64 == 63:
+                self._drain(0)
+        elapsed_ns = time.time_ns() - begin_ns
+        used_ns = cpu_ns(self.process.pid) - begin_cpu
+        self._settle()
+        stamps, self._stamps = self._stamps, None
+        whole = [row for row in stamps if len(row) == len(sent_ns)]
+        times_us = np.concatenate([np.subtract(row, sent_ns) for row in whole] or [[0]]) / 1000
+        return Latency(
+            p50_us=float(np.percentile(times_us, 50)),
+            p99_us=float(np.percentile(times_us, 99)),
+            max_us=float(times_us.max()),
+            cpu_percent=100 * used_ns / elapsed_ns,
+            lost=len(sent_ns) * len(stamps) - sum(self._counts),
+        )
+
+    def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:
+        """Forward until so many messages were delivered; yield count and KiB now and then."""
+        total = 0
+        while total < delivered:
+            self.throughput(2.0, WINDOWS[0])
+            total += sum(self._counts)
+            yield total, resident_kib(self.process.pid)
+
+    def _wait_until_up(self) -> None:
+        limit = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < limit:
+            self._send(heartbeat())
+            self._send(self._frames[0])
+            self._drain(50)
+            if min(self._counts) > 2:
+                self._settle()
+                return
+            time.sleep(0.05)
+        self.close()
+        raise RuntimeError(f"{shlex.join(self.process.args)} forwards nothing")
+
+    def _send(self, frame: bytes) -> None:
+        with contextlib.suppress(ConnectionRefusedError):
+            self._source.send(frame)
+
+    def _settle(self) -> None:
+        """Wait until nothing comes any more."""
+        while self._drain(100):
+            pass
+
+    def _drain(self, wait_ms: int) -> int:
+        """Take what has come; return how many datagrams that were."""
+        taken = 0
+        for fd, _ in self._poll.poll(wait_ms):
+            place = self._by_fd[fd]
+            count = self._read_stamps(place) if self._stamps else self._read(place)
+            self._counts[place] += count
+            taken += count
+        return taken
+
+    def _read(self, place: int) -> int:
+        receive, length, count = self._sinks[place].recv, self._length, 0
+        try:
+            while True:
+                count += len(receive(2048)) == length
+        except BlockingIOError:
+            return count
+
+    def _read_stamps(self, place: int) -> int:
+        assert self._stamps is not None
+        sink, row, before = self._sinks[place], self._stamps[place], len(self._stamps[place])
+        try:
+            while True:
+                data, ancillary, _, _ = sink.recvmsg(2048, 64)
+                if len(data) == self._length:
+                    seconds, nanoseconds = struct.unpack("=qq", ancillary[0][2])
+                    row.append(seconds * 1_000_000_000 + nanoseconds)
+        except BlockingIOError:
+            return len(row) - before
+
+
+def lossless(bench: Bench, seconds: float) -> Throughput:
+    """Return the fastest run without loss, or the last."""
+    for window in WINDOWS:
+        result = bench.throughput(seconds, window)
+        if not result.lost:
+            break
+    return result
+
+
+def median(results: list[dict[str, float]]) -> dict[str, float]:
+    """Take each figure's median; of losses the sum."""
+    return {
+        key: sum(r[key] for r in results)
+        if key == "lost"
+        else statistics.median(r[key] for r in results)
+        for key in results[0]
+    }
+
+
+def measure(
+    forwarders: dict[str, Command], clients: int, rounds: int, seconds: float
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Run all forwarders with so many clients, in turns."""
+    frames = source_frames()
+    found: dict[str, tuple[list[dict[str, float]], list[dict[str, float]]]] = {
+        name: ([], []) for name in forwarders
+    }
+    for _ in range(rounds):
+        for name, command in forwarders.items():
+            bench = Bench(command, clients, frames)
+            try:
+                found[name][0].append(asdict(lossless(bench, seconds)))
+                found[name][1].append(asdict(bench.latency(seconds, RATE_HZ)))
+            finally:
+                bench.close()
+    return {
+        name: {"throughput": median(fast), "latency": median(late)}
+        for name, (fast, late) in found.items()
+    }
+
+
+def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
+    """Print the figures and how they compare."""
+    table = Table(
+        title="Forwarding MAVLink over UDP, 44-byte frames, loopback", box=box.SIMPLE_HEAD
+    )
+    for column in (
+        "clients", "forwarder", "lossless/s", "x plain", "CPU µs/msg", f"p50 µs @{RATE_HZ}/s",
+        "p99 µs", "x plain", "max µs", "CPU %", "lost",
+    ):  # fmt: skip
+        table.add_column(column, justify="right")
+    for clients, by_name in report.items():
+        plain = by_name["plain"]
+        for name, figures in by_name.items():
+            fast, late = figures["throughput"], figures["latency"]
+            table.add_row(
+                clients,
+                name,
+                f"{fast['delivered_per_s']:,.0f}",
+                f"{fast['delivered_per_s'] / plain['throughput']['delivered_per_s']:.2f}",
+                f"{fast['cpu_us_per_message']:.2f}",
+                f"{late['p50_us']:.0f}",
+                f"{late['p99_us']:.0f}",
+                f"{late['p99_us'] / plain['latency']['p99_us']:.2f}",
+                f"{late['max_us']:.0f}",
+                f"{late['cpu_percent']:.1f}",
+                f"{fast['lost'] + late['lost']:.0f}",
+            )
+    Console(width=120).print(table)
+
+
+def watch_memory(messages: int) -> dict[str, int]:
+    """Forward many messages through the hub to 16 clients and watch its memory."""
+    bench = Bench(python(HUB), 16, source_frames())
+    track: list[tuple[int, int]] = []
+    try:
+        for total, kib in bench.run_until(messages):
+            track.append((total, kib))
+            print(f"{total:>12,} delivered  {kib:>8,} KiB", flush=True)
+    finally:
+        bench.close()
+    return {"delivered": track[-1][0], "first_kib": track[0][1], "last_kib": track[-1][1]}
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each single run")
+    parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
+    parser.add_argument("--mavlink-router", metavar="COMMAND", help="compare mavlink-routerd")
+    parser.add_argument("--mavproxy", metavar="COMMAND", help="compare mavproxy.py")
+    parser.add_argument(
+        "--memory", type=int, metavar="MESSAGES", help="only watch memory over so many messages"
+    )
+    options = parser.parse_args()
+    report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
+    if options.memory:
+        report["memory"] = watch_memory(options.memory)
+    else:
+        forwarders = {"plain": python(PLAIN), "mavgate": python(HUB)}
+        if options.mavlink_router:
+            forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
+        if options.mavproxy:
+            forwarders["mavproxy"] = mavproxy(options.mavproxy)
+        figures = {
+            str(clients): measure(forwarders, clients, options.rounds, options.seconds)
+            for clients in options.clients
+        }
+        show(figures)
+        report["forwarding"] = figures
+    if options.json:
+        options.json.write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
