@@ -20,7 +20,9 @@ from gateway.records import (
     BaroRaw,
     FusedSample,
     GpsFix,
+    ImuCalibrated,
     ImuRaw,
+    ImuSample,
     Incoming,
     LinkReport,
     NavState,
@@ -63,11 +65,13 @@ class Aircraft:
         self._chain = SensorChain(settings.sensing, calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
 
-    def take(self, record: RawRecord, now_us: int) -> list[Action]:
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
         match record:
             case ImuRaw():
-                return self._take_imu(record, now_us)
+                return self._take_imu(record, self._chain.imu(record), now_us)
+            case ImuCalibrated():
+                return self._take_imu(None, self._filter(record), now_us)
             case BaroRaw():
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
@@ -78,8 +82,17 @@ class Aircraft:
             case NodeStatus():
                 return [*self.vehicle.on_node_status(record, now_us)]
 
-    def _take_imu(self, raw: ImuRaw, now_us: int) -> list[Action]:
-        sample = self._chain.imu(raw)
+    def _filter(self, imu: ImuCalibrated) -> ImuSample:
+        return self._chain.imu_si(
+            imu.time_us,
+            imu.accel_b_mps2,
+            imu.gyro_b_radps,
+            imu.mag_b_ut,
+            imu.temperature_degc,
+            imu.flags,
+        )
+
+    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
         self.state = self._estimator.update_imu(sample)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
@@ -112,7 +125,7 @@ class Pipeline:
             actions += self.take(record, now_us)
         return actions
 
-    def take(self, record: RawRecord, now_us: int) -> list[Action]:
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
         vehicle_id = record.node.vehicle_id
         aircraft = self.aircraft.get(vehicle_id)
