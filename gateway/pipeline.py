@@ -10,7 +10,7 @@ order. An aircraft comes into being with its first payload. Live, demo and playb
 who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -52,6 +52,8 @@ class PipelineSettings:
     vehicle: VehicleSettings
     calibrations: Mapping[int, NodeCalibration]
     """Calibration of the IMU node by vehicle id; an aircraft without one is taken as ideal."""
+    correct: Callable[[NavState], NavState] | None = None
+    """Changes the states before they are told: for a playback that knows what comes."""
 
 
 class Aircraft:
@@ -64,6 +66,7 @@ class Aircraft:
         self.vehicle = Vehicle(settings.vehicle, vehicle_id)
         self._chain = SensorChain(settings.sensing, calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
+        self._correct = settings.correct
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
@@ -93,7 +96,8 @@ class Aircraft:
         )
 
     def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
-        self.state = self._estimator.update_imu(sample)
+        state = self._estimator.update_imu(sample)
+        self.state = state if self._correct is None else self._correct(state)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
         return [*self.vehicle.on_state(self.state, sample, now_us), fused]

@@ -24,7 +24,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "routing": FOUNDATION | {"wire"},
     "simulator": FOUNDATION | {"wire"},
     "pipeline": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
-    "replay": FOUNDATION | {"flightlog", "pipeline"},
+    "replay": FOUNDATION | STAGES | {"pipeline"},
     "status": FOUNDATION | {"routing"},
     "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "routing", "simulator", "status"},
     "analysis": FOUNDATION | STAGES | {"pipeline", "replay"},
