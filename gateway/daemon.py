@@ -95,6 +95,7 @@ class Daemon:
             states=tuple((key, a.state) for key, a in aircraft if a.state is not None),
             clients=self._hub.clients(),
             sent=tuple(sorted(self._sent.items())),
+            hub=self._hub.counters(),
         )
 
     def _on_open(self, port: str) -> None:

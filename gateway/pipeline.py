@@ -10,7 +10,7 @@ order. An aircraft comes into being with its first payload. Live, demo and playb
 who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -23,7 +23,9 @@ from gateway.records import (
     ClientInterval,
     FusedSample,
     GpsFix,
+    ImuCalibrated,
     ImuRaw,
+    ImuSample,
     Incoming,
     LinkReport,
     NavState,
@@ -86,29 +88,37 @@ class PipelineSettings:
     """By vehicle id, in place of the default."""
     unix_us_at_zero: int = 0
     """Civil time at the gateway clock's zero, as well as it is known."""
+    correct: Callable[[NavState], NavState] | None = None
+    """Changes the states before they are told: for a playback that knows what comes."""
 
 
 class Aircraft:
     """The stages of one aircraft, from its raw records on."""
 
-    def __init__(self, vehicle_id: int, settings: AircraftSettings, unix_us_at_zero: int) -> None:
+    def __init__(self, vehicle_id: int, common: PipelineSettings) -> None:
         self.vehicle_id = vehicle_id
-        self.settings = settings
+        self.settings = settings = common.aircraft.get(vehicle_id, common.default)
         self.state: NavState | None = None
         sections = {
             name: getattr(settings, name) for name in ("sensing", "estimation", "calibration")
         }
         self.vehicle = Vehicle(
-            settings.vehicle, vehicle_id, sections=sections, unix_us_at_zero=unix_us_at_zero
+            settings.vehicle,
+            vehicle_id,
+            sections=sections,
+            unix_us_at_zero=common.unix_us_at_zero,
         )
         self._chain = SensorChain(settings.sensing, settings.calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)
+        self._correct = common.correct
 
-    def take(self, record: RawRecord, now_us: int) -> list[Action]:
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
         match record:
             case ImuRaw():
-                return self._take_imu(record, now_us)
+                return self._take_imu(record, self._chain.imu(record), now_us)
+            case ImuCalibrated():
+                return self._take_imu(None, self._filter(record), now_us)
             case BaroRaw():
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
@@ -119,9 +129,19 @@ class Aircraft:
             case NodeStatus():
                 return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
 
-    def _take_imu(self, raw: ImuRaw, now_us: int) -> list[Action]:
-        sample = self._chain.imu(raw)
-        self.state = self._estimator.update_imu(sample)
+    def _filter(self, imu: ImuCalibrated) -> ImuSample:
+        return self._chain.imu_si(
+            imu.time_us,
+            imu.accel_b_mps2,
+            imu.gyro_b_radps,
+            imu.mag_b_ut,
+            imu.temperature_degc,
+            imu.flags,
+        )
+
+    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
+        state = self._estimator.update_imu(sample)
+        self.state = state if self._correct is None else self._correct(state)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
         # Frames first: nothing that is recorded may delay what is shown.
         return [*self.perform(self.vehicle.on_state(self.state, sample, now_us), now_us), fused]
@@ -195,14 +215,12 @@ class Pipeline:
             actions += self.take(record, now_us)
         return actions
 
-    def take(self, record: RawRecord, now_us: int) -> list[Action]:
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
         vehicle_id = record.node.vehicle_id
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
-            settings = self._settings.aircraft.get(vehicle_id, self._settings.default)
-            aircraft = Aircraft(vehicle_id, settings, self._settings.unix_us_at_zero)
-            self.aircraft[vehicle_id] = aircraft
+            aircraft = self.aircraft[vehicle_id] = Aircraft(vehicle_id, self._settings)
         return aircraft.take(record, now_us)
 
     def connect(self, port: str) -> None:

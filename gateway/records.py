@@ -98,6 +98,20 @@ class ImuRaw:
 
 
 @dataclass(frozen=True, slots=True)
+class ImuCalibrated:
+    """One IMU sample in SI and body FRD without counts: all that other people's logs have."""
+
+    time_us: int
+    node: NodeId
+    accel_b_mps2: Vec3
+    gyro_b_radps: Vec3
+    mag_b_ut: Vec3 | None
+    """None unless sampled anew."""
+    temperature_degc: float
+    flags: ImuFlags
+
+
+@dataclass(frozen=True, slots=True)
 class BaroRaw:
     """One barometer payload on the gateway clock; the node has applied the BMP180's own words."""
 
@@ -240,7 +254,8 @@ class FusedSample:
     """
 
     vehicle_id: int
-    imu: ImuRaw
+    imu: ImuRaw | None
+    """None where the source has no counts."""
     sample: ImuSample
     state: NavState
 

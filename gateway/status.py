@@ -17,4 +17,4 @@ class Snapshot:
     clients: tuple[ClientStats, ...]
     sent: tuple[tuple[int, int], ...]
     """MAVLink message id and how many were sent since the start."""
-    hub: HubCounters = HubCounters()
+    hub: HubCounters

@@ -2,10 +2,15 @@
 
 import asyncio
 import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import typer
+from msgspec.structs import replace
 
+from gateway.cli.errors import refuse
 from gateway.cli.run import (
     ConfigOption,
     EndpointOption,
@@ -17,10 +22,12 @@ from gateway.cli.run import (
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
+from gateway.edges.flight_file import FlightFileError, read_flight
 from gateway.pipeline import AircraftSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import Aircraft
-from gateway.simulator.receiver import simulate
+from gateway.simulator.receiver import TimedFrame, simulate
+from gateway.simulator.recorded import replay
 
 
 def register(app: typer.Typer) -> None:
@@ -33,18 +40,42 @@ def demo(
     config: ConfigOption = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
+    flight: Annotated[
+        Path | None,
+        typer.Option("--flight", "-f", help="Send a recorded tracker log (CSV) in its place."),
+    ] = None,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
     The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates.
     """
     settings = with_endpoints(read_settings(config), endpoint)
-    line = simulate(settings.simulator, unix_time_us()).frames()
-    aircraft = calibrated_aircraft(settings)
+    try:
+        if flight is None:
+            line = simulate(settings.simulator, unix_time_us()).frames()
+            aircraft = calibrated_aircraft(settings)
+        else:
+            line, aircraft = recorded_line(settings, flight)
+    except (FlightFileError, ValueError) as error:
+        refuse(str(error))
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
-        settings = msgspec.structs.replace(settings, aircraft_folder=folder)
+        settings = replace(settings, aircraft_folder=folder)
         asyncio.run(serve(lambda: Daemon(settings, aircraft, line), plain=plain))
+
+
+def recorded_line(
+    settings: GatewaySettings, file: Path
+) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
+    """Send a log as its nodes would have, and take its calibrated values as they are."""
+    flight = read_flight(file)
+    estimation = settings.estimation
+    reference = replace(estimation.reference, gps_latency_s=flight.gps_latency_s)
+    aircraft = replace(
+        settings.default_aircraft, estimation=replace(estimation, reference=reference)
+    )
+    receiver = replay(settings.simulator, flight, unix_time_us())
+    return receiver.frames(flight.duration_s), {settings.simulator.vehicle_id: aircraft}
 
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
@@ -53,7 +84,5 @@ def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings
     for index in range(settings.simulator.vehicles):
         simulated = Aircraft(settings.simulator, index)
         calibration = msgspec.convert(simulated.errors, NodeCalibration, from_attributes=True)
-        found[simulated.vehicle_id] = msgspec.structs.replace(
-            settings.default_aircraft, calibration=calibration
-        )
+        found[simulated.vehicle_id] = replace(settings.default_aircraft, calibration=calibration)
     return found

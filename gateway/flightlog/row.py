@@ -13,9 +13,9 @@ from gateway.records import (
     FusedSample,
     GpsFix,
     GpsFixType,
+    ImuCalibrated,
     ImuFlags,
     ImuRaw,
-    ImuSample,
     NavFlags,
     NavState,
     NodeId,
@@ -74,17 +74,6 @@ _NO_VECTOR: Final = (None, None, None)
 
 
 @dataclass(frozen=True, slots=True)
-class CalibratedImu:
-    """An IMU sample in SI and body FRD; all that other people's logs have."""
-
-    accel_b_mps2: Vec3
-    gyro_b_radps: Vec3
-    mag_b_ut: Vec3 | None
-    temperature_degc: float
-    flags: ImuFlags
-
-
-@dataclass(frozen=True, slots=True)
 class TableRow:
     """One row; what is not there is None."""
 
@@ -93,19 +82,8 @@ class TableRow:
     baro: BaroRaw | None = None
     gps: GpsFix | None = None
     raw: ImuRaw | None = None
-    imu: CalibratedImu | None = None
+    imu: ImuCalibrated | None = None
     state: NavState | None = None
-
-
-def calibrated(sample: ImuSample) -> CalibratedImu:
-    """Take from a sample what the table keeps; its filtered twins can be computed again."""
-    return CalibratedImu(
-        sample.accel_b_mps2,
-        sample.gyro_b_radps,
-        sample.mag_b_ut,
-        sample.temperature_degc,
-        sample.flags,
-    )
 
 
 def row_to_line(row: TableRow) -> str:
@@ -138,7 +116,7 @@ def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
         baro=_read_baro(cells[_BARO:_GPS], vehicle_id) if cells[_BARO] else None,
         gps=_read_gps(cells[_GPS:_NAV], vehicle_id) if cells[_GPS] else None,
         raw=_read_raw(cells, time_us, vehicle_id, flags) if cells[_RAW] else None,
-        imu=_read_si(cells[_SI:_BARO], flags) if cells[_SI] else None,
+        imu=_read_si(cells, time_us, vehicle_id, flags) if cells[_SI] else None,
         state=_read_nav(cells[_NAV:]) if cells[_NAV] else None,
     )
 
@@ -160,9 +138,8 @@ class RowBuilder:
                 rows = self.flush() if self._gps else []
                 self._gps = record
             case FusedSample():
-                imu = calibrated(record.sample)
-                raw = record.imu
-                rows = [TableRow(raw.time_us, self._baro, self._gps, raw, imu, record.state)]
+                imu = _calibrated(record)
+                rows = [TableRow(imu.time_us, self._baro, self._gps, record.imu, imu, record.state)]
                 self._baro = self._gps = None
         return rows
 
@@ -176,10 +153,26 @@ class RowBuilder:
         return [row]
 
 
+def _calibrated(fused: FusedSample) -> ImuCalibrated:
+    """Take from a sample what the table keeps; its filtered twins can be computed again."""
+    sample = fused.sample
+    return ImuCalibrated(
+        sample.time_us,
+        fused.imu.node if fused.imu else NodeId(fused.vehicle_id, 0),
+        sample.accel_b_mps2,
+        sample.gyro_b_radps,
+        sample.mag_b_ut,
+        sample.temperature_degc,
+        sample.flags,
+    )
+
+
 def _head_cells(row: TableRow) -> tuple[Cell, ...]:
     if row.raw:
         return (row.raw.node.node_id, row.raw.node_time_us, int(row.raw.flags))
-    return (None, None, int(row.imu.flags) if row.imu else None)
+    if row.imu:
+        return (row.imu.node.node_id, None, int(row.imu.flags))
+    return (None, None, None)
 
 
 def _raw_cells(raw: ImuRaw) -> tuple[Cell, ...]:
@@ -189,7 +182,7 @@ def _raw_cells(raw: ImuRaw) -> tuple[Cell, ...]:
     )
 
 
-def _si_cells(imu: CalibratedImu) -> tuple[Cell, ...]:
+def _si_cells(imu: ImuCalibrated) -> tuple[Cell, ...]:
     mag = imu.mag_b_ut or _NO_VECTOR
     return (*imu.accel_b_mps2, *imu.gyro_b_radps, *mag, imu.temperature_degc)
 
@@ -246,9 +239,17 @@ def _read_raw(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> Im
     )
 
 
-def _read_si(cells: Text, flags: ImuFlags) -> CalibratedImu:
-    mag = _vector(cells[6:9]) if cells[6] else None
-    return CalibratedImu(_vector(cells[0:3]), _vector(cells[3:6]), mag, _number(cells[9]), flags)
+def _read_si(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuCalibrated:
+    si = cells[_SI:_BARO]
+    return ImuCalibrated(
+        time_us=time_us,
+        node=NodeId(vehicle_id, int(cells[1] or 0)),
+        accel_b_mps2=_vector(si[0:3]),
+        gyro_b_radps=_vector(si[3:6]),
+        mag_b_ut=_vector(si[6:9]) if si[6] else None,
+        temperature_degc=_number(si[9]),
+        flags=flags,
+    )
 
 
 def _read_baro(cells: Text, vehicle_id: int) -> BaroRaw:

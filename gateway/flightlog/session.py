@@ -237,6 +237,8 @@ class Session:
         match self.state:
             case SessionState.IDLE if self.wanted:
                 self.name, self.part, self._begun_us = session_name(unix_us), 0, now_us
+                if self._is_short(free_bytes):
+                    return self._stop_short(now_us)
                 return self._open_next()
             case SessionState.RECORDING:
                 return self._poll_recording(now_us, unix_us, part_bytes, free_bytes, jumped)
@@ -248,13 +250,12 @@ class Session:
     def _poll_recording(
         self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, jumped: bool
     ) -> list[SessionAction]:
-        s = self._settings
         if not self.wanted:
             self.state = SessionState.IDLE
             return [ClosePart(), Announce(is_trouble=False, text=f"Recording {self.name} ended")]
-        if free_bytes < s.free_floor_mb * 1e6:
-            return self.failed(f"less than {s.free_floor_mb:g} MB free", now_us)
-        age_us = now_us - self._opened_us
+        if self._is_short(free_bytes):
+            return self._stop_short(now_us)
+        s, age_us = self._settings, now_us - self._opened_us
         too_old = age_us > s.rotate_min * 60 * US_PER_S
         if jumped:
             old, self.name = self.name, session_name(unix_us - (now_us - self._begun_us))
@@ -267,10 +268,15 @@ class Session:
         if not self.wanted:
             self.state, self.reason = SessionState.IDLE, ""
             return [Announce(is_trouble=False, text=f"Recording {self.name} ended")]
-        enough = free_bytes >= self._settings.free_floor_mb * 1e6 * RESUME_FACTOR
-        if now_us < self._retry_us or not enough:
+        if now_us < self._retry_us or self._is_short(free_bytes, RESUME_FACTOR):
             return []
         return self._open_next()
+
+    def _is_short(self, free_bytes: int, factor: float = 1.0) -> bool:
+        return free_bytes < self._settings.free_floor_mb * 1e6 * factor
+
+    def _stop_short(self, now_us: int) -> list[SessionAction]:
+        return self.failed(f"less than {self._settings.free_floor_mb:g} MB free", now_us)
 
     def _open_next(self) -> list[SessionAction]:
         self.state = SessionState.OPENING

@@ -76,7 +76,9 @@ class SimulatorSettings(Settings, frozen=True):
     ] = 120.0
     imu_restart_s: Annotated[
         float,
-        setting("When the IMU node restarts, its clock at zero again; 0 for never.", "s", ge=0),
+        setting(
+            "When the IMU node restarts, its clock at zero again; 0 for never.", "s", ge=0, le=1e6
+        ),
     ] = 0.0
     radio_loss: Annotated[float, setting("Share of payloads that never arrive.", ge=0, le=0.9)] = (
         0.01

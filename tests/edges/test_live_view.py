@@ -20,7 +20,7 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, HubCounters
 from gateway.status import Snapshot
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
@@ -61,7 +61,9 @@ CLIENT = ClientStats(
     heard_us=9_500_000,
     round_trip_us=None,
 )
-SNAPSHOT = Snapshot(10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)))
+SNAPSHOT = Snapshot(
+    10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)), HubCounters()
+)
 
 
 def text_of(*snapshots: Snapshot) -> str:
@@ -109,7 +111,7 @@ def test_unknown_is_a_dash(word: str) -> None:
 
 def test_an_empty_gateway_can_be_drawn() -> None:
     report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
-    text = text_of(Snapshot(0, report, (), (), ()))
+    text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
     assert "auto not connected" in text
     assert "No aircraft heard yet" in text
 

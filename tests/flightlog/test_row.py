@@ -1,5 +1,7 @@
 """Rows keep every record, its digits and its place."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,6 @@ from gateway.flightlog.row import (
     COLUMNS,
     RowBuilder,
     TableRow,
-    calibrated,
     row_from_cells,
     row_to_line,
 )
@@ -47,8 +48,9 @@ def test_a_line_holds_every_digit(seed: int) -> None:
 
 
 def test_a_row_without_counts_keeps_the_calibrated_sample(rng: np.random.Generator) -> None:
-    fused = make_fused(rng, 1000)
-    row = TableRow(1000, imu=calibrated(fused.sample))
+    (row,) = RowBuilder().add(replace(make_fused(rng, 1000), imu=None))
+    assert row.raw is None
+    assert row.imu is not None
     again = row_from_cells(row_to_line(row).rstrip("\n").split(","), 3)
     assert repr(again) == repr(row)
 

@@ -144,3 +144,11 @@ def test_stop_while_blocked_gives_up() -> None:
     assert poll(session) == [Announce(is_trouble=False, text=f"Recording {NAME} ended")]
     assert session.state is SessionState.IDLE
     assert poll(session, 10 * RETRY_US) == []
+
+
+def test_nothing_is_opened_on_a_disk_that_is_full_already() -> None:
+    session = Session(ALWAYS)
+    (announcement,) = poll(session, free=0)
+    assert isinstance(announcement, Announce)
+    assert announcement.is_trouble
+    assert poll(session, RETRY_US) == [OpenPart(NAME, 1)]

@@ -1,0 +1,240 @@
+"""The control socket: how the command line talks to a gateway that runs.
+
+A Unix socket that only the user (and root) can open. One line of JSON asks, one line answers;
+docs/control.md describes every verb. Whoever offers a verb registers a handler and the shape of
+its parameters, which are checked before the handler sees them.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+import struct
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+
+log = logging.getLogger(__name__)
+
+MAX_LINE: Final = 64 << 10
+"""A request is some words; a status of many clients some thousand bytes."""
+MAX_CONNECTIONS: Final = 16
+FOLDER_RIGHTS: Final = 0o700
+SOCKET_RIGHTS: Final = 0o600
+REQUEST_TIMEOUT_S: Final = 10.0
+
+_CREDENTIALS: Final = struct.Struct("3i")
+"""Linux `struct ucred`: process, user, group."""
+
+
+class ControlError(Exception):
+    """A request that cannot be granted, or nobody to ask; the text says why."""
+
+
+class NoParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The parameters of a verb that has none."""
+
+
+class _Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    verb: str
+    params: dict[str, Any] = {}
+
+
+class _Answer(msgspec.Struct, frozen=True):
+    ok: bool
+    result: Any = None
+    error: str = ""
+
+
+Params = TypeVar("Params", bound=msgspec.Struct)
+Handler = Callable[[Any], Awaitable[object] | object]
+
+
+class ControlServer:
+    """Answers requests on a Unix socket.
+
+    Parameters
+    ----------
+    path : Path
+        Where the socket is made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
+        self._server: asyncio.Server | None = None
+        self._writers: set[asyncio.StreamWriter] = set()
+        self.register("verbs", NoParams, lambda _: sorted(self._verbs))
+
+    def register(
+        self,
+        verb: str,
+        params: type[Params],
+        handler: Callable[[Params], Awaitable[object] | object],
+    ) -> None:
+        """Offer a verb.
+
+        Parameters
+        ----------
+        verb : str
+            One or more words joined by dots: `record.start`.
+        params : type
+            A msgspec structure; should forbid unknown fields.
+        handler : callable
+            Takes the parameters and returns, or awaits, what is JSON or a msgspec structure or
+            dataclass. Raises ControlError to refuse.
+        """
+        self._verbs[verb] = (params, handler)
+
+    async def start(self) -> None:
+        """Make the socket and listen.
+
+        Raises
+        ------
+        ControlError
+            If another gateway listens there, or the socket cannot be made.
+        """
+        try:
+            self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)
+            if self.path.is_socket():
+                self._remove_stale()
+            self._server = await asyncio.start_unix_server(
+                self._serve, str(self.path), limit=MAX_LINE
+            )
+            self.path.chmod(SOCKET_RIGHTS)
+        except OSError as error:
+            raise ControlError(f"control socket {self.path}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Stop listening and end all connections."""
+        if self._server is None:
+            return
+        self._server.close()
+        self._server = None
+        for writer in self._writers:
+            writer.close()
+        self.path.unlink(missing_ok=True)
+
+    async def answer(self, line: bytes) -> bytes:
+        """Answer one line by one line; both end with a line feed."""
+        return msgspec.json.encode(await self._answer(line), enc_hook=_plain) + b"\n"
+
+    async def _answer(self, line: bytes) -> _Answer:
+        try:
+            request = msgspec.json.decode(line, type=_Request)
+            kind, handler = self._find(request.verb)
+            result = handler(msgspec.convert(request.params, kind))
+            if isinstance(result, Awaitable):
+                result = await result
+        except (ControlError, msgspec.DecodeError) as error:
+            return _Answer(ok=False, error=str(error))
+        return _Answer(ok=True, result=result)
+
+    def _find(self, verb: str) -> tuple[type[msgspec.Struct], Handler]:
+        if verb not in self._verbs:
+            known = ", ".join(sorted(self._verbs))
+            raise ControlError(f"no such verb: {verb}; there are {known}")
+        return self._verbs[verb]
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._writers) >= MAX_CONNECTIONS or not _is_allowed(writer):
+            writer.close()
+            return
+        self._writers.add(writer)
+        try:
+            while line := await reader.readline():
+                writer.write(await self.answer(line))
+                await writer.drain()
+        except (ConnectionError, ValueError):
+            # Gone, or a line beyond the limit.
+            log.debug("Control connection ended early")
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    def _remove_stale(self) -> None:
+        """Remove the socket of a gateway that was killed; never that of one that lives."""
+        with socket.socket(socket.AF_UNIX) as probe:
+            try:
+                probe.connect(str(self.path))
+            except ConnectionRefusedError:
+                self.path.unlink(missing_ok=True)
+                return
+        raise ControlError(f"control socket {self.path}: another gateway listens there")
+
+
+def socket_path(name: str) -> Path:
+    """Tell where the socket of a kind of gateway is.
+
+    Parameters
+    ----------
+    name : str
+        `run` for the gateway, `play` for a player.
+
+    Returns
+    -------
+    Path
+        In the user's runtime folder, or in the state folder where there is none.
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    state = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser()
+    return (Path(runtime) if runtime else state) / "mavgate" / f"{name}.sock"
+
+
+def request(
+    path: Path, verb: str, params: dict[str, Any] | None = None, *, timeout_s: float | None = None
+) -> Any:
+    """Ask a gateway that runs, and wait for its answer.
+
+    Parameters
+    ----------
+    path : Path
+        See `socket_path`.
+    verb : str
+        What to do.
+    params : dict, optional
+        Its parameters.
+    timeout_s : float, optional
+        Longest wait; `REQUEST_TIMEOUT_S` by default.
+
+    Returns
+    -------
+    object
+        The result, as JSON has it.
+
+    Raises
+    ------
+    ControlError
+        If nobody listens, or the request is refused.
+    """
+    line = msgspec.json.encode({"verb": verb, "params": params or {}}) + b"\n"
+    try:
+        with socket.socket(socket.AF_UNIX) as link:
+            link.settimeout(timeout_s or REQUEST_TIMEOUT_S)
+            link.connect(str(path))
+            link.sendall(line)
+            with link.makefile("rb") as lines:
+                answer = msgspec.json.decode(lines.readline(), type=_Answer)
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise ControlError(f"nothing runs that could do this (no socket {path})") from error
+    except (OSError, msgspec.DecodeError) as error:
+        raise ControlError(f"no answer on {path}: {error}") from error
+    if not answer.ok:
+        raise ControlError(answer.error)
+    return answer.result
+
+
+def _is_allowed(writer: asyncio.StreamWriter) -> bool:
+    """Check by the kernel's word who is at the other end; the folder's rights alone may be lax."""
+    link = writer.get_extra_info("socket")
+    data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    _, user, _ = _CREDENTIALS.unpack(data)
+    return user in (0, os.getuid())
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Path):
+        return str(value)
+    raise NotImplementedError(f"{type(value).__name__} is no JSON")

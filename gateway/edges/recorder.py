@@ -1,0 +1,363 @@
+"""The recorder: keeps what passes through the gateway, and never holds it up.
+
+Linux has no way to write to a disk without waiting for it: a card that tidies up, or a network
+folder, blocks for seconds. So the disk is the one thing that a second thread does. It is handed
+immutable bytes and hands back a result; nothing is shared, so there is nothing to lock. While it
+is at work the event loop gathers the next bytes, up to a bound.
+
+Every `flush_s` the gathered bytes go to the kernel, which survives the death of the gateway; every
+`sync_s` the kernel is made to put them on the disk, which survives the loss of power. A sync at
+each flush would wear cards out and lets none of them keep up.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, ParamSpec, TypeVar
+
+from gateway.edges.part_files import DiskState, PartFiles, free_bytes_near, reason_of
+from gateway.edges.recordings import RecordingError, rename_recording, restamp_recording
+from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
+from gateway.flightlog.session import (
+    Announce,
+    ClosePart,
+    OpenPart,
+    RecordingSettings,
+    Rename,
+    Session,
+    SessionAction,
+)
+from gateway.flightlog.stamps import CivilClock, Stamper
+from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_mark
+from gateway.flightlog.tlog import encode_record
+from gateway.records import BaroRaw, FusedSample, GpsFix
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+PENDING_LIMIT: Final = 16 << 20
+"""Bytes that wait for a slow disk: minutes of telemetry. More is given up, not piled up."""
+TLOG: Final = ".tlog"
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """What the recorder does."""
+
+    state: str
+    name: str
+    part: int
+    part_bytes: int
+    free_bytes: int
+    reason: str
+    folder: str
+
+
+class _Part:
+    """What the loop gathers for the part that is being written."""
+
+    def __init__(self, session: str, number: int, offset_us: int) -> None:
+        self.session = session
+        self.number = number
+        self.stamper = Stamper(offset_us)
+        self.tables: set[int] = set()
+        """Aircraft whose table has its head."""
+        self.pending: dict[str, bytearray] = {}
+        self.size = 0
+
+    def add(self, ending: str, data: bytes) -> None:
+        if self.size < PENDING_LIMIT:
+            self.pending.setdefault(ending, bytearray()).extend(data)
+        self.size += len(data)
+
+    def take(self) -> dict[str, bytes]:
+        pending, self.pending, self.size = self.pending, {}, 0
+        return {ending: bytes(data) for ending, data in pending.items()}
+
+
+class Recorder:
+    """Records MAVLink and flights.
+
+    Parameters
+    ----------
+    settings : RecordingSettings
+        What, where, when.
+    now_us : callable
+        The gateway clock.
+    unix_us : callable
+        The machine's civil time.
+    header_of : callable
+        Tells what heads a vehicle's table: version, settings, calibration. Session, part and
+        start are filled in here.
+    announce : callable
+        Told whether it is trouble, and a text for the user.
+    """
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        now_us: Callable[[], int],
+        unix_us: Callable[[], int],
+        header_of: Callable[[int], TableHeader],
+        announce: Callable[[bool, str], None],
+    ) -> None:
+        self._settings = settings
+        self._clock, self._machine_us = now_us, unix_us
+        self._header_of = header_of
+        self._announce = announce
+        self._session = Session(settings)
+        self._civil = CivilClock()
+        self._rows: dict[int, RowBuilder] = {}
+        self._seen: set[int] = set()
+        self._part: _Part | None = None
+        self._files: PartFiles | None = None
+        self._disk = DiskState(0, 0)
+        self._sync_due_us = 0
+        self._worker = ThreadPoolExecutor(1, "recorder")
+        self._wake = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self.folder = Path(settings.folder).expanduser()
+        """Where the recordings are."""
+
+    def start(self) -> None:
+        """Begin to work; needs a running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def close(self) -> None:
+        """Write what is left and end; waits for the disk."""
+        if self._task is not None:
+            self._task.cancel()
+        self._worker.shutdown(wait=True)
+        files, self._files = self._files, None
+        if files is None or self._part is None:
+            return
+        try:
+            self._flush_rows(self._part)
+            files.write(self._part.take(), sync=True)
+            files.close()
+        except OSError as error:
+            log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+
+    def record(self) -> None:
+        """Record from now on."""
+        self._session.start()
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Record no more until the next order or flight."""
+        self._session.stop()
+        self._wake.set()
+
+    def set_in_flight(self, in_flight: bool) -> None:
+        """Note take-off or landing."""
+        self._session.set_in_flight(in_flight)
+
+    def mark(self, text: str) -> None:
+        """Put a remark at this moment into the recording."""
+        if self._part is not None:
+            line = encode_mark(TableMark(self._clock(), text)).encode()
+            for vehicle_id in self._part.tables:
+                self._part.add(_table(vehicle_id), line)
+        self._announce(False, f"Mark: {text}")
+
+    async def save(self, name: str) -> None:
+        """Name the session that runs, or ran last.
+
+        Raises
+        ------
+        RecordingError
+            If there is none, or the name is taken or is none.
+        """
+        if not self._session.name:
+            raise RecordingError("nothing was recorded since the gateway started")
+        old, files = self._session.name, self._files
+        await self._on_disk(_rename_open, self.folder, old, name, files)
+        self._session.name = name
+        if self._part is not None:
+            self._part.session = name
+
+    def status(self) -> RecorderStatus:
+        """Describe this moment."""
+        session, disk = self._session, self._disk
+        return RecorderStatus(
+            state=session.state.value,
+            name=session.name,
+            part=session.part,
+            part_bytes=disk.part_bytes,
+            free_bytes=disk.free_bytes,
+            reason=session.reason,
+            folder=str(self.folder),
+        )
+
+    def frame(self, frame: bytes) -> None:
+        """Keep a MAVLink frame that was sent or received."""
+        part = self._part
+        if part is not None and self._settings.tlog:
+            part.add(TLOG, encode_record(part.stamper.stamp(self._clock()), frame))
+
+    def flight(self, record: BaroRaw | GpsFix | FusedSample) -> None:
+        """Keep what the estimator took, and the state that it made of it."""
+        if isinstance(record, GpsFix) and record.utc_us is not None:
+            self._civil.hear_gps(record.utc_us, record.time_us)
+        vehicle_id = (
+            record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
+        )
+        if self._part is not None and self._settings.table:
+            rows = self._rows.setdefault(vehicle_id, RowBuilder())
+            self._write_rows(self._part, vehicle_id, rows.add(record))
+        self._seen.add(vehicle_id)
+
+    def _write_rows(self, part: _Part, vehicle_id: int, rows: list[TableRow]) -> None:
+        ending = _table(vehicle_id)
+        if vehicle_id not in part.tables:
+            part.tables.add(vehicle_id)
+            part.add(ending, self._head(vehicle_id, part).encode())
+        for row in rows:
+            part.add(ending, row_to_line(row).encode())
+
+    def _flush_rows(self, part: _Part) -> None:
+        for vehicle_id, rows in self._rows.items():
+            self._write_rows(part, vehicle_id, rows.flush())
+        self._rows.clear()
+
+    def _head(self, vehicle_id: int, part: _Part) -> str:
+        known = self._header_of(vehicle_id)
+        return encode_head(
+            TableHeader(
+                mavgate_version=known.mavgate_version,
+                vehicle_id=vehicle_id,
+                session=part.session,
+                part=part.number,
+                cold_start=vehicle_id not in self._seen,
+                unix_us_at_zero=part.stamper.offset_us,
+                settings=known.settings,
+                calibration=known.calibration,
+            )
+        )
+
+    async def _run(self) -> None:
+        while True:
+            await self._turn()
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), self._settings.flush_s)
+
+    async def _turn(self) -> None:
+        """Write what was gathered, then let the session decide."""
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        actions = await self._flush()
+        if not actions:
+            now_us, disk = self._clock(), self._disk
+            part = self._part
+            actions = self._session.poll(
+                now_us,
+                now_us + (self._civil.offset_us or 0),
+                disk.part_bytes,
+                disk.free_bytes,
+                jumped=part is not None and part.stamper.has_jumped(self._civil),
+            )
+        while actions:
+            actions = await self._perform(actions)
+
+    async def _flush(self) -> list[SessionAction]:
+        now_us, part, files = self._clock(), self._part, self._files
+        try:
+            if part is None or files is None:
+                self._disk = DiskState(0, await self._on_disk(free_bytes_near, self.folder))
+                return []
+            if part.size > PENDING_LIMIT:
+                return self._session.failed("disk is too slow", now_us)
+            sync = now_us >= self._sync_due_us
+            if sync:
+                self._sync_due_us = now_us + round(self._settings.sync_s * US_PER_S)
+            self._disk = await self._on_disk(files.write, part.take(), sync)
+        except OSError as error:
+            return self._session.failed(reason_of(error), self._clock())
+        return []
+
+    async def _perform(self, actions: list[SessionAction]) -> list[SessionAction]:
+        """Do what the session decided; return what it decides upon the outcome."""
+        closing = self._part
+        opening = next((action for action in actions if isinstance(action, OpenPart)), None)
+        # The next part gathers from here on, so that nothing is lost while the last one closes.
+        self._part = None if any(isinstance(a, ClosePart) for a in actions) else self._part
+        if opening is not None:
+            offset_us = self._civil.offset_us or 0
+            self._part = _Part(opening.session, opening.part, offset_us)
+        following: list[SessionAction] = []
+        for action in actions:
+            match action:
+                case ClosePart():
+                    await self._close_part(closing, has_next=opening is not None)
+                case Rename():
+                    await self._rename(action, closing)
+                case OpenPart():
+                    following += await self._open_part(action)
+                case Announce():
+                    (log.warning if action.is_trouble else log.info)("%s", action.text)
+                    self._announce(action.is_trouble, action.text)
+        return following
+
+    async def _open_part(self, action: OpenPart) -> list[SessionAction]:
+        try:
+            files = await self._on_disk(PartFiles, self.folder, action.session, action.part)
+        except OSError as error:
+            self._part = None
+            return self._session.failed(reason_of(error), self._clock())
+        self._files = files
+        self._session.name = files.session
+        if self._part is not None:
+            self._part.session = files.session
+        return self._session.opened(self._clock())
+
+    async def _close_part(self, part: _Part | None, *, has_next: bool) -> None:
+        files, self._files = self._files, None
+        if part is None or files is None:
+            return
+        if not has_next:
+            self._flush_rows(part)
+        try:
+            await self._on_disk(files.write, part.take(), True)
+        except OSError as error:
+            log.warning("Recording: the end of %s is lost: %s", files.session, reason_of(error))
+        with contextlib.suppress(OSError):
+            await self._on_disk(files.close)
+
+    async def _rename(self, action: Rename, closed: _Part | None) -> None:
+        """Name a session by its true time, and shift its time stamps to it."""
+        try:
+            if closed is not None:
+                shift_us = (self._civil.offset_us or 0) - closed.stamper.offset_us
+                await self._on_disk(
+                    restamp_recording, self.folder, action.session, closed.number, shift_us
+                )
+            await self._on_disk(rename_recording, self.folder, action.session, action.to_session)
+        except (OSError, RecordingError) as error:
+            log.warning("Recording %s keeps its name: %s", action.session, error)
+
+    async def _on_disk(
+        self,
+        job: Callable[Parameters, Result],
+        *args: Parameters.args,
+        **kwargs: Parameters.kwargs,
+    ) -> Result:
+        assert not kwargs
+        return await asyncio.get_running_loop().run_in_executor(self._worker, job, *args)
+
+
+def _rename_open(folder: Path, name: str, to_name: str, files: PartFiles | None) -> None:
+    """Rename between two writes, so that no file is begun under the old name afterwards."""
+    rename_recording(folder, name, to_name)
+    if files is not None:
+        files.session = to_name
+
+
+def _table(vehicle_id: int) -> str:
+    return f"_v{vehicle_id}.csv"

@@ -1,0 +1,160 @@
+"""The folder of recordings: what is in it, and renaming and deleting without losing anything.
+
+A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog` and so on.
+"""
+
+import contextlib
+import itertools
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gateway.flightlog.session import check_name, part_stem
+from gateway.flightlog.tlog import TlogScanner, encode_record
+
+SUFFIXES: Final = (".tlog", ".csv")
+RESTAMP_LIMIT: Final = 16 << 20
+"""Larger files keep the times they were written with; `mavgate recover` can shift those."""
+
+_FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """All files of one recording."""
+
+    name: str
+    files: tuple[Path, ...]
+    size: int
+    modified_s: float
+    """When it was last written, in s since 1970."""
+
+
+class RecordingError(Exception):
+    """What was asked for cannot be done; the text says why."""
+
+
+def list_recordings(folder: Path) -> list[Recording]:
+    """List the recordings of a folder, the newest last; none if there is no such folder."""
+    files: dict[str, list[Path]] = {}
+    with contextlib.suppress(FileNotFoundError):
+        for path in sorted(folder.iterdir()):
+            if (match := _FILE_NAME.fullmatch(path.name)) and path.is_file():
+                files.setdefault(match["name"], []).append(path)
+    found = [_describe(name, paths) for name, paths in files.items()]
+    return sorted(found, key=lambda recording: recording.modified_s)
+
+
+def find_recording(folder: Path, name: str) -> Recording:
+    """Find one recording by name; `last` is the newest.
+
+    Raises
+    ------
+    RecordingError
+        If there is none.
+    """
+    recordings = list_recordings(folder)
+    if name == "last" and recordings:
+        return recordings[-1]
+    for recording in recordings:
+        if recording.name == name:
+            return recording
+    raise RecordingError(f"no recording {name!r} in {folder}")
+
+
+def free_name(folder: Path, wanted: str) -> str:
+    """Return the wanted name, or with a number behind it if there is such a recording."""
+    taken = {recording.name for recording in list_recordings(folder)}
+    names = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
+    return next(name for name in names if name not in taken)
+
+
+def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
+    """Give a recording another name, also while it is being written; never overwrites.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such recording, the new name is taken, or it is no name.
+    """
+    try:
+        check_name(to_name)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+    recording = find_recording(folder, name)
+    if free_name(folder, to_name) != to_name:
+        raise RecordingError(f"there is a recording {to_name!r} already in {folder}")
+    for path in recording.files:
+        _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
+    sync_folder(folder)
+    return find_recording(folder, to_name)
+
+
+def delete_recording(folder: Path, name: str) -> Recording:
+    """Delete the files of a recording and tell what they were.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such recording.
+    """
+    recording = find_recording(folder, name)
+    for path in recording.files:
+        path.unlink()
+    sync_folder(folder)
+    return recording
+
+
+def restamp_recording(folder: Path, name: str, part: int, shift_us: int) -> None:
+    """Shift all times of a part's tlog, once the true time is known.
+
+    The new file takes the place of the old one in one step, so a power cut leaves either.
+    """
+    path = folder / f"{part_stem(name, part)}.tlog"
+    if not path.exists() or path.stat().st_size > RESTAMP_LIMIT:
+        return
+    batch = TlogScanner().feed(path.read_bytes(), final=True)
+    shifted = b"".join(
+        encode_record(max(record.time_us + shift_us, 0), record.frame) for record in batch.records()
+    )
+    temporary = path.with_suffix(".tlog.new")
+    with temporary.open("wb") as file:
+        file.write(shifted)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make new names in a folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        # Some file systems (FAT among them) cannot; then there is nothing to be done.
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _describe(name: str, paths: list[Path]) -> Recording:
+    stats = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            stats.append(path.stat())
+    return Recording(
+        name,
+        tuple(paths),
+        sum(stat.st_size for stat in stats),
+        max((stat.st_mtime for stat in stats), default=0.0),
+    )
+
+
+def _move(path: Path, target: Path) -> None:
+    """Rename without overwriting, also on file systems without hard links."""
+    try:
+        target.touch(exist_ok=False)
+    except FileExistsError as error:
+        raise RecordingError(f"{target} is there already") from error
+    path.replace(target)

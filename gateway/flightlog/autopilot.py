@@ -1,0 +1,202 @@
+"""Read the flight out of any autopilot's MAVLink, so that it can be fused here.
+
+The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
+SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
+definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import (
+    NAN,
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NodeId,
+    Vec3,
+)
+from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+
+UT_PER_GAUSS: Final = 100.0
+MILLI: Final = 1e-3
+CENTI: Final = 1e-2
+UNKNOWN_U16: Final = 65535
+MAG_FIELDS: Final = 0b111 << 6
+"""HIGHRES_IMU's bits of what is new."""
+UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
+"""Later times are civil time, earlier ones count from the start of the autopilot."""
+
+Imported = ImuCalibrated | BaroRaw | GpsFix
+
+_FIX_TYPES: Final = {2: GpsFixType.FIX_2D, 3: GpsFixType.FIX_3D}
+_IMU_RANK: Final = {
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 3,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: 2,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
+}
+
+
+class AutopilotReader:
+    """Turn one vehicle's frames into records.
+
+    Parameters
+    ----------
+    system_id : int or None
+        Whose frames; the first system that sends an IMU message by default.
+    """
+
+    def __init__(self, system_id: int | None = None) -> None:
+        self.system_id = system_id
+        self.unix_us_at_zero: int | None = None
+        """Civil time of the records' time zero, by the times of the recording."""
+        self.undecoded = 0
+        self._decoder = mavlink.MAVLink(None)
+        self._zero_us: int | None = None
+        self._rank = 0
+        self._newest_us = 0
+        self._last_height = (-US_PER_S * 10, NAN)
+        self._handlers: dict[int, Callable[[Any, int], list[Imported]]] = {
+            mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
+            mavlink.MAVLINK_MSG_ID_RAW_IMU: self._milli_imu,
+            mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._milli_imu,
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._pressure,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps,
+        }
+
+    def feed(self, frame: bytes, time_us: int) -> list[Imported]:
+        """Take the next frame of the recording.
+
+        Parameters
+        ----------
+        frame : bytes
+            A complete frame.
+        time_us : int
+            When it was recorded, µs since 1970.
+
+        Returns
+        -------
+        list of Imported
+            What it holds; nothing for most frames. Never raises on data.
+        """
+        message_id = message_id_of(frame)
+        handler = self._handlers.get(message_id)
+        if handler is None:
+            return []
+        system_id, component_id = origin_of(frame)
+        rank = _IMU_RANK.get(message_id, 0)
+        if self.system_id is None and rank:
+            self.system_id = system_id
+        if system_id != self.system_id or component_id != 1 or (rank and rank < self._rank):
+            return []
+        self._rank = max(rank, self._rank)
+        try:
+            message = self._decoder.decode(bytearray(frame))
+        except mavlink.MAVError:
+            self.undecoded += 1
+            return []
+        return handler(message, time_us)
+
+    def _time(self, message: Any, recorded_us: int) -> int:
+        """Put a message on the records' clock, which never falls."""
+        if hasattr(message, "time_usec"):
+            own_us = int(message.time_usec)
+        else:
+            own_us = int(message.time_boot_ms) * 1000
+        if own_us == 0 or own_us > UNIX_YEAR_2000_US:
+            own_us = recorded_us
+        if self._zero_us is None:
+            self._zero_us = own_us
+            self.unix_us_at_zero = recorded_us
+        elapsed_us = own_us - self._zero_us
+        if not 0 <= elapsed_us - self._newest_us <= US_PER_S:
+            # Another clock than the IMU's, or a restart: what was recorded then is true.
+            elapsed_us = recorded_us - (self.unix_us_at_zero or 0)
+        self._newest_us = max(self._newest_us, elapsed_us)
+        return self._newest_us
+
+    def _highres_imu(self, m: Any, recorded_us: int) -> list[Imported]:
+        time_us = self._time(m, recorded_us)
+        mag: Vec3 = (m.xmag * UT_PER_GAUSS, m.ymag * UT_PER_GAUSS, m.zmag * UT_PER_GAUSS)
+        new_mag = bool(m.fields_updated & MAG_FIELDS) and any(mag)
+        return [
+            self._imu(
+                time_us,
+                (m.xacc, m.yacc, m.zacc),
+                (m.xgyro, m.ygyro, m.zgyro),
+                mag if new_mag else None,
+                m.temperature,
+            )
+        ]
+
+    def _milli_imu(self, m: Any, recorded_us: int) -> list[Imported]:
+        g, mgauss = STANDARD_GRAVITY_MPS2 * MILLI, UT_PER_GAUSS * MILLI
+        mag: Vec3 = (m.xmag * mgauss, m.ymag * mgauss, m.zmag * mgauss)
+        return [
+            self._imu(
+                self._time(m, recorded_us),
+                (m.xacc * g, m.yacc * g, m.zacc * g),
+                (m.xgyro * MILLI, m.ygyro * MILLI, m.zgyro * MILLI),
+                mag if any(mag) else None,
+                m.temperature * CENTI if getattr(m, "temperature", 0) else NAN,
+            )
+        ]
+
+    def _imu(
+        self, time_us: int, accel: Vec3, gyro: Vec3, mag: Vec3 | None, temperature_degc: float
+    ) -> ImuCalibrated:
+        flags = ImuFlags.MAG_NEW if mag else ImuFlags(0)
+        node = NodeId(self.system_id or 1, 0)
+        return ImuCalibrated(time_us, node, accel, gyro, mag, temperature_degc, flags)
+
+    def _pressure(self, m: Any, recorded_us: int) -> list[Imported]:
+        time_us, node = self._time(m, recorded_us), NodeId(self.system_id or 1, 0)
+        return [BaroRaw(time_us, node, time_us, m.press_abs * PA_PER_HPA, m.temperature * CENTI)]
+
+    def _gps(self, m: Any, recorded_us: int) -> list[Imported]:
+        time_us = self._time(m, recorded_us)
+        fix_type = _FIX_TYPES.get(min(m.fix_type, 3), GpsFixType.NONE)
+        alt_m, speed = m.alt * MILLI, _known(m.vel, CENTI)
+        course_rad = math.radians(_known(m.cog, CENTI))
+        return [
+            GpsFix(
+                time_us=time_us,
+                node=NodeId(self.system_id or 1, 1),
+                node_time_us=time_us,
+                itow_ms=0,
+                fix_type=fix_type,
+                fix_ok=fix_type is not GpsFixType.NONE,
+                satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
+                lat_dege7=m.lat,
+                lon_dege7=m.lon,
+                alt_amsl_m=alt_m,
+                vel_n_mps=(
+                    speed * math.cos(course_rad),
+                    speed * math.sin(course_rad),
+                    self._sink_rate(time_us, alt_m),
+                ),
+                alt_ellipsoid_m=m.alt_ellipsoid * MILLI if m.alt_ellipsoid else NAN,
+                h_acc_m=m.h_acc * MILLI or NAN,
+                v_acc_m=m.v_acc * MILLI or NAN,
+                speed_acc_mps=m.vel_acc * MILLI or NAN,
+                course_acc_deg=m.hdg_acc * 1e-5 or NAN,
+                pdop=_known(m.eph, CENTI),
+                utc_us=m.time_usec if m.time_usec > UNIX_YEAR_2000_US else None,
+            )
+        ]
+
+    def _sink_rate(self, time_us: int, alt_m: float) -> float:
+        """Tell the velocity down, which the message has not, from two fixes' heights."""
+        last, self._last_height = self._last_height, (time_us, alt_m)
+        dt_us = time_us - last[0]
+        return (last[1] - alt_m) * US_PER_S / dt_us if 0 < dt_us <= 2 * US_PER_S else NAN
+
+
+def _known(value: int, scale: float) -> float:
+    return NAN if value == UNKNOWN_U16 else value * scale

@@ -1,0 +1,272 @@
+"""What a recording holds, found in one pass: time, vehicles, rates, gaps, distance, damage."""
+
+import math
+import struct
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from gateway.flightlog.row import TableRow
+from gateway.flightlog.table import TableEvent, TableFault, TableHeader, TableMark
+from gateway.flightlog.tlog import Batch, TlogIndex
+from gateway.geometry.geodesy import displacement_m
+from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import START_V2
+
+GAP_US: Final = 2 * US_PER_S
+"""Every vehicle sends a heartbeat a second: a longer silence is one."""
+MAX_GAPS: Final = 1000
+STEP_US: Final = US_PER_S // 2
+"""Positions nearer in time than this are not summed: at rest their noise would be a distance."""
+LEAST_STEP_M: Final = 1.0
+
+HEARTBEAT_ID: Final = 0
+GLOBAL_POSITION_INT_ID: Final = 33
+_POSITION: Final = struct.Struct("<Iii")
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A silence."""
+
+    time_us: int
+    """When it began, in the recording's own time."""
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """How often something came."""
+
+    name: str
+    count: int
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleInfo:
+    """What one system of a recording sent."""
+
+    system_id: int
+    mav_type: int | None
+    autopilot: int | None
+    distance_m: float
+    """Along the ground."""
+    rates: tuple[Rate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FileInfo:
+    """What a recording holds."""
+
+    kind: str
+    size: int
+    records: int
+    first_us: int | None
+    """In µs since 1970 for a tlog, on the gateway clock for a table."""
+    last_us: int | None
+    duration_s: float
+    vehicles: tuple[VehicleInfo, ...]
+    gaps: tuple[Gap, ...]
+    damaged_bytes: int
+    damaged_runs: int
+    header: TableHeader | None = None
+    marks: tuple[TableMark, ...] = ()
+
+
+@dataclass(slots=True)
+class _Way:
+    """Sums up the way between positions."""
+
+    distance_m: float = 0.0
+    last: tuple[int, float, float] | None = None
+
+    def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
+        if self.last is not None:
+            if 0 <= time_us - self.last[0] < STEP_US:
+                return
+            step_m = math.hypot(*displacement_m(*self.last[1:], lat_deg, lon_deg, 0.0))
+            if step_m < LEAST_STEP_M:
+                return
+            self.distance_m += step_m
+        self.last = (time_us, lat_deg, lon_deg)
+
+
+@dataclass(slots=True)
+class _Gaps:
+    """Finds silences."""
+
+    last_us: int | None = None
+    found: list[Gap] = field(default_factory=list)
+
+    def add(self, time_us: int) -> None:
+        if self.last_us is not None and time_us - self.last_us > GAP_US:
+            self._note(self.last_us, time_us - self.last_us)
+        self.last_us = time_us
+
+    def add_all(self, times_us: np.ndarray[tuple[int], np.dtype[np.int64]]) -> None:
+        self.add(int(times_us[0]))
+        steps = np.diff(times_us)
+        for i in np.flatnonzero(steps > GAP_US).tolist():
+            self._note(int(times_us[i]), int(steps[i]))
+        self.last_us = int(times_us[-1])
+
+    def _note(self, time_us: int, duration_us: int) -> None:
+        if len(self.found) < MAX_GAPS:
+            self.found.append(Gap(time_us, duration_us / US_PER_S))
+
+
+class TlogSummary:
+    """Sums up a tlog, batch by batch."""
+
+    def __init__(self) -> None:
+        self._index = TlogIndex()
+        self._counts: Counter[tuple[int, int]] = Counter()
+        self._kinds: dict[int, tuple[int, int]] = {}
+        self._ways: dict[int, _Way] = {}
+        self._gaps = _Gaps()
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        self._index.add(batch)
+        if not len(batch):
+            return
+        self._gaps.add_all(batch.time_us)
+        keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
+        for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
+            self._counts[key >> 24, key & 0xFFFFFF] += count
+        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
+            system_id, component_id = divmod(int(batch.origins[i]), 256)
+            if component_id == 1 and system_id not in self._kinds:
+                payload = payload_of(batch.frame(i), 6)
+                self._kinds[system_id] = (payload[4], payload[5])
+        for i in np.flatnonzero(batch.message_ids == GLOBAL_POSITION_INT_ID).tolist():
+            self._add_position(batch, i)
+
+    def result(self, size: int) -> FileInfo:
+        """Tell what was found in a file of that size."""
+        index = self._index
+        duration_s = ((index.last_us or 0) - (index.first_us or 0)) / US_PER_S
+        return FileInfo(
+            kind="tlog",
+            size=size,
+            records=index.count,
+            first_us=index.first_us,
+            last_us=index.last_us,
+            duration_s=duration_s,
+            vehicles=tuple(
+                self._vehicle(system_id, duration_s)
+                for system_id in sorted({system_id for system_id, _ in self._counts})
+            ),
+            gaps=tuple(self._gaps.found),
+            damaged_bytes=index.damaged_bytes,
+            damaged_runs=len(index.damage),
+        )
+
+    def _add_position(self, batch: Batch, i: int) -> None:
+        way = self._ways.setdefault(int(batch.origins[i]) >> 8, _Way())
+        time_us = int(batch.time_us[i])
+        if way.last is not None and 0 <= time_us - way.last[0] < STEP_US:
+            return
+        _, lat, lon = _POSITION.unpack(payload_of(batch.frame(i), _POSITION.size))
+        if lat or lon:
+            way.add(time_us, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+
+    def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
+        mav_type, autopilot = self._kinds.get(system_id, (None, None))
+        counts = {key: n for (system, key), n in self._counts.items() if system == system_id}
+        return VehicleInfo(
+            system_id=system_id,
+            mav_type=mav_type,
+            autopilot=autopilot,
+            distance_m=self._ways.get(system_id, _Way()).distance_m,
+            rates=tuple(
+                _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
+                for key in sorted(counts)
+            ),
+        )
+
+
+class TableSummary:
+    """Sums up a table, event by event."""
+
+    def __init__(self) -> None:
+        self._header: TableHeader | None = None
+        self._marks: list[TableMark] = []
+        self._counts: Counter[str] = Counter()
+        self._damaged_bytes = 0
+        self._first_us: int | None = None
+        self._last_us: int | None = None
+        self._way = _Way()
+        self._gaps = _Gaps()
+
+    def add(self, events: list[TableEvent], header: TableHeader | None) -> None:
+        """Take in the next events of the file."""
+        self._header = header
+        for event in events:
+            match event:
+                case TableRow():
+                    self._add_row(event)
+                case TableMark():
+                    self._marks.append(event)
+                case TableFault():
+                    self._counts["damage"] += 1
+                    self._damaged_bytes += event.size
+
+    def result(self, size: int) -> FileInfo:
+        """Tell what was found in a file of that size."""
+        duration_s = ((self._last_us or 0) - (self._first_us or 0)) / US_PER_S
+        vehicle = VehicleInfo(
+            system_id=self._header.vehicle_id if self._header else 1,
+            mav_type=None,
+            autopilot=None,
+            distance_m=self._way.distance_m,
+            rates=tuple(
+                _rate(name, self._counts[name], duration_s)
+                for name in ("imu", "mag", "baro", "gps", "state")
+                if self._counts[name]
+            ),
+        )
+        return FileInfo(
+            kind="table",
+            size=size,
+            records=self._counts["row"],
+            first_us=self._first_us,
+            last_us=self._last_us,
+            duration_s=duration_s,
+            vehicles=(vehicle,),
+            gaps=tuple(self._gaps.found),
+            damaged_bytes=self._damaged_bytes,
+            damaged_runs=self._counts["damage"],
+            header=self._header,
+            marks=tuple(self._marks),
+        )
+
+    def _add_row(self, row: TableRow) -> None:
+        counts, imu = self._counts, row.imu
+        counts["row"] += 1
+        counts["imu"] += imu is not None or row.raw is not None
+        counts["mag"] += imu is not None and imu.mag_b_ut is not None
+        counts["baro"] += row.baro is not None
+        counts["gps"] += row.gps is not None
+        counts["state"] += row.state is not None
+        if self._first_us is None:
+            self._first_us = row.time_us
+        self._last_us = max(row.time_us, self._last_us or 0)
+        self._gaps.add(row.time_us)
+        if row.gps is not None and row.gps.fix_ok:
+            fix = row.gps
+            self._way.add(fix.time_us, fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
+
+
+def payload_of(frame: bytes, size: int) -> bytes:
+    """Return the first bytes of a frame's payload, with the zeros that version 2 cuts off."""
+    begin = 10 if frame[0] == START_V2 else 6
+    return frame[begin : begin + min(frame[1], size)].ljust(size, b"\0")
+
+
+def _rate(name: str, count: int, duration_s: float) -> Rate:
+    return Rate(name, count, round(count / duration_s, 3) if duration_s > 0 else 0.0)
