@@ -14,5 +14,6 @@ def refuse(text: str) -> NoReturn:
     text : str
         What was wrong, where, and what to do; one or more lines.
     """
-    Console(stderr=True, highlight=False, soft_wrap=True).print(text, style="red", markup=False)
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(text, style="red", markup=False, emoji=False)
     raise typer.Exit(2)
