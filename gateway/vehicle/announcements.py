@@ -89,7 +89,7 @@ class Announcements:
     def _on_restarts(self, now_us: int) -> list[Any]:
         found = []
         for node, restarts in sorted(self._health.restarts().items()):
-            if restarts > self._restarts.get(node, 0):
+            if restarts > self._restarts.get(node, restarts):
                 found += self.say(Told(WARNING, f"Node {node} restarted"), now_us)
             self._restarts[node] = restarts
         return found

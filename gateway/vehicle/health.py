@@ -26,6 +26,7 @@ PRESSURE: Final = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
 GPS: Final = mavlink.MAV_SYS_STATUS_SENSOR_GPS
 AHRS: Final = mavlink.MAV_SYS_STATUS_AHRS
 LOGGING: Final = mavlink.MAV_SYS_STATUS_LOGGING
+GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
 PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
@@ -141,6 +142,8 @@ class Health:
             if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID:
                 healthy |= 0 if self._nav_flags & BAD_FOR_AHRS else AHRS
         present |= LOGGING | PREARM
+        # There is no fence, so none is breached; MAVProxy cries breach without this bit.
+        healthy |= GEOFENCE
         enabled = present if self.recording else present & ~LOGGING
         healthy |= LOGGING if self.recording else 0
         needed = GYRO | ACCEL | GPS | AHRS | present & MAG

@@ -2,8 +2,8 @@
 
 `paper.alpha_gyro` becomes PAPER_ALPHA_GYRO and `rates.attitude_quaternion_hz` RATE_ATT_QUAT: the
 unit goes (it is in the metadata), long words have fixed abbreviations, and what is still too long
-loses vowels behind its first word. The name depends on the key alone, so that it stays the same
-when other settings come and go.
+loses vowels behind its first word. The name depends on the section's keys alone, so that it stays
+the same when settings elsewhere come and go.
 """
 
 from typing import Final

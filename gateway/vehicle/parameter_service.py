@@ -50,7 +50,7 @@ class ParameterService:
         parameter = self._named(request.message.param_id)
         if parameter is None:
             return [self._error(request, UNKNOWN)]
-        return [request.reply(self._value(parameter)), self._error(request, FORBIDDEN)]
+        return [self._error(request, FORBIDDEN), request.reply(self._value(parameter))]
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one request."""
@@ -125,7 +125,8 @@ class ParameterService:
         try:
             settings = self.table.change(parameter, number)
         except ValueError:
-            return [self.told(parameter), self._error(request, BAD_VALUE)]
+            # The error first: a client that sees only the old value would try again.
+            return [self._error(request, BAD_VALUE), self.told(parameter)]
         path = ".".join(parameter.path)
         change = SettingsChange(self._vehicle_id, parameter.section, settings, path)
         return [change, self.told(parameter)]

@@ -3,7 +3,18 @@ from dataclasses import replace
 import pytest
 
 from gateway.records import ImuFlags, NavFlags, NodeId, ReceiverStatus
-from gateway.vehicle.health import ACCEL, AHRS, GPS, GYRO, LOGGING, MAG, PREARM, PRESSURE, Health
+from gateway.vehicle.health import (
+    ACCEL,
+    AHRS,
+    GEOFENCE,
+    GPS,
+    GYRO,
+    LOGGING,
+    MAG,
+    PREARM,
+    PRESSURE,
+    Health,
+)
 from tests.vehicle.samples import (
     BARO,
     FIX,
@@ -31,14 +42,14 @@ def healthy() -> Health:
 def test_nothing_is_present_before_it_is_heard() -> None:
     present, _, well = Health(1, 2.0).sensors(0)
     assert not present & ALL
-    assert not well
+    assert well == GEOFENCE
 
 
 def test_all_well_is_ready_to_fly() -> None:
     present, enabled, well = healthy().sensors(1_500_000)
     assert present == ALL | LOGGING | PREARM
     assert enabled == ALL | PREARM
-    assert well == ALL | PREARM
+    assert well == ALL | PREARM | GEOFENCE
 
 
 def test_a_silent_sensor_is_present_but_unhealthy() -> None:
@@ -60,7 +71,7 @@ def test_a_silent_sensor_is_present_but_unhealthy() -> None:
 def test_faults_of_the_imu(sample: object, state: object, bad: int) -> None:
     health = healthy()
     health.on_state(state, sample)
-    assert health.sensors(1_500_000)[2] == (ALL | PREARM) & ~bad
+    assert health.sensors(1_500_000)[2] == (ALL | PREARM | GEOFENCE) & ~bad
 
 
 def test_an_absent_magnetometer_does_not_forbid_flying() -> None:

@@ -1,4 +1,5 @@
 import math
+import re
 import struct
 from typing import Annotated
 
@@ -6,6 +7,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.config import GatewaySettings
+from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, setting
 from gateway.vehicle.actions import SaveSettings, SettingsChange
 from gateway.vehicle.parameter_names import parameter_name
@@ -142,7 +145,7 @@ def test_a_value_out_of_range_changes_nothing(
     station: GroundStation, name: str, value: float
 ) -> None:
     before = values(station)
-    answer, error = station.send(set_message(name, value))
+    error, answer = station.send(set_message(name, value))
     assert (answer.param_id, answer.param_value) == (name, pytest.approx(before[name]))
     assert (error.get_type(), error.error) == ("PARAM_ERROR", ERROR["range"])
     assert station.of(SettingsChange) == []
@@ -174,8 +177,8 @@ def test_integers_encoded_byte_wise_are_understood(
 def test_an_untrusted_client_changes_nothing_and_is_told(station: GroundStation) -> None:
     station.trusted = False
     found = station.send(set_message("TUNING_ORDER", 5.0))
-    assert kinds(found) == ["PARAM_VALUE", "PARAM_ERROR", "STATUSTEXT"]
-    assert (found[0].param_value, found[1].error) == (2.0, ERROR["denied"])
+    assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
+    assert (found[0].error, found[1].param_value) == (ERROR["denied"], 2.0)
     assert found[2].text == "Refused PARAM_SET of system 255"
     assert station.vehicle.refusals == 1
     assert station.of(SettingsChange) == []
@@ -214,3 +217,23 @@ def test_two_settings_of_one_name_are_a_fault_of_the_caller() -> None:
 def test_every_rate_is_named_as_its_message() -> None:
     for field in RateSettings.__struct_fields__:
         assert hasattr(mavlink, f"MAVLINK_MSG_ID_{field.removesuffix('_hz').upper()}")
+
+
+def test_the_gateways_own_settings_have_names_that_tell() -> None:
+    settings = GatewaySettings()
+    sections = {
+        "vehicle": settings.vehicle,
+        "sensing": settings.sensing,
+        "estimation": settings.estimation,
+        "calibration": NodeCalibration(),
+    }
+    table = ParameterTable(sections)
+    assert {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "SENS_ACC_CUTOFF", "REF_GPS_LATENCY"} <= set(
+        table.index
+    )
+    for parameter in table.parameters:
+        assert re.fullmatch(r"[A-Z][A-Z0-9_]{1,15}", parameter.name)
+        assert table.number(parameter) == pytest.approx(
+            parameter.to_number(parameter.field.default)
+        ), "the default is within its own range"
+        assert parameter.field.meaning, parameter.name

@@ -173,6 +173,12 @@ def test_link_and_nodes_are_told() -> None:
     assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "Node 1 is back"]
 
 
+def test_a_node_that_restarts_is_told() -> None:
+    vehicle = make()
+    assert "Node 0 restarted" not in texts(vehicle.on_link(report(link(restarts=3)), ONE_S))
+    assert texts(vehicle.on_link(report(link(restarts=4)), ONE_S)) == ["Node 0 restarted"]
+
+
 def test_flags_of_the_estimator_are_told_and_cannot_flood() -> None:
     vehicle = make()
     told = texts(fly(vehicle, 0, 2))
