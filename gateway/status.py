@@ -1,6 +1,6 @@
 """One moment of the daemon: what the live view, the status command and the metrics show."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.records import LinkReport, NavState
 from gateway.routing.clients import ClientStats, HubCounters
@@ -17,4 +17,4 @@ class Snapshot:
     clients: tuple[ClientStats, ...]
     sent: tuple[tuple[int, int], ...]
     """MAVLink message id and how many were sent since the start."""
-    hub: HubCounters = HubCounters()
+    hub: HubCounters = field(default_factory=HubCounters)

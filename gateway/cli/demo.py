@@ -10,7 +10,8 @@ from gateway.cli.run import (
     ConfigOption,
     EndpointOption,
     PlainOption,
-    read_settings,
+    load_settings,
+    or_refuse,
     serve,
     with_endpoints,
 )
@@ -38,13 +39,17 @@ def demo(
 
     The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates.
     """
-    settings = with_endpoints(read_settings(config), endpoint)
+
+    def read() -> GatewaySettings:
+        return with_endpoints(load_settings(config), endpoint)
+
+    settings = or_refuse(read)
     line = simulate(settings.simulator, unix_time_us()).frames()
     aircraft = calibrated_aircraft(settings)
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
         settings = msgspec.structs.replace(settings, aircraft_folder=folder)
-        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), plain=plain))
+        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), read, plain=plain))
 
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
