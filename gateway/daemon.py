@@ -11,8 +11,10 @@ import msgspec
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.hub import Hub
+from gateway.edges.metrics import MetricsServer
 from gateway.edges.pty_port import PtyPort
 from gateway.edges.serial_link import SerialLink
+from gateway.edges.service import ServiceNotifier, set_realtime_priority
 from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
@@ -64,26 +66,53 @@ class Daemon:
             PipelineSettings(settings.default_aircraft, aircraft, unix_time_us() - self.now_us())
         )
         self._pipeline.disconnect(serial.port)
-        self._hub = Hub(settings.hub, self._on_frame, self.now_us)
+        self._hub = Hub(
+            settings.hub,
+            self._on_frame,
+            self.now_us,
+            on_gone=self._pipeline.forget_client,
+            on_trouble=self._on_trouble,
+        )
+        self._metrics = MetricsServer(self.snapshot)
+        self._notifier = ServiceNotifier()
         self._serial = SerialLink(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
+        set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
+        self._metrics.listen(self._settings.hub.metrics_port)
         self._serial.start()
         if self._receiver is not None:
             self._receiver.start()
         self._poll()
+        self._notifier.ready()
+
+    def reload(self, settings: GatewaySettings) -> None:
+        """Take over changed settings of the hub; clients that stay notice nothing.
+
+        The other sections hold from the next start on.
+        """
+        self._notifier.reloading()
+        later = msgspec.structs.replace(settings, hub=self._settings.hub) != self._settings
+        self._settings = msgspec.structs.replace(self._settings, hub=settings.hub)
+        self._hub.apply(settings.hub)
+        self._metrics.listen(settings.hub.metrics_port)
+        set_realtime_priority(settings.hub.realtime_priority)
+        self._notifier.ready()
+        log.info("settings of the hub applied%s", "; others need a new start" if later else "")
 
     def close(self) -> None:
         """End everything: first what comes in, then what goes out."""
+        self._notifier.stopping()
         if self._receiver is not None:
             self._receiver.close()
         self._serial.close()
         if self._timer is not None:
             self._timer.cancel()
+        self._metrics.close()
         self._hub.close()
 
     def snapshot(self) -> Snapshot:
@@ -103,6 +132,9 @@ class Daemon:
 
     def _on_lost(self, port: str) -> None:
         self._pipeline.disconnect(port)
+
+    def _on_trouble(self, text: str) -> None:
+        self._perform(self._pipeline.say(Told(WARNING, text), self.now_us()))
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         self._perform(self._pipeline.feed(data, now_us))

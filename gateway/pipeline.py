@@ -51,6 +51,7 @@ from gateway.vehicle.actions import (
     SaveSettings,
     SettingsChange,
 )
+from gateway.vehicle.events import Told
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
@@ -245,6 +246,13 @@ class Pipeline:
         """Drop what was kept for a client that has gone."""
         for aircraft in self.aircraft.values():
             aircraft.vehicle.forget_client(client_id)
+
+    def say(self, told: Told, now_us: int) -> list[Action]:
+        """Let every aircraft tell its clients a text."""
+        actions: list[Action] = []
+        for aircraft in self.aircraft.values():
+            actions += aircraft.perform(aircraft.vehicle.say(told, now_us), now_us)
+        return actions
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""

@@ -15,7 +15,8 @@ from gateway.cli.run import (
     ConfigOption,
     EndpointOption,
     PlainOption,
-    read_settings,
+    load_settings,
+    or_refuse,
     serve,
     with_endpoints,
 )
@@ -49,7 +50,11 @@ def demo(
 
     The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates.
     """
-    settings = with_endpoints(read_settings(config), endpoint)
+
+    def read() -> GatewaySettings:
+        return with_endpoints(load_settings(config), endpoint)
+
+    settings = or_refuse(read)
     try:
         if flight is None:
             line = simulate(settings.simulator, unix_time_us()).frames()
@@ -61,7 +66,7 @@ def demo(
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
         settings = replace(settings, aircraft_folder=folder)
-        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), plain=plain))
+        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), read, plain=plain))
 
 
 def recorded_line(

@@ -50,23 +50,32 @@ def run_gateway(
     plain: PlainOption = False,
 ) -> None:
     """Run the gateway on the receiver's serial port until interrupted."""
-    settings = read_settings(config)
-    if port is not None:
-        serial = msgspec.structs.replace(settings.serial, port=port)
-        settings = msgspec.structs.replace(settings, serial=serial)
-    settings = with_endpoints(settings, endpoint)
+
+    def read() -> GatewaySettings:
+        settings = load_settings(config)
+        if port is not None:
+            serial = msgspec.structs.replace(settings.serial, port=port)
+            settings = msgspec.structs.replace(settings, serial=serial)
+        return with_endpoints(settings, endpoint)
+
+    settings = or_refuse(read)
     aircraft = read_aircraft(settings)
-    asyncio.run(serve(lambda: Daemon(settings, aircraft), plain=plain))
+    asyncio.run(serve(lambda: Daemon(settings, aircraft), read, plain=plain))
 
 
-def read_settings(file: Path | None) -> GatewaySettings:
+def load_settings(file: Path | None) -> GatewaySettings:
     """Load the settings that a command was given, the user's own, or the defaults."""
     if file is None:
         file = USER_CONFIG.expanduser()
         if not file.exists():
             return GatewaySettings()
+    return load(file)
+
+
+def or_refuse(read: Callable[[], GatewaySettings]) -> GatewaySettings:
+    """Read settings at the start of a command, which ends if they are wrong."""
     try:
-        return load(file)
+        return read()
     except ConfigError as error:
         refuse(str(error))
 
@@ -90,13 +99,17 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
     return msgspec.structs.replace(settings, hub=hub)
 
 
-async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
-    """Run a daemon until SIGINT or SIGTERM, showing what it does.
+async def serve(
+    daemon_of: Callable[[], Daemon], read: Callable[[], GatewaySettings], *, plain: bool
+) -> None:
+    """Run a daemon until SIGINT or SIGTERM, showing what it does; SIGHUP reloads the settings.
 
     Parameters
     ----------
     daemon_of : callable
         Builds the daemon; called inside the event loop.
+    read : callable
+        Reads the settings again, or raises ConfigError.
     plain : bool
         Log lines even on a terminal.
     """
@@ -107,6 +120,7 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
     if view is not None:
         logging.getLogger().handlers[:] = [view.log]
     daemon = daemon_of()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reload, daemon, read)
     daemon.start()
     try:
         if view is None:
@@ -115,6 +129,16 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
             await _live_view(daemon, view, stopped)
     finally:
         daemon.close()
+
+
+def reload(daemon: Daemon, read: Callable[[], GatewaySettings]) -> None:
+    """Let a daemon take over changed settings; wrong ones are told and change nothing."""
+    try:
+        settings = read()
+    except ConfigError as error:
+        log.warning("settings not reloaded: %s", error)
+        return
+    daemon.reload(settings)
 
 
 async def _live_view(daemon: Daemon, view: LiveView, stopped: asyncio.Event) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
@@ -13,7 +14,8 @@ log = logging.getLogger(__name__)
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 REQUEST_LIMIT_S: Final = 5.0
-MAX_REQUEST_LINES: Final = 100
+MAX_REQUEST_BYTES: Final = 8192
+MAX_CONNECTIONS: Final = 8
 
 Sample = tuple[dict[str, str], float]
 
@@ -29,42 +31,62 @@ class MetricsServer:
 
     def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
         self._snapshot = snapshot
-        self._server: asyncio.Server | None = None
-        self.port = 0
-        """The port that is bound, or 0."""
+        self._socket: socket.socket | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
 
-    async def listen(self, port: int) -> None:
+    @property
+    def port(self) -> int:
+        """The port that is bound, or 0."""
+        return self._socket.getsockname()[1] if self._socket else 0
+
+    def listen(self, port: int) -> None:
         """Serve on a loopback port; 0 ends it. Another port replaces the former one."""
+        if port == self.port:
+            return
         self.close()
         if not port:
             return
         try:
-            self._server = await asyncio.start_server(self._serve, "127.0.0.1", port)
+            self._socket = socket.create_server(("127.0.0.1", port))
         except OSError as error:
             log.warning("no metrics: %s", error)
             return
-        self.port = self._server.sockets[0].getsockname()[1]
+        self._socket.setblocking(False)
+        asyncio.get_running_loop().add_reader(self._socket, self._on_readable, self._socket)
 
     def close(self) -> None:
         """Stop serving."""
-        if self._server is not None:
-            self._server.close()
-            self._server = None
-            self.port = 0
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def _on_readable(self, sock: socket.socket) -> None:
         try:
-            async with asyncio.timeout(REQUEST_LIMIT_S):
-                request = await reader.readline()
-                for _ in range(MAX_REQUEST_LINES):
-                    if await reader.readline() in (b"\r\n", b"\n", b""):
-                        break
-                writer.write(self._respond(request))
-                await writer.drain()
-        except (OSError, TimeoutError, ValueError) as error:
-            log.debug("metrics request failed: %s", error)
-        finally:
-            writer.close()
+            connection, _ = sock.accept()
+        except OSError:
+            return
+        if len(self._tasks) >= MAX_CONNECTIONS:
+            connection.close()
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(connection))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, connection: socket.socket) -> None:
+        loop, request = asyncio.get_running_loop(), b""
+        with connection:
+            connection.setblocking(False)
+            try:
+                async with asyncio.timeout(REQUEST_LIMIT_S):
+                    while b"\r\n\r\n" not in request and len(request) < MAX_REQUEST_BYTES:
+                        data = await loop.sock_recv(connection, 4096)
+                        if not data:
+                            return
+                        request += data
+                    await loop.sock_sendall(connection, self._respond(request))
+            except (OSError, TimeoutError) as error:
+                log.debug("metrics request failed: %s", error)
 
     def _respond(self, request: bytes) -> bytes:
         words = request.split()

@@ -103,24 +103,28 @@ class TestServer:
 
     async def test_serves_and_refuses(self) -> None:
         server = MetricsServer(lambda: SNAPSHOT)
-        await server.listen(_free_port())
+        server.listen(_free_port())
         answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
         head, _, body = answer.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200 OK")
         assert f"Content-Length: {len(body)}".encode() in head
         assert body.decode() == prometheus_text(SNAPSHOT)
         assert (await self.ask(server.port, b"POST / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 405")
+        port = server.port
         server.close()
+        await asyncio.sleep(0)
         assert server.port == 0
+        with pytest.raises(ConnectionRefusedError):
+            await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
 
     async def test_zero_serves_none_and_a_taken_port_is_told(
         self, caplog: pytest.LogCaptureFixture
     ) -> None:
         first, second = MetricsServer(lambda: SNAPSHOT), MetricsServer(lambda: SNAPSHOT)
-        await first.listen(0)
+        first.listen(0)
         assert first.port == 0
-        await first.listen(_free_port())
-        await second.listen(first.port)
+        first.listen(_free_port())
+        second.listen(first.port)
         assert second.port == 0
         assert "no metrics" in caplog.text
         first.close()

@@ -1,0 +1,71 @@
+"""The gateway as a service: readiness, metrics, settings changed while it flies."""
+
+import itertools
+import signal
+import socket
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.processes import Client, Gateway, free_udp_ports
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+CHANGED = """
+[hub]
+endpoints = ["udp:127.0.0.1:{port}", "udp:127.0.0.1:{extra}?deny=ATTITUDE"]
+metrics_port = {metrics}
+"""
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        sock.bind(str(tmp_path / "notify"))
+        sock.settimeout(60)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield sock
+
+
+def test_a_reload_changes_clients_and_leaves_no_gap(
+    start_gateway: Callable[..., Gateway],
+    connect: Callable[..., Client],
+    systemd: socket.socket,
+    tmp_path: Path,
+) -> None:
+    gateway = start_gateway("demo")
+    assert systemd.recv(200) == b"READY=1"
+    steady = connect(gateway.port)
+    steady.until(lambda seen: "ATTITUDE_QUATERNION" in seen)
+    extra, metrics = free_udp_ports(2)
+    numbers: list[int] = []
+    settings = tmp_path / "gateway.toml"
+
+    def follow(frames: int) -> None:
+        for _ in range(frames):
+            numbers.extend(
+                message.get_seq() for message in steady.receive() if message.get_srcComponent() == 1
+            )
+
+    follow(50)
+    settings.write_text(CHANGED.format(port=gateway.port, extra=extra, metrics=metrics))
+    gateway.process.send_signal(signal.SIGHUP)
+    told = [systemd.recv(200).split(b"\n")[0] for _ in range(2)]
+    assert told == [b"RELOADING=1", b"READY=1"]
+    follow(50)
+    newcomer = connect(extra)
+    seen = newcomer.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
+    assert "ATTITUDE" not in seen
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=10) as page:
+        text = page.read().decode()
+    assert f'remote="127.0.0.1:{extra}"' in text
+    settings.write_text("[hub]\nendpoints = 7\n")
+    gateway.process.send_signal(signal.SIGHUP)
+    follow(100)
+    steps = {(after - before) % 256 for before, after in itertools.pairwise(numbers)}
+    assert steps == {1}
+    assert gateway.stop() == 0
+    assert systemd.recv(200) == b"STOPPING=1"
+    assert "settings not reloaded" in gateway.log.read_text()
