@@ -13,12 +13,14 @@ namespace {
 
 enum State : uint8_t { ABSENT, IDLE, SENDING };
 
-constexpr uint8_t RETRIES = 4;
-constexpr uint8_t ROUNDS = 4;
-// Pauses in units of 250 us: steps longer than a packet's air time, the shortest long enough for
-// the acknowledgement (table 18 of the chip's specification).
-constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 6 : RADIO_KBPS == 1000 ? 2 : 1;
-constexpr uint8_t PAUSE_FIRST = RADIO_KBPS == 250 ? 2 : PAUSE_STEP;
+// One retry by the chip alone, then a new pause: twenty attempts in all.
+constexpr uint8_t RETRIES = 1;
+constexpr uint8_t ROUNDS = 10;
+// Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
+// 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
+// the acknowledgement (section 7.4.2 of the chip's specification).
+constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 7 : RADIO_KBPS == 1000 ? 3 : 2;
+constexpr uint8_t PAUSE_FIRST = 2;
 constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 4;
 static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
 

@@ -11,7 +11,7 @@
 // | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
 //
 // Two nodes whose packets collided would collide again if both paused for the same time; so every
-// round of retries draws its pause, in steps longer than a packet.
+// round of retries draws its pause anew.
 #pragma once
 
 #include <stdint.h>

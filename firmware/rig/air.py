@@ -40,7 +40,7 @@ class Listener(Protocol):
     def listens(self, channel: int, kbps: int, start_ps: int) -> bool:
         """Whether it has been receiving there since `start_ps` without a break."""
 
-    def hear(self, packet: Packet, start_ps: int) -> None:
+    def hear(self, packet: Packet) -> None:
         """Take a packet that ended now, undamaged."""
 
 
@@ -112,4 +112,4 @@ class Air:
                 if self.loss and self.rng.random() < self.loss:
                     self.missed += 1
                 else:
-                    listener.hear(packet, sent.start_ps)
+                    listener.hear(packet)

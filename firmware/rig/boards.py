@@ -11,7 +11,7 @@ from firmware.rig.bench import Bench, Timer
 from firmware.rig.bmp180 import Bmp180
 from firmware.rig.hmc5883l import Hmc5883l
 from firmware.rig.i2c import I2cBus
-from firmware.rig.m8n import M8n
+from firmware.rig.m8n import COMPUTING_S, M8n
 from firmware.rig.mcu import FIRMWARE, Mcu
 from firmware.rig.mpu6050 import Mpu6050
 from firmware.rig.nrf24 import Nrf24
@@ -41,6 +41,7 @@ class Setup:
     world: World = field(default_factory=World)
     build: Path = FIRMWARE / "build"
     frequency_hz: int = 16_000_000
+    gps_computing_s: float = COMPUTING_S
 
     def __post_init__(self) -> None:
         self.bench = Bench()
@@ -125,7 +126,12 @@ class GpsNode(Board):
     def __init__(self, setup: Setup, clock_ppm: float = 0.0, program: str = "gps_node") -> None:
         super().__init__(setup, program, clock_ppm)
         self.m8n = M8n(
-            setup.bench, setup.world, setup.rng(), self.mcu.uart_feed, lambda: self.mcu.uart_baud
+            setup.bench,
+            setup.world,
+            setup.rng(),
+            self.mcu.uart_feed,
+            lambda: self.mcu.uart_baud,
+            setup.gps_computing_s,
         )
         setup.bench.after_step.append(self._pass_bytes)
 

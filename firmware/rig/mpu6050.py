@@ -16,6 +16,7 @@ INT_PIN_CFG, INT_ENABLE, DATA, PWR_MGMT_1, WHO_AM_I = 0x37, 0x38, 0x3B, 0x6B, 0x
 _ASLEEP: Final = 0x40
 _RESET: Final = 0x80
 _GRAVITY_MPS2: Final = 9.80665
+_PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
 _DLPF_HZ: Final = (260, 184, 94, 44, 21, 10, 5)
 _INT_PULSE_PS: Final = 50 * PS_PER_US
 _NOISE_COUNTS: Final = 1.5
@@ -129,7 +130,7 @@ class Mpu6050(RegisterDevice):
         accel_config = self._registers.get(ACCEL_CONFIG, 0)
         gyro_config = self._registers.get(GYRO_CONFIG, 0)
         per_g = 16384 >> (accel_config >> 3 & 3)
-        per_dps = 131 / (1 << (gyro_config >> 3 & 3))
+        per_dps = _PER_DPS[gyro_config >> 3 & 3]
         noise = self._rng.normal(0.0, self._noise, 6) if self._noise else np.zeros(6)
         words = []
         for axis in range(3):

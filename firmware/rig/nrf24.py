@@ -233,7 +233,7 @@ class Nrf24:
             and (channel, kbps) == (self._channel, self._kbps)
         )
 
-    def hear(self, packet: Packet, start_ps: int) -> None:
+    def hear(self, packet: Packet) -> None:
         """Take an undamaged packet."""
         if self._receiving_mode():
             self._hear_data(packet)

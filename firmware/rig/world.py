@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Final
 
 Vec3 = tuple[float, float, float]
@@ -40,11 +39,11 @@ class Solution:
     fix_type: int = 3
     fix_ok: bool = True
     satellites: int = 14
+    time_valid: bool = True
 
 
-START_UTC: Final = datetime(2026, 11, 19, 0, 0, tzinfo=UTC)
-START_ITOW_MS: Final = 345_600_000
-"""The same moment within the GPS week, leap seconds left aside."""
+START_UNIX_US: Final = 1_795_046_400_000_000
+"""19 November 2026, 00:00 UTC."""
 
 
 @dataclass(frozen=True)
@@ -53,3 +52,4 @@ class World:
 
     moment: Callable[[float], Moment] = lambda _time_s: Moment()
     solution: Callable[[float], Solution] = lambda _time_s: Solution()
+    start_unix_us: int = START_UNIX_US

@@ -1,25 +1,41 @@
-"""The firmware's tests need compilers and the simulator; without them they are skipped."""
+"""Programs built once, a bench for every test; skipped where the tools are not installed."""
 
-import shutil
-import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-FIRMWARE = ROOT / "firmware"
-PACKAGES = "gcc-avr avr-libc libsimavr-dev libelf-dev g++ make cppcheck"
-
 sys.path.insert(0, str(ROOT))
 
-
-def need(*programs: str) -> None:
-    missing = [program for program in programs if shutil.which(program) is None]
-    if missing:
-        pytest.skip(f"{', '.join(missing)} not found: apt-get install {PACKAGES}")
+from firmware.rig import build as builder  # noqa: E402 - the checkout is no installed package
+from firmware.rig.boards import Setup  # noqa: E402
+from tests.firmware.harness import Bench  # noqa: E402
 
 
-def make(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = ["make", "-j2", "-C", str(FIRMWARE), f"PYTHON={sys.executable}", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+@pytest.fixture(scope="session")
+def build() -> Callable[..., Path]:
+    if missing := builder.missing_tools():
+        pytest.skip(f"{', '.join(missing)} not found: apt-get install {builder.PACKAGES}")
+    return builder.build
+
+
+@pytest.fixture(scope="session")
+def programs(build: Callable[..., Path]) -> Path:
+    return build()
+
+
+@pytest.fixture
+def bench(programs: Path) -> Iterator[Callable[..., Bench]]:
+    """Make benches: boards on one time line, their frames decoded."""
+    made: list[Bench] = []
+
+    def make(**setup: Any) -> Bench:
+        made.append(Bench(Setup(**{"build": programs, **setup})))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()

@@ -1,0 +1,42 @@
+"""The receiver's serial line with the real programs behind it, for `mavgate demo --firmware`."""
+
+from collections.abc import Iterator
+
+from firmware.rig.boards import Setup
+from firmware.rig.build import build
+from firmware.rig.flight import FlightWorld
+from firmware.rig.tracker import Tracker
+from gateway.simulator.receiver import TimedFrame
+from gateway.simulator.settings import SimulatorSettings
+
+
+def frames(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
+    """Fly the first simulated aircraft with the firmware in the loop.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+        Flight, sensors and loss on the air; rates are the firmware's own.
+    start_unix_us : int
+        UTC at the start.
+
+    Returns
+    -------
+    iterator of TimedFrame
+        Endless. Each step takes some milliseconds of the processor.
+
+    Raises
+    ------
+    BuildError
+        If a compiler or the simulator is missing.
+    """
+    folder = build(f"-DVEHICLE_ID={settings.vehicle_id}" if settings.vehicle_id != 1 else "")
+    flight = FlightWorld(settings, start_unix_us=start_unix_us)
+    setup = Setup(
+        seed=settings.seed,
+        loss=settings.radio_loss,
+        world=flight.world,
+        build=folder,
+        gps_computing_s=settings.gps_latency_s,
+    )
+    return Tracker(setup, noise=False).frames()

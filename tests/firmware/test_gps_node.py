@@ -1,0 +1,162 @@
+"""The GPS node's program against the model of the M8N."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+
+from firmware.rig.m8n import FACTORY_BAUD
+from firmware.rig.world import Solution, World
+from gateway.records import GpsFixType
+from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, NodeStatusPayload, RadioFrame
+from tests.firmware.harness import Bench
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+MakeBench = Callable[..., Bench]
+GPS = 1 << 3
+CONFIGURED_S = 1.5
+
+
+def always(solution: Solution) -> World:
+    return World(solution=lambda _time_s: solution)
+
+
+def test_a_receiver_fresh_from_the_factory_is_configured(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S)
+    m8n = node.m8n
+    assert m8n.baud == 57_600
+    assert m8n.period_s == 0.2
+    assert m8n.dynamic_model == 8
+    assert m8n.ubx_only
+    assert m8n.pvt_on
+    rig.run(2.0)
+    assert len(rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)) == pytest.approx(10, abs=1)
+    status = rig.last(NodeStatusPayload)
+    assert (status.sensors_present, status.sensors_failed) == (GPS, 0)
+    assert status.sample_rate_hz == pytest.approx(5, abs=1)
+
+
+def test_fix_and_quality_carry_the_solution(bench: MakeBench) -> None:
+    rig = bench(world=always(Solution(geoid_separation_m=-7.5, alt_amsl_m=-12.5)))
+    rig.gps_node()
+    rig.run(CONFIGURED_S + 0.5)
+    fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
+    assert (fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_mm) == (-77_123_456, 1_103_654_321, -12_500)
+    assert fix.vel_n_cmps == (1234, -567, -89)
+    assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.FIX_3D, True, 14)
+    assert (quality.h_acc_cm, quality.v_acc_cm, quality.speed_acc_cmps) == (180, 310, 42)
+    assert (quality.course_acc_cdeg, quality.pdop_centi) == (275, 161)
+    assert quality.geoid_separation_cm == -750
+    assert quality.utc is not None
+    assert quality.utc.isoformat().startswith("2026-11-19T00:00:0")
+
+
+def test_quality_comes_directly_before_its_fix(bench: MakeBench) -> None:
+    rig = bench(loss=0.2, seed=4)
+    rig.gps_node()
+    rig.run(CONFIGURED_S + 1.5)
+    frames = [f for _, f in rig.frames if not isinstance(f.payload, NodeStatusPayload)]
+    assert len(frames) >= 14
+    for quality, fix in zip(frames[::2], frames[1::2], strict=False):
+        assert isinstance(quality.payload, GpsQualityPayload)
+        assert isinstance(fix.payload, GpsFixPayload)
+        assert quality.payload.itow_ms == fix.payload.itow_ms
+        assert quality.header.node_time_us == fix.header.node_time_us
+
+
+def test_node_time_is_the_arrival_of_the_first_byte(bench: MakeBench) -> None:
+    rig = bench(gps_computing_s=0.12)
+    rig.gps_node()
+    rig.run(CONFIGURED_S + 1.5)
+    for _, frame in rig.frames:
+        if isinstance(frame.payload, GpsFixPayload):
+            late_us = frame.header.node_time_us % 200_000 - 120_000
+            assert -1000 < late_us < 1000
+
+
+def test_no_fix_is_told_and_sent_on(bench: MakeBench) -> None:
+    blind = Solution(
+        fix_type=0, fix_ok=False, satellites=2, time_valid=False, h_acc_m=4e6, lat_deg=0.0
+    )
+    rig = bench(world=always(blind))
+    rig.gps_node()
+    rig.run(CONFIGURED_S + 1.0)
+    fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
+    assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 2)
+    assert quality.utc is None
+    assert quality.h_acc_cm == 65_535
+    assert rig.last(NodeStatusPayload).sensors_failed == 0
+
+
+def test_a_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S + 0.5)
+    node.m8n.reset()
+    assert node.m8n.baud == FACTORY_BAUD
+    lost_s = rig.now_s
+    rig.run(4.0)
+    found = [t for t, f in rig.frames if isinstance(f.payload, GpsFixPayload) and t > lost_s + 0.5]
+    assert found[0] - lost_s < 3.0
+    assert node.m8n.dynamic_model == 8
+    assert node.mcu.resets == 0
+
+
+def test_a_node_that_restarts_beside_a_configured_receiver(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S + 0.5)
+    node.reset(cause=2)
+    again_s = rig.now_s
+    rig.run(1.2)
+    assert len(rig.payloads(GpsFixPayload, since_s=again_s + 0.5)) >= 3
+    assert rig.last(NodeStatusPayload).reset_cause == 2
+
+
+def test_garbage_on_the_line_costs_no_more_than_the_message_it_hits(bench: MakeBench) -> None:
+    rig = bench(seed=9)
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S)
+    for _ in range(8):
+        node.m8n.say_garbage(60)
+        rig.run(0.25)
+    fixes = rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)
+    assert len(fixes) >= 7
+    assert all((f.lat_dege7, f.satellites) == (-77_123_456, 14) for f in fixes)
+    assert rig.last(NodeStatusPayload).bus_errors > 0
+    assert not rig.faults
+
+
+def test_without_a_receiver_the_node_says_so_and_goes_on_asking(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.gps_node()
+    node.m8n.absent = True
+    rig.run(2.3)
+    assert not rig.payloads(GpsFixPayload)
+    status = rig.last(NodeStatusPayload)
+    assert (status.sensors_present, status.sensors_failed) == (0, GPS)
+    node.m8n.absent = False
+    rig.run(2.5)
+    assert len(rig.payloads(GpsFixPayload)) >= 5
+    assert rig.last(NodeStatusPayload).sensors_present == GPS
+    assert node.mcu.resets == 0
+
+
+def test_ten_fixes_a_second_at_8_mhz(bench: MakeBench, build: Callable[..., object]) -> None:
+    folder = build("-DGPS_RATE_HZ=10 -DGPS_DYNAMIC_MODEL=6", 8_000_000)
+    rig = bench(build=folder, frequency_hz=8_000_000)
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S + 1.5)
+    assert (node.m8n.baud, node.m8n.dynamic_model) == (38_400, 6)
+    assert len(rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)) == pytest.approx(15, abs=1)
+
+
+def test_sequence_counts_every_payload(bench: MakeBench) -> None:
+    rig = bench()
+    rig.gps_node()
+    rig.run(CONFIGURED_S + 1.0)
+    frames: list[RadioFrame] = [f for _, f in rig.frames]
+    assert all((b.header.seq - a.header.seq) % 65536 == 1 for a, b in pairwise(frames))

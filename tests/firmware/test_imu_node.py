@@ -1,0 +1,254 @@
+"""The IMU node's program against the models of its three sensors."""
+
+import bisect
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from firmware.rig.bmp180 import Words
+from firmware.rig.world import Moment, World
+from gateway.records import ImuFlags
+from gateway.wire.payloads import BaroPayload, ImuPayload, NodeStatusPayload
+from tests.firmware.harness import Bench
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+START_S = 0.45
+"""Reset, self-test and set-up."""
+FILTERED = ImuFlags.ACCEL_FILTERED | ImuFlags.GYRO_FILTERED
+MPU6050, HMC5883L, BMP180 = 1, 2, 4
+
+MakeBench = Callable[..., Bench]
+
+
+def still(**values: object) -> World:
+    moment = Moment(**values)
+    return World(moment=lambda _time_s: moment)
+
+
+def test_counts_are_those_of_the_physical_values(bench: MakeBench) -> None:
+    world = still(
+        accel_mps2=(9.80665, -4.903325, 2.4516625),
+        gyro_radps=(math.radians(90), math.radians(-45), math.radians(100)),
+        mag_ut=(20.0, -31.0, 43.0),
+        temperature_degc=21.53,
+        pressure_pa=94_321.5,
+    )
+    rig = bench(world=world)
+    rig.imu_node(noise=False)
+    rig.run(START_S + 0.15)
+    imu, baro = rig.last(ImuPayload), rig.last(BaroPayload)
+    assert imu.accel == (4096, -2048, 1024)
+    # The high-pass has begun to take the constant rate away.
+    assert imu.gyro == pytest.approx((2952, -1476, 3280), rel=0.005)
+    assert imu.mag == (218, -338, 469)
+    assert imu.temperature == -5100
+    assert (imu.accel_range, imu.gyro_range, imu.mag_gain) == (2, 2, 1)
+    assert imu.flags & ~ImuFlags.MAG_NEW == FILTERED
+    # The datasheet's whole numbers round by some pascals.
+    assert baro.pressure_centipa == pytest.approx(9_432_150, abs=500)
+    assert baro.temperature_ddegc == pytest.approx(215, abs=1)
+
+
+def test_rates_are_100_imu_75_mag_25_baro(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(3.5)
+    imu = rig.payloads(ImuPayload, since_s=1.0)
+    baro = rig.payloads(BaroPayload, since_s=1.0)
+    assert len(imu) == pytest.approx(250, abs=2)
+    assert sum(ImuFlags.MAG_NEW in payload.flags for payload in imu) == pytest.approx(187, abs=4)
+    assert len(baro) == pytest.approx(62, abs=2)
+    status = rig.last(NodeStatusPayload)
+    assert status.sample_rate_hz == pytest.approx(100, abs=1)
+    assert (status.sensors_present, status.sensors_failed, status.bus_errors) == (7, 0, 0)
+    assert status.supply_mv == pytest.approx(3300, abs=20)
+    assert 0 < status.loop_max_us < 2000
+    # Every one of the MPU6050's samples was read: a tenth of them makes the payloads.
+    assert len(node.mpu6050.sampled_ps) > 3000
+
+
+def test_node_time_is_the_moment_of_the_sample(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(1.5)
+    sampled_us = sorted(ps / 1e6 for ps in node.mpu6050.sampled_ps)
+    late_us = []
+    for _, frame in rig.frames:
+        if isinstance(frame.payload, ImuPayload):
+            # The clock starts some hundred microseconds behind the reset.
+            stamp_us = frame.header.node_time_us + 500
+            late_us.append(stamp_us - sampled_us[bisect.bisect(sampled_us, stamp_us) - 1])
+    assert len(late_us) > 90
+    assert max(late_us) - min(late_us) < 20
+
+
+def test_butterworth_takes_a_vibration_and_leaves_the_manoeuvre(bench: MakeBench) -> None:
+    def moment(time_s: float) -> Moment:
+        slow = 3.0 * math.sin(2 * math.pi * 1.0 * time_s)
+        return Moment(accel_mps2=(slow + 8.0 * math.sin(2 * math.pi * 90.0 * time_s), 0.0, 9.80665))
+
+    rig = bench(world=World(moment=moment))
+    rig.imu_node(noise=False)
+    rig.run(START_S + 2.2)
+    x = [payload.accel[0] for payload in rig.payloads(ImuPayload, since_s=START_S + 0.2)]
+    assert max(x) == pytest.approx(3.0 / 9.80665 * 4096, rel=0.06)
+    assert min(x) == pytest.approx(-3.0 / 9.80665 * 4096, rel=0.06)
+
+
+def test_raw_mode_sends_means_and_says_so(bench: MakeBench, build: Callable[..., Path]) -> None:
+    settings = "-DIMU_RAW=1 -DRADIO_KBPS=250 -DVEHICLE_ID=3 -DBARO_OVERSAMPLING=0"
+    folder = build(settings, programs=("imu_node", "receiver"))
+    rig = bench(build=folder, world=still(gyro_radps=(math.radians(100), 0.0, 0.0)))
+    rig.imu_node(noise=False)
+    rig.run(1.5)
+    imu = rig.last(ImuPayload)
+    assert imu.flags & FILTERED == 0
+    assert imu.gyro == (3280, 0, 0)
+    assert rig.frames[-1][1].header.node.vehicle_id == 3
+    assert {frame.pipe for _, frame in rig.frames} == {4}
+
+
+def test_the_8_mhz_build_keeps_time_and_rate(bench: MakeBench, build: Callable[..., Path]) -> None:
+    rig = bench(build=build("", 8_000_000), frequency_hz=8_000_000)
+    rig.imu_node()
+    rig.run(2.5)
+    assert len(rig.payloads(ImuPayload, since_s=1.0)) == pytest.approx(150, abs=2)
+    assert rig.last(NodeStatusPayload).sensors_failed == 0
+    assert not rig.faults
+
+
+def test_clipping_is_told(bench: MakeBench) -> None:
+    rig = bench(world=still(accel_mps2=(0.0, 0.0, 100.0), gyro_radps=(0.0, -30.0, 0.0)))
+    rig.imu_node()
+    rig.run(START_S + 0.2)
+    imu = rig.last(ImuPayload)
+    assert imu.accel[2] == 32767
+    assert imu.flags & (ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED) == (
+        ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
+    )
+
+
+def test_a_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
+    rig = bench(world=still(mag_ut=(20.0, 500.0, 40.0)))
+    rig.imu_node()
+    rig.run(START_S + 0.1)
+    assert rig.last(ImuPayload).mag == (218, -4096, 436)
+
+
+def test_a_failed_self_test_is_told_and_flying_goes_on(bench: MakeBench) -> None:
+    rig = bench()
+    rig.imu_node().mpu6050.self_test_works = False
+    rig.run(START_S + 0.3)
+    assert ImuFlags.SELF_TEST_FAILED in rig.last(ImuPayload).flags
+    assert rig.last(NodeStatusPayload).sensors_failed == MPU6050
+
+
+@pytest.mark.parametrize(
+    ("absent", "flag", "bits"),
+    [
+        ("hmc5883l", ImuFlags.MAG_ABSENT, HMC5883L),
+        ("bmp180", ImuFlags.BARO_ABSENT, BMP180),
+    ],
+)
+def test_an_absent_sensor_is_told_and_found_when_it_comes(
+    bench: MakeBench, absent: str, flag: ImuFlags, bits: int
+) -> None:
+    rig = bench()
+    device = getattr(rig.imu_node(), absent)
+    device.absent = True
+    rig.run(1.6)
+    assert flag in rig.last(ImuPayload).flags
+    status = rig.last(NodeStatusPayload)
+    assert (status.sensors_present, status.sensors_failed) == (7 & ~bits, bits)
+    assert len(rig.payloads(ImuPayload, since_s=0.6)) == pytest.approx(100, abs=2)
+    device.absent = False
+    rig.run(1.2)
+    assert flag not in rig.last(ImuPayload).flags
+    assert rig.last(NodeStatusPayload).sensors_present == 7
+
+
+def test_without_the_mpu6050_barometer_and_status_still_come(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    node.mpu6050.absent = True
+    rig.run(1.6)
+    assert not rig.payloads(ImuPayload)
+    assert len(rig.payloads(BaroPayload)) > 20
+    status = rig.last(NodeStatusPayload)
+    assert (status.sensors_present, status.sensors_failed) == (BMP180, MPU6050 | HMC5883L)
+    node.mpu6050.absent = False
+    node.mpu6050.power_cycle()
+    rig.run(0.8)
+    assert len(rig.payloads(ImuPayload)) > 40
+    assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
+
+
+def test_an_mpu6050_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(1.0)
+    node.mpu6050.power_cycle()
+    rig.run(0.5)
+    assert len(rig.payloads(ImuPayload, since_s=1.15)) > 30
+    assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
+
+
+def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(0.8)
+    node.bmp180.refuse_bytes = 2
+    node.mpu6050.refuse_bytes = 1
+    rig.run(1.2)
+    status = rig.last(NodeStatusPayload)
+    assert status.bus_errors == 3
+    assert status.sensors_failed == 0
+    assert len(rig.payloads(ImuPayload, since_s=0.8)) == pytest.approx(120, abs=2)
+
+
+@pytest.mark.parametrize("clocks", [1, 8])
+def test_a_hung_slave_is_clocked_free(bench: MakeBench, clocks: int) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(0.8)
+    node.bus.hang(clocks)
+    rig.run(1.3)
+    status = rig.last(NodeStatusPayload)
+    assert status.bus_errors >= 1
+    assert status.sensors_failed == 0
+    assert len(rig.payloads(ImuPayload, since_s=0.8)) > 120
+
+
+def test_a_bus_held_for_good_stops_the_samples_but_not_the_node(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(0.8)
+    node.bus.hang(10**6)
+    rig.run(1.5)
+    assert node.mcu.resets == 0
+    assert rig.last(NodeStatusPayload).sensors_failed == 7
+    before = len(rig.payloads(ImuPayload))
+    node.bus.hang(0)
+    rig.run(0.8)
+    assert len(rig.payloads(ImuPayload)) > before + 30
+    assert not rig.last(ImuPayload).flags & (ImuFlags.MAG_ABSENT | ImuFlags.BARO_ABSENT)
+
+
+@pytest.mark.parametrize("pressure_pa", [30_000.0, 70_000.0, 109_000.0])
+def test_other_calibration_words_give_the_same_pressure(
+    bench: MakeBench, pressure_pa: float
+) -> None:
+    rig = bench(world=still(pressure_pa=pressure_pa, temperature_degc=-8.0))
+    node = rig.imu_node()
+    node.bmp180.__init__(  # type: ignore[misc]
+        rig.setup.world,
+        lambda: node.timer.now_ps,
+        Words(7911, -1022, -14429, 33996, 25204, 16739, 5498, 57, -32768, -11786, 2723),
+    )
+    rig.run(START_S + 0.15)
+    baro = rig.last(BaroPayload)
+    assert baro.pressure_centipa == pytest.approx(pressure_pa * 100, abs=400)
+    assert baro.temperature_ddegc == pytest.approx(-80, abs=1)

@@ -1,0 +1,188 @@
+"""The radio driver, the sender and the receiver on an air that loses and collides."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware.rig.air import Air, Packet
+from firmware.rig.bench import PS_PER_S, PS_PER_US
+from firmware.rig.bench import Bench as TimeLine
+from firmware.rig.boards import Setup
+from gateway.wire.payloads import ImuPayload
+from tests.firmware.harness import Bench
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+MakeBench = Callable[..., Bench]
+RUNNING_S = 1.0
+"""By then every board has started."""
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
+def test_nothing_is_lost_up_to_30_percent_on_the_air(bench: MakeBench, loss: float) -> None:
+    rig = bench(loss=loss, seed=3)
+    rig.imu_node(clock_ppm=40.0)
+    rig.gps_node(clock_ppm=-30.0)
+    rig.run(RUNNING_S + 5.0)
+    imu = rig.payloads(ImuPayload, since_s=RUNNING_S)
+    assert len(imu) == pytest.approx(500, abs=3)
+    assert rig.lost(0) == rig.lost(1) == 0
+    assert rig.node_status(0).radio_failed == rig.node_status(1).radio_failed == 0
+    retries = rig.node_status(0).radio_retries
+    # A packet is repeated if it or its acknowledgement is lost.
+    expected = 130 * 4.5 * ((1 - loss) ** -2 - 1)
+    assert 0.6 * expected <= retries <= 1.5 * expected + 40
+    last = rig.statuses[-1]
+    assert [p.lost for p in last.pipes] == [0] * 6
+    assert last.uart_dropped == 0
+    assert not rig.faults
+
+
+def test_the_receiver_counts_what_went_by(bench: MakeBench) -> None:
+    rig = bench()
+    rig.imu_node()
+    rig.run(1.2)
+    rig.setup.air.loss = 1.0
+    rig.run(0.5)
+    rig.setup.air.loss = 0.0
+    rig.run(1.4)
+    gaps = rig.lost(0)
+    assert gaps > 20
+    assert rig.node_status(0).radio_failed == pytest.approx(gaps, abs=9)
+    assert rig.statuses[-1].pipes[0].lost == gaps
+    received = sum(
+        1 for _, f in rig.frames if f.receiver_time_us <= rig.statuses[-1].receiver_time_us
+    )
+    assert rig.statuses[-1].pipes[0].received == received
+
+
+def test_payloads_come_in_order_and_once(bench: MakeBench) -> None:
+    rig = bench(loss=0.3, seed=8)
+    rig.imu_node()
+    rig.run(2.5)
+    seqs = [header.seq for header in rig.headers(0)]
+    assert all(b - a == 1 for a, b in pairwise(seqs))
+    frame_seqs = [frame.frame_seq for _, frame in rig.frames]
+    assert all((b - a) % 256 <= 2 for a, b in pairwise(frame_seqs))
+
+
+def test_nodes_that_start_in_step_get_through(bench: MakeBench, build: Callable[..., Path]) -> None:
+    """Three nodes that sample at the same instants, again and again: the worst for an air."""
+    rig = bench(seed=5)
+    for vehicle in (1, 2, 3):
+        folder = (
+            build(f"-DVEHICLE_ID={vehicle}", programs=("imu_node",))
+            if vehicle > 1
+            else rig.setup.build
+        )
+        default, rig.setup.build = rig.setup.build, folder
+        rig.imu_node()
+        rig.setup.build = default
+    rig.run(RUNNING_S + 2.0)
+    assert rig.setup.air.collisions > 50
+    vehicles = {f.header.node.vehicle_id for _, f in rig.frames}
+    assert vehicles == {1, 2, 3}
+    imu = rig.payloads(ImuPayload, since_s=RUNNING_S)
+    assert len(imu) == pytest.approx(600, abs=6)
+    assert rig.node_status(0).radio_failed <= 2
+
+
+def test_noise_on_the_channel_is_told_and_own_packets_are_not(bench: MakeBench) -> None:
+    rig = bench(seed=2)
+    rig.imu_node()
+    rig.run(2.2)
+    assert rig.statuses[-1].noise_percent == 0
+    rig.setup.air.noise = 0.5
+    rig.run(2.0)
+    assert rig.statuses[-1].noise_percent == pytest.approx(50, abs=25)
+
+
+@pytest.mark.parametrize("side", ["receiver", "node"])
+def test_a_radio_that_lost_its_supply_is_set_up_again(bench: MakeBench, side: str) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    rig.run(RUNNING_S)
+    (rig.receiver if side == "receiver" else node).radio.power_cycle()
+    rig.run(2.2)
+    assert len(rig.payloads(ImuPayload, since_s=RUNNING_S + 1.8)) == pytest.approx(40, abs=3)
+    assert rig.receiver.mcu.resets == node.mcu.resets == 0
+
+
+def test_a_node_without_its_radio_waits_for_it(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    node.radio.absent = True
+    rig.run(1.0)
+    assert not rig.frames
+    assert node.mcu.resets == 0
+    node.radio.absent = False
+    rig.run(0.8)
+    assert len(rig.payloads(ImuPayload)) > 20
+
+
+def test_a_receiver_without_its_radio_still_reports(bench: MakeBench) -> None:
+    rig = bench()
+    rig.receiver.radio.absent = True
+    rig.run(2.2)
+    assert len(rig.statuses) == 2
+    assert rig.receiver.mcu.resets == 0
+
+
+def test_only_the_right_address_and_channel_are_heard(
+    bench: MakeBench, build: Callable[..., Path]
+) -> None:
+    rig = bench()
+    default = rig.setup.build
+    for settings in ("-DRADIO_ADDRESS=0x01020304UL", "-DRADIO_CHANNEL=40"):
+        rig.setup.build = build(settings, programs=("imu_node",))
+        rig.imu_node()
+    rig.setup.build = default
+    rig.run(0.8)
+    assert not rig.frames
+
+
+def test_the_models_air_times_follow_the_specification() -> None:
+    full = Packet(76, 1000, b"12345", bytes(32), 0, is_ack=False)
+    assert full.duration_ps == 329 * PS_PER_US
+    assert Packet(76, 250, b"12345", b"", 0, is_ack=True).duration_ps == 73 * 4 * PS_PER_US
+
+
+def test_packets_that_overlap_destroy_each_other() -> None:
+    line = TimeLine()
+    air = Air(line, np.random.default_rng(1))
+    heard: list[bytes] = []
+
+    class Ear:
+        def listens(self, channel: int, kbps: int, start_ps: int) -> bool:
+            return channel == 76
+
+        def hear(self, packet: Packet) -> None:
+            heard.append(packet.payload)
+
+    air.listeners.append(Ear())
+    sender = Ear()
+    for at_us, channel, payload in (
+        (0, 76, b"a"), (50, 76, b"b"), (60, 77, b"c"), (500, 76, b"d"), (900, 76, b"e"),
+    ):  # fmt: skip
+        packet = Packet(channel, 1000, b"12345", payload, 0, is_ack=False)
+        line.at(at_us * PS_PER_US, lambda packet=packet: air.send(packet, sender, lambda: None))
+    line.run_until(PS_PER_S // 100)
+    assert heard == [b"d", b"e"]
+    assert air.collisions == 2
+
+
+def test_the_same_seed_gives_the_same_bytes(bench: MakeBench, programs: Path) -> None:
+    def bytes_of(seed: int) -> list[tuple[int, int]]:
+        rig = Bench(Setup(seed=seed, loss=0.2, build=programs))
+        rig.imu_node()
+        rig.run(0.9)
+        rig.close()
+        return rig.line
+
+    first = bytes_of(11)
+    assert len(first) > 1000
+    assert first == bytes_of(11)
+    assert first != bytes_of(12)
