@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -16,7 +17,6 @@ from firmware.rig.flight import FlightWorld
 from firmware.rig.line import frames
 from firmware.rig.tracker import Tracker
 from gateway.config import GatewaySettings
-from gateway.geometry import quaternion
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.sensing.calibration import NodeCalibration
@@ -30,6 +30,9 @@ START_S = 4.0
 FLOWN_S = 34.0
 SETTLED_S = 4.0
 CHUNK_S = 0.01
+RMS_DEG = 1.2
+WORST_DEG = 3.0
+"""Twice what this flight gives; the simulator's own nodes give as much."""
 
 
 @dataclass
@@ -45,16 +48,12 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown(programs: Path) -> Flown:
-    settings = GatewaySettings()
     flight = FlightWorld(SimulatorSettings(), start_s=START_S)
     tracker = Tracker(Setup(seed=7, loss=0.1, world=flight.world, build=programs), noise=False)
     errors = flight.aircraft.errors
     calibration = msgspec.convert(errors, NodeCalibration, from_attributes=True)
-    pipeline = Pipeline(
-        PipelineSettings(
-            settings.sensing, settings.estimation, settings.vehicle, {1: calibration}
-        )
-    )
+    aircraft = msgspec.structs.replace(GatewaySettings().default_aircraft, calibration=calibration)
+    pipeline = Pipeline(PipelineSettings(aircraft))
     parser = mavlink.MAVLink(None)
     counts: dict[str, int] = {}
     times, attitudes = [], []
@@ -90,8 +89,8 @@ def errors_deg(flown: Flown) -> np.ndarray:
 def test_attitude_is_within_its_error_of_the_truth(flown: Flown) -> None:
     error = errors_deg(flown)
     assert len(error) > 500
-    assert math.sqrt(float(np.mean(error**2))) < 5.0
-    assert float(np.max(error)) < 15.0
+    assert math.sqrt(float(np.mean(error**2))) < RMS_DEG
+    assert float(np.max(error)) < WORST_DEG
 
 
 def test_every_stream_of_the_vehicle_comes_out(flown: Flown) -> None:
@@ -104,4 +103,4 @@ def test_the_demos_line_gives_whole_frames_in_order_of_time(programs: Path) -> N
     line = frames(SimulatorSettings(), START_UNIX_US)
     first = [next(line) for _ in range(60)]
     assert all(frame.data.endswith(b"\0") and frame.data.count(b"\0") == 1 for frame in first)
-    assert all(a.time_s <= b.time_s for a, b in zip(first, first[1:], strict=False))
+    assert all(a.time_s <= b.time_s for a, b in pairwise(first))
