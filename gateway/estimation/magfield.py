@@ -20,6 +20,8 @@ NEW_FIELD_S: Final = 20.0
 """Time in turning motion after which a steady other field becomes the usual one."""
 FIRST_FIELD_S: Final = 5.0
 TURNING_RADPS: Final = 0.35
+STALE_MAG_S: Final = 1.0
+MIN_FIELD_UT: Final = 1.0
 
 
 class FieldGains:

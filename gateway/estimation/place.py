@@ -16,6 +16,7 @@ INTEGRALS: Final = 9
 """Values in the ring: force in the inertial frame, acceleration in NED and its integral."""
 ORIGIN_RENEWAL_M: Final = 5_000.0
 """Metres are taken on the radii at the origin, which moves along before they stretch."""
+BARO_STALE_S: Final = 2.0
 AGREE_M: Final = 10.0
 """Rejected fixes within this of their own dead reckoning agree with one another."""
 

@@ -4,6 +4,8 @@ from typing import Annotated, Literal
 
 from gateway.estimation.complementary.estimator import ComplementaryEstimator
 from gateway.estimation.complementary.state import ComplementarySettings
+from gateway.estimation.eskf.estimator import EskfEstimator
+from gateway.estimation.eskf.settings import EskfSettings
 from gateway.estimation.interface import Estimator
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
@@ -21,6 +23,7 @@ class EstimationSettings(Settings, frozen=True):
     reference: ReferenceSettings = ReferenceSettings()
     paper: PaperSettings = PaperSettings()
     complementary: ComplementarySettings = ComplementarySettings()
+    eskf: EskfSettings = EskfSettings()
 
 
 def make_estimator(settings: EstimationSettings) -> Estimator:
@@ -38,4 +41,6 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     """
     if settings.estimator == "complementary":
         return ComplementaryEstimator(settings.complementary, settings.reference)
+    if settings.estimator == "eskf":
+        return EskfEstimator(settings.eskf, settings.reference)
     return PaperEstimator(settings.paper, settings.reference)

@@ -18,6 +18,8 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.complementary.estimator import ComplementaryEstimator
 from gateway.estimation.complementary.state import ComplementarySettings
+from gateway.estimation.eskf.estimator import EskfEstimator
+from gateway.estimation.eskf.settings import EskfSettings
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import layout
 from gateway.estimation.reference import ReferenceSettings
@@ -36,7 +38,11 @@ def make_complementary() -> KernelEstimator:
     return ComplementaryEstimator(ComplementarySettings(), REFERENCE)
 
 
-MAKERS = {"complementary": make_complementary}
+def make_eskf() -> KernelEstimator:
+    return EskfEstimator(EskfSettings(), REFERENCE)
+
+
+MAKERS = {"complementary": make_complementary, "eskf": make_eskf}
 
 
 @pytest.fixture(params=MAKERS.values(), ids=MAKERS.keys())

@@ -11,8 +11,9 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment import collect_match, information_of
 from gateway.estimation.complementary.state import Gains, State
-from gateway.estimation.magfield import judge_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field
 from gateway.estimation.record import as_quat
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
@@ -21,14 +22,6 @@ UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
 GOOD_VAR: Final = 0.07
 """Up to 15 deg of standard deviation, the GPS acceleration may be turned by the heading."""
-MATCH_MEMORY_S: Final = 30.0
-MATCH_INFORMATION: Final = 25.0
-"""Information in 1/rad2 at which matched accelerations give the first heading."""
-MATCH_WINDOW_S: Final = 1.0
-"""Differences of successive velocities share their noise; over this time it averages out."""
-
-STALE_MAG_S: Final = 1.0
-MIN_FIELD_UT: Final = 1.0
 
 
 @compiled
@@ -99,20 +92,14 @@ def take_match(s: State, p: Gains, force_e: Vec3, accel_n: Vec3, dt: float) -> N
     dt : float
         Length of the interval, s.
     """
-    real = force_e[0] * accel_n[0] + force_e[1] * accel_n[1]
-    imag = force_e[0] * accel_n[1] - force_e[1] * accel_n[0]
-    power = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
     noise = p.gps_velocity_noise_mps
-    information = power * dt * MATCH_WINDOW_S / (2.0 * noise * noise)
     if s.heading_known == 1:
+        information = information_of(accel_n, dt, noise)
         if information > 0.0:
             s.heading_true = 1
+            real = force_e[0] * accel_n[0] + force_e[1] * accel_n[1]
+            imag = force_e[0] * accel_n[1] - force_e[1] * accel_n[0]
             correct_heading(s, math.atan2(imag, real), 1.0 / information)
-        return
-    kept = math.exp(-dt / MATCH_MEMORY_S)
-    s.match[0] = kept * s.match[0] + dt * real
-    s.match[1] = kept * s.match[1] + dt * imag
-    s.match[2] = kept * s.match[2] + information
-    if s.match[2] > MATCH_INFORMATION:
+    elif collect_match(s, force_e, accel_n, dt, noise):
         s.heading_true = 1
         correct_heading(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])

@@ -16,9 +16,10 @@ from gateway.estimation.complementary.navigation import (
     stand_still,
     take_baro,
 )
-from gateway.estimation.complementary.output import FRESH_GPS_S, tell
+from gateway.estimation.complementary.output import tell
 from gateway.estimation.complementary.state import Gains, State
 from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
+from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.health import (
     ACCEL_LIMIT_MPS2,
     GYRO_LIMIT_RADPS,

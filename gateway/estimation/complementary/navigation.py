@@ -11,6 +11,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC
 from gateway.estimation.complementary.state import Gains, State
+from gateway.estimation.place import BARO_STALE_S
 from gateway.estimation.record import FloatArray, as_quat, put
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
@@ -20,7 +21,6 @@ DRIFT_MPS2: Final = 1.0
 """Acceleration error that dead reckoning may have had, for the gates."""
 BLUNDER_H_ACC_M: Final = 30.0
 ACCEL_BIAS_LIMIT_MPS2: Final = 1.0
-BARO_STALE_S: Final = 2.0
 REST_DECAY_S: Final = 0.5
 
 

@@ -13,31 +13,26 @@ from gateway.estimation.columns import (
     NAV_RATE,
     NAV_VEL,
 )
-from gateway.estimation.complementary.heading import STALE_MAG_S, is_heading_good
-from gateway.estimation.complementary.navigation import BARO_STALE_S
+from gateway.estimation.complementary.heading import is_heading_good
 from gateway.estimation.complementary.state import State
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
     AT_REST,
     ATTITUDE_VALID,
-    DEAD_RECKONING,
     DEGRADED,
-    GPS_REJECTED,
     HEADING_VALID,
     MAG_DISTURBED,
-    POSITION_VALID,
     SENSOR_FAULT,
     USING_BARO,
-    USING_GPS,
     USING_MAG,
-    VELOCITY_VALID,
+    gps_flags,
 )
-from gateway.estimation.place import NEVER_S
+from gateway.estimation.magfield import STALE_MAG_S
+from gateway.estimation.place import BARO_STALE_S, NEVER_S
 from gateway.estimation.record import FloatArray
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
-FRESH_GPS_S: Final = 1.5
 DEAD_RECKONING_MAX_S: Final = 60.0
 """Dead reckoning longer than this is no position any more."""
 
@@ -83,20 +78,7 @@ def flags_of(s: State) -> int:
         flags |= ALTITUDE_VALID
     if s.fault == 1:
         flags |= SENSOR_FAULT | DEGRADED
-    return flags | gps_flags(s)
-
-
-@compiled
-def gps_flags(s: State) -> int:
-    """Tell the flags that follow from the age of the last accepted fix."""
     if s.fix_s == NEVER_S:
-        return 0
-    age = s.time_s - s.fix_s
-    flags = POSITION_VALID | VELOCITY_VALID if age < DEAD_RECKONING_MAX_S else 0
-    if age < FRESH_GPS_S:
-        flags |= USING_GPS
-    else:
-        flags |= DEAD_RECKONING | DEGRADED
-    if s.time_s - s.reject_last[0] < FRESH_GPS_S:
-        flags |= GPS_REJECTED | DEGRADED
-    return flags
+        return flags
+    since_reject = s.time_s - s.reject_last[0]
+    return flags | gps_flags(s.time_s - s.fix_s, since_reject, DEAD_RECKONING_MAX_S)

@@ -2,6 +2,7 @@
 
 from typing import Annotated, Final
 
+from gateway.estimation.alignment import MatchState
 from gateway.estimation.health import HealthState
 from gateway.estimation.magfield import FieldGains, FieldState
 from gateway.estimation.place import PlaceState
@@ -185,7 +186,7 @@ class Gains(RestGains, FieldGains):
     gps_latency_s: float
 
 
-class State(HealthState, RestState, FieldState, PlaceState):
+class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     """All that the complementary estimator remembers."""
 
     started: int
@@ -220,8 +221,6 @@ class State(HealthState, RestState, FieldState, PlaceState):
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
     declination_rad: float
-    match: Annotated[FloatArray, (3,)]
-    """Sum of GPS against inertial accelerations: real, imaginary, information."""
     mag_s: float
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""

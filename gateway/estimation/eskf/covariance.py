@@ -1,0 +1,228 @@
+"""Propagation and scalar updates of the covariance.
+
+The transition matrix is the identity and four 3x3 blocks, so its products are written out row by
+row. A measurement of three numbers is three scalar updates: no matrix is ever inverted.
+
+References
+----------
+.. [1] J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, ch. 5 and 7
+   (global attitude error).
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    BARO_BIAS,
+    GYRO_BIAS,
+    MAG_BIAS,
+    POS,
+    STATES,
+    TILT,
+    VEL,
+    WANDER,
+    State,
+)
+from gateway.estimation.record import FloatArray, as_quat, put_quat
+from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+
+SCALE_S: Final = 1.0
+"""A turn keeps its axis in the body for about this time, and its error its sign."""
+MAX_TILT_VAR: Final = 3.0
+"""A heading of which nothing is known; more would only break the linearisation."""
+
+
+@compiled
+def propagate(s: State, p: Gains) -> None:
+    """Carry the covariance over the pending time: `F P F^T + Q`.
+
+    With `R` the integral of `R_nb`, `f` that of the specific force in NED and `dt` the time:
+    `tilt' = tilt - R gyro_bias`, `vel' = vel + tilt x f - R accel_bias`, `pos' = pos + vel dt`.
+    """
+    dt = s.pending_s
+    if dt <= 0.0:
+        return
+    transit(s)
+    turned = p.gyro_scale_sq * SCALE_S * s.pending_rate_sq
+    pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq
+    s.pending_rate_sq = s.pending_accel_sq = 0.0
+    for k in range(3):
+        s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
+        s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
+        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
+        steady = p.gps_wander_var if k < 2 else p.gps_height_wander_var
+        fade(s.P, WANDER + k, math.exp(-dt / p.gps_wander_s), steady)
+    fade(s.P, MAG_BIAS, math.exp(-dt / p.mag_wander_s), p.mag_wander_var)
+    s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
+    s.P[TILT + 2, TILT + 2] = min(s.P[TILT + 2, TILT + 2], MAX_TILT_VAR)
+    for k in range(3):
+        kept = math.exp(-dt / p.gps_wander_s)
+        s.wander_n[k] *= kept
+    s.mag_bias_rad *= math.exp(-dt / p.mag_wander_s)
+    s.pending_s = 0.0
+    s.pending_force_n[:] = 0.0
+    s.pending_turn[:, :] = 0.0
+
+
+@compiled
+def transit(s: State) -> None:
+    """Multiply by the transition matrix from the left, then by its transpose from the right."""
+    P, R, dt = s.P, s.pending_turn, s.pending_s
+    f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
+    for j in range(STATES):
+        for k in range(3):
+            P[POS + k, j] += dt * P[VEL + k, j]
+        t0, t1, t2 = P[TILT, j], P[TILT + 1, j], P[TILT + 2, j]
+        a0, a1, a2 = P[ACCEL_BIAS, j], P[ACCEL_BIAS + 1, j], P[ACCEL_BIAS + 2, j]
+        g0, g1, g2 = P[GYRO_BIAS, j], P[GYRO_BIAS + 1, j], P[GYRO_BIAS + 2, j]
+        P[VEL, j] += t1 * f2 - t2 * f1 - R[0, 0] * a0 - R[0, 1] * a1 - R[0, 2] * a2
+        P[VEL + 1, j] += t2 * f0 - t0 * f2 - R[1, 0] * a0 - R[1, 1] * a1 - R[1, 2] * a2
+        P[VEL + 2, j] += t0 * f1 - t1 * f0 - R[2, 0] * a0 - R[2, 1] * a1 - R[2, 2] * a2
+        P[TILT, j] = t0 - R[0, 0] * g0 - R[0, 1] * g1 - R[0, 2] * g2
+        P[TILT + 1, j] = t1 - R[1, 0] * g0 - R[1, 1] * g1 - R[1, 2] * g2
+        P[TILT + 2, j] = t2 - R[2, 0] * g0 - R[2, 1] * g1 - R[2, 2] * g2
+    for i in range(STATES):
+        for k in range(3):
+            P[i, POS + k] += dt * P[i, VEL + k]
+        t0, t1, t2 = P[i, TILT], P[i, TILT + 1], P[i, TILT + 2]
+        a0, a1, a2 = P[i, ACCEL_BIAS], P[i, ACCEL_BIAS + 1], P[i, ACCEL_BIAS + 2]
+        g0, g1, g2 = P[i, GYRO_BIAS], P[i, GYRO_BIAS + 1], P[i, GYRO_BIAS + 2]
+        P[i, VEL] += t1 * f2 - t2 * f1 - R[0, 0] * a0 - R[0, 1] * a1 - R[0, 2] * a2
+        P[i, VEL + 1] += t2 * f0 - t0 * f2 - R[1, 0] * a0 - R[1, 1] * a1 - R[1, 2] * a2
+        P[i, VEL + 2] += t0 * f1 - t1 * f0 - R[2, 0] * a0 - R[2, 1] * a1 - R[2, 2] * a2
+        P[i, TILT] = t0 - R[0, 0] * g0 - R[0, 1] * g1 - R[0, 2] * g2
+        P[i, TILT + 1] = t1 - R[1, 0] * g0 - R[1, 1] * g1 - R[1, 2] * g2
+        P[i, TILT + 2] = t2 - R[2, 0] * g0 - R[2, 1] * g1 - R[2, 2] * g2
+
+
+@compiled
+def fade(P: FloatArray, k: int, kept: float, steady: float) -> None:
+    """Let one state fade towards zero while noise keeps its variance at `steady`."""
+    for j in range(STATES):
+        P[k, j] *= kept
+        P[j, k] *= kept
+    P[k, k] += steady * (1.0 - kept * kept)
+
+
+@compiled
+def forget(P: FloatArray, k: int, variance: float) -> None:
+    """Give one state a new variance that has nothing to do with the others."""
+    for j in range(STATES):
+        P[k, j] = 0.0
+        P[j, k] = 0.0
+    P[k, k] = variance
+
+
+@compiled
+def clear(s: State) -> None:
+    """Begin a measurement: an empty row, no state held."""
+    s.h[:] = 0.0
+    s.held[:] = 0.0
+
+
+@compiled
+def remainder(s: State, innovation: float) -> float:
+    """Take from an innovation what the measurements before it in the group have explained."""
+    for j in range(STATES):
+        innovation -= s.h[j] * s.dx[j]
+    return innovation
+
+
+@compiled
+def spread(s: State, variance: float) -> float:
+    """Compute `P h` and the variance of the innovation, `h^T P h` and the noise."""
+    total = variance
+    for i in range(STATES):
+        sum_ = 0.0
+        for j in range(STATES):
+            sum_ += s.P[i, j] * s.h[j]
+        s.Ph[i] = sum_
+        total += s.h[i] * sum_
+    return total
+
+
+@compiled
+def distance_sq(s: State, innovation: float, variance: float) -> float:
+    """Tell the normalised innovation squared of the row in `h`."""
+    rest = remainder(s, innovation)
+    return rest * rest / spread(s, variance)
+
+
+@compiled
+def absorb(s: State, innovation: float, variance: float, gate_sq: float) -> None:
+    """Update by one number whose row stands in `h`.
+
+    Parameters
+    ----------
+    s : State
+        `P` and `dx` are changed.
+    innovation : float
+        Measured less expected.
+    variance : float
+        Of the measurement.
+    gate_sq : float
+        An innovation further off counts as one so many squared standard deviations away: its
+        variance is raised until it is, so an outlier does little and a lasting one wins.
+    """
+    rest = remainder(s, innovation)
+    total = spread(s, variance)
+    total = max(total, rest * rest / gate_sq)
+    for i in range(STATES):
+        gain = s.Ph[i] / total
+        s.dx[i] += gain * rest
+        for j in range(STATES):
+            s.P[i, j] -= gain * s.Ph[j]
+
+
+@compiled
+def absorb_considering(s: State, innovation: float, variance: float, gate_sq: float) -> None:
+    """Update by the row in `h`, but let the states marked in `held` only be considered.
+
+    Their gain is zero, their uncertainty still counts: the Schmidt-Kalman update. It is for
+    measurements whose errors are not white, which other states would take the blame for.
+
+    Parameters
+    ----------
+    s : State
+        `P` and `dx` are changed.
+    innovation : float
+        Measured less expected.
+    variance : float
+        Of the measurement.
+    gate_sq : float
+        See `absorb`.
+    """
+    rest = remainder(s, innovation)
+    total = max(spread(s, variance), rest * rest / gate_sq)
+    for i in range(STATES):
+        gain = s.Ph[i] / total
+        s.dx[i] += (1.0 - s.held[i]) * gain * rest
+        for j in range(STATES):
+            s.P[i, j] -= (1.0 - s.held[i] * s.held[j]) * gain * s.Ph[j]
+
+
+@compiled
+def hold(s: State, first: int, count: int) -> None:
+    """Mark states as only considered."""
+    s.held[first : first + count] = 1.0
+
+
+@compiled
+def inject(s: State) -> None:
+    """Move the errors found into the nominal state."""
+    d = s.dx
+    turn = from_rotation_vector((d[TILT], d[TILT + 1], d[TILT + 2]))
+    put_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    for k in range(3):
+        s.vel_n[k] += d[VEL + k]
+        s.pos_n[k] += d[POS + k]
+        s.gyro_bias_b[k] += d[GYRO_BIAS + k]
+        s.accel_bias_b[k] += d[ACCEL_BIAS + k]
+        s.wander_n[k] += d[WANDER + k]
+    s.mag_bias_rad += d[MAG_BIAS]
+    s.baro_bias_m += d[BARO_BIAS]
+    d[:] = 0.0

@@ -1,0 +1,394 @@
+"""The compiled entry points: one sample in, a log through."""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment import collect_match
+from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.eskf.covariance import propagate
+from gateway.estimation.eskf.measure import (
+    UNAIDED_CORRELATION_S,
+    absorb_baro,
+    absorb_compass,
+    absorb_fix,
+    absorb_rest,
+    absorb_velocity,
+    is_near,
+    lag_integrals,
+)
+from gateway.estimation.eskf.output import tell
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.start import (
+    begin,
+    bridge_gap,
+    end_dead_reckoning,
+    forget_times,
+    relock_at,
+    restart_at,
+    restart_baro,
+    start_heading_by_compass,
+    start_heading_by_match,
+    turn_heading,
+)
+from gateway.estimation.eskf.state import State
+from gateway.estimation.flagbits import FRESH_GPS_S
+from gateway.estimation.health import HOLD_S, is_sound, judge_sensors
+from gateway.estimation.history import recall, remember
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field
+from gateway.estimation.place import (
+    BARO_STALE_S,
+    NEVER_S,
+    fix_position,
+    fix_velocity,
+    is_relocked,
+    move_origin,
+    past_state,
+)
+from gateway.estimation.record import FloatArray, IntArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.rest import watch_rest
+from gateway.geometry.quaternion import (
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    rotate_inverse,
+)
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+GAP_S: Final = 0.5
+"""A longer silence is not integrated over."""
+COVARIANCE_S: Final = 0.02
+"""The covariance is propagated this often, and before each measurement."""
+PSEUDO_S: Final = 0.1
+"""Between measurements that stand in for a sensor."""
+COMPASS_S: Final = 0.045
+"""Between compass measurements; its slow error makes more of them useless."""
+MIN_BASELINE_S: Final = 0.15
+MAX_BASELINE_S: Final = 2.5
+"""Interval of two fixes whose velocities tell an acceleration."""
+ZERO: Final = (0.0, 0.0, 0.0)
+
+
+@compiled
+def take_imu(
+    s: State,
+    p: Gains,
+    time_us: int,
+    ax: float,
+    ay: float,
+    az: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    mx: float,
+    my: float,
+    mz: float,
+    clipped: float,
+) -> None:
+    """Advance by one IMU sample; see `columns` for the numbers.
+
+    A sample that is late is left out; a clock that went far back is a new clock.
+    """
+    gyro, accel = (gx, gy, gz), (ax, ay, az)
+    if s.started == 0:
+        s.hold_s = p.dead_reckoning_s
+        begin(s, p, time_us, gyro, accel)
+        return
+    dt = (time_us - s.time_us) * 1e-6
+    if dt <= 0.0:
+        s.fault = 1
+        if dt < -GAP_S:
+            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
+            forget_times(s)
+            bridge_gap(s, p, 1.0)
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    if dt > GAP_S:
+        bridge_gap(s, p, dt)
+        return
+    sound_gyro, sound_accel = judge_sensors(s, gyro, accel, dt)
+    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    if not sound_gyro:
+        gyro = stand_in_rate(s, dt)
+    else:
+        s.missing_gyro_s = 0.0
+    if not sound_accel:
+        accel = stand_in_force(s)
+    integrate(s, gyro, accel, dt)
+    if sound_gyro and sound_accel:
+        watch_rest(s, p, gyro, accel, is_moving(s, p), dt)
+    if s.pending_s >= COVARIANCE_S:
+        propagate(s, p)
+    take_substitutes(s, p)
+    if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
+        take_mag(s, p, (mx, my, mz))
+
+
+@compiled
+def stand_in_rate(s: State, dt: float) -> Vec3:
+    """Hold the last rate for a moment, then none, where the gyroscope fails."""
+    held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
+    s.missing_gyro_s += dt
+    b = s.gyro_bias_b
+    return (held[0] + b[0], held[1] + b[1], held[2] + b[2])
+
+
+@compiled
+def stand_in_force(s: State) -> Vec3:
+    """Assume no acceleration where the accelerometer fails."""
+    f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    b = s.accel_bias_b
+    return (f[0] + b[0], f[1] + b[1], f[2] + b[2])
+
+
+@compiled
+def is_moving(s: State, p: Gains) -> bool:
+    """Tell whether the GPS says that the aircraft moves."""
+    fresh = s.aided == 1 and s.time_s - s.fix_s < FRESH_GPS_S
+    return bool(fresh and math.hypot(s.vel_n[0], s.vel_n[1]) > p.rest_speed_mps)
+
+
+@compiled
+def integrate(s: State, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Advance the nominal state and collect what the covariance will need.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    gyro, accel : tuple of 3 floats
+        Newest sample in body FRD, biases still in.
+    dt : float
+        Time step, s.
+    """
+    b, c = s.gyro_bias_b, s.accel_bias_b
+    rate = (gyro[0] - b[0], gyro[1] - b[1], gyro[2] - b[2])
+    put(s.rate_b, rate)
+    # The force of the interval acts, on average, at the attitude half way through it.
+    half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
+    q = multiply(as_quat(s.q_nb), half)
+    put_quat(s.q_nb, normalise(multiply(q, half)))
+    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
+    s.pending_s += dt
+    s.pending_rate_sq += (rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]) * dt
+    for k in range(3):
+        force = x[k] * f0 + y[k] * f1 + z[k] * f2
+        s.pending_force_n[k] += force * dt
+        s.pending_turn[k, 0] += x[k] * dt
+        s.pending_turn[k, 1] += y[k] * dt
+        s.pending_turn[k, 2] += z[k] * dt
+        a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
+        s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
+        s.integrals[3 + k] += a * dt
+        s.pending_accel_sq += a * a * dt
+        if s.aided == 1:
+            s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
+        s.vel_n[k] += a * dt
+    s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
+
+
+@compiled
+def take_substitutes(s: State, p: Gains) -> None:
+    """Use rest, or the little motion to be expected, where GPS does not tell the velocity."""
+    if s.time_s - s.pseudo_s < PSEUDO_S:
+        return
+    dt = min(s.time_s - s.pseudo_s, 1.0)
+    s.pseudo_s = s.time_s
+    if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
+        end_dead_reckoning(s, p)
+    if s.at_rest == 1:
+        absorb_rest(s, p)
+    elif s.aided == 0:
+        absorb_velocity(s, p, p.unaided_var * UNAIDED_CORRELATION_S / dt)
+
+
+@compiled
+def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
+    """Use one magnetometer sample.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    mag_b : tuple of 3 floats
+        Calibrated field in body FRD, uT.
+    """
+    dt = s.time_s - s.mag_s
+    field = rotate(as_quat(s.q_nb), mag_b)
+    level = math.hypot(field[0], field[1])
+    norm = math.hypot(level, field[2])
+    if norm < MIN_FIELD_UT or level < 0.05 * norm or dt <= 0.0:
+        return
+    s.mag_s = s.time_s
+    weight = judge_field(s, p, norm, math.asin(field[2] / norm), min(dt, STALE_MAG_S))
+    known = math.isfinite(s.declination_rad)
+    declination = s.declination_rad if known else 0.0
+    if s.heading_known == 0:
+        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]))
+        s.heading_true = 1 if known else 0
+    elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
+        since = min(s.time_s - s.mag_used_s, STALE_MAG_S)
+        s.mag_used_s = s.time_s
+        absorb_compass(s, p, field, declination, weight, since)
+
+
+@compiled
+def take_baro(s: State, p: Gains, alt_m: float) -> None:
+    """Use one barometer height.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    alt_m : float
+        Pressure altitude, positive up.
+    """
+    if s.started == 0 or not math.isfinite(alt_m):
+        return
+    s.baro_down_m = -alt_m
+    if s.has_height == 0:
+        s.pos_n[2] = -alt_m
+    elif s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:
+        restart_baro(s, p)
+    else:
+        absorb_baro(s, p, -alt_m)
+    s.baro_known, s.baro_s = 1, s.time_s
+
+
+@compiled
+def take_gps(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
+    """Take in one fix at its arrival.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    time_us : int
+        Arrival on the gateway clock.
+    row : ndarray, shape (GPS_COLUMNS,)
+        See `columns`.
+    """
+    if s.started == 0 or row[GPS_USABLE] == 0.0:
+        return
+    learn_declination(s, row[GPS_DECLINATION])
+    then = s.then
+    wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
+    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, then)
+    lag = s.time_s - valid_s
+    move_origin(s, row[GPS_LAT], row[GPS_LON])
+    pos, vel = fix_position(s, row), fix_velocity(row)
+    told_velocity = is_sound(vel, 1000.0)
+    if s.heading_known == 0:
+        if told_velocity:
+            match_heading(s, p, valid_s, vel, (then[3], then[4], then[5]))
+        if s.heading_known == 0:
+            show_fix(s, pos, vel)
+            return
+    if s.aided == 0:
+        restart_at(s, p, pos, vel if told_velocity else ZERO, lag)
+        accept(s, vel)
+        return
+    fuse_fix(s, p, row, pos, vel, lag)
+
+
+@compiled
+def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
+    """Update by a fix that lies near, reject one that does not, relock on those that insist."""
+    propagate(s, p)
+    past_pos, past_vel = past_state(s, s.then, lag)
+    once, twice = lag_integrals(s, s.then, lag)
+    w = s.wander_n
+    off_pos = (
+        pos[0] - past_pos[0] - w[0],
+        pos[1] - past_pos[1] - w[1],
+        pos[2] - past_pos[2] - w[2],
+    )
+    off_vel = (vel[0] - past_vel[0], vel[1] - past_vel[1], vel[2] - past_vel[2])
+    if is_near(s, p, row, off_pos, once, twice, lag):
+        absorb_fix(s, p, row, off_pos, off_vel, once, twice, lag)
+        accept(s, vel)
+    elif is_relocked(s, p.gps_relock_s, pos, vel):
+        relock_at(s, p, pos, vel if is_sound(vel, 1000.0) else ZERO, lag)
+        accept(s, vel)
+
+
+@compiled
+def accept(s: State, vel: Vec3) -> None:
+    """Note that a fix was used."""
+    s.fix_s = s.time_s
+    put(s.fix_vel, vel)
+    s.reject_s, s.reject_last[0] = 0.0, NEVER_S
+
+
+@compiled
+def show_fix(s: State, pos: Vec3, vel: Vec3) -> None:
+    """Show a fix as it is while it cannot be fused: without a heading."""
+    put(s.fix_vel, vel)
+    s.fix_s = s.time_s
+    s.pos_n[0], s.pos_n[1] = pos[0], pos[1]
+    if s.baro_known == 0:
+        s.pos_n[2] = pos[2]
+
+
+@compiled
+def match_heading(s: State, p: Gains, valid_s: float, vel: Vec3, integral: Vec3) -> None:
+    """Collect the match of GPS and inertial accelerations; it may give the first heading."""
+    dt = valid_s - s.fix_valid_s
+    if dt < MIN_BASELINE_S:
+        return
+    old, force = as_vec(s.fix_vel), as_vec(s.fix_force)
+    put(s.fix_force, integral)
+    s.fix_valid_s = valid_s
+    if dt > MAX_BASELINE_S:
+        return
+    accel = ((vel[0] - old[0]) / dt, (vel[1] - old[1]) / dt, (vel[2] - old[2]) / dt)
+    mean = ((integral[0] - force[0]) / dt, (integral[1] - force[1]) / dt, 0.0)
+    if collect_match(s, mean, accel, dt, math.sqrt(p.gps_velocity_var)):
+        start_heading_by_match(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])
+
+
+@compiled
+def learn_declination(s: State, declination_rad: float) -> None:
+    """Turn a magnetic heading to true north when the declination becomes known."""
+    if not math.isfinite(declination_rad):
+        return
+    if s.heading_known == 1 and s.heading_true == 0:
+        turn_heading(s, declination_rad)
+        s.heading_true = 1
+    s.declination_rad = declination_rad
+
+
+@compiled
+def run(
+    s: State,
+    p: Gains,
+    imu_time_us: IntArray,
+    imu: FloatArray,
+    baro_time_us: IntArray,
+    baro_alt_m: FloatArray,
+    gps_time_us: IntArray,
+    gps: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Advance over a log: at each IMU sample, what came before it first."""
+    i_baro, i_gps = 0, 0
+    for i in range(imu_time_us.shape[0]):
+        now = imu_time_us[i]
+        while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
+            take_baro(s, p, baro_alt_m[i_baro])
+            i_baro += 1
+        while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
+            take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
+            i_gps += 1
+        r = imu[i]
+        take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
+        tell(s, out[i])

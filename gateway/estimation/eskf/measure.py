@@ -1,0 +1,269 @@
+"""The measurements: how each sensor's number depends on the errors.
+
+A late fix is compared with the state at the time it was valid, and its row carries that state's
+error back from the present one: `vel_then = vel - tilt x S + R L accel_bias` and
+`pos_then = pos - L vel + tilt x (L S - D) - R L^2/2 accel_bias`, `S` and `D` being the first and
+second integral of the specific force over the lag `L`. It is the same as fusing the fix in time,
+but for the noise of the few tenths of a second between.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
+from gateway.estimation.eskf.covariance import (
+    absorb,
+    absorb_considering,
+    clear,
+    distance_sq,
+    hold,
+    inject,
+    propagate,
+)
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    BARO_BIAS,
+    GYRO_BIAS,
+    MAG_BIAS,
+    POS,
+    TILT,
+    VEL,
+    WANDER,
+    State,
+)
+from gateway.estimation.record import FloatArray, as_quat, as_vec
+from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+ACC_SHARE: Final = 0.25
+"""Of the accuracy that a receiver tells, the share that is noise from one fix to the next."""
+SPEED_ACC_SHARE: Final = 0.7
+REST_VELOCITY_VAR: Final = 0.2**2
+REST_RATE_VAR: Final = 0.002**2
+UNAIDED_CORRELATION_S: Final = 1.0
+"""The true speed that is taken for noise changes in about this time."""
+COMPASS_CORRELATION_S: Final = 1.0
+"""The errors of iron and current change with the attitude, so in about this time."""
+VELOCITY_CORRELATION_S: Final = 1.0
+"""Errors of successive GPS velocities are alike for about this time: faster fixes tell no more."""
+VELOCITY_GATE_SQ: Final = 9.0
+"""A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
+FAR_SQ: Final = 1e12
+
+
+@compiled
+def set_turned(s: State, k: int, w: Vec3) -> None:
+    """Put the dependence of `(tilt x w)[k]` on the tilt into the row."""
+    a, b = (k + 1) % 3, (k + 2) % 3
+    s.h[TILT + a] = w[b]
+    s.h[TILT + b] = -w[a]
+
+
+@compiled
+def set_bias_row(s: State, k: int, share: float) -> None:
+    """Put `share` times row `k` of `R_nb` at the accelerometer bias."""
+    q = as_quat(s.q_nb)
+    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    s.h[ACCEL_BIAS] = share * x[k]
+    s.h[ACCEL_BIAS + 1] = share * y[k]
+    s.h[ACCEL_BIAS + 2] = share * z[k]
+
+
+@compiled
+def lag_integrals(s: State, then: FloatArray, lag: float) -> tuple[Vec3, Vec3]:
+    """Integrate the specific force in NED once and twice over the lag.
+
+    Parameters
+    ----------
+    s : State
+        Present integrals.
+    then : ndarray, shape (INTEGRALS,)
+        Integrals when the fix was valid.
+    lag : float
+        How long ago that was, s.
+
+    Returns
+    -------
+    tuple of 2 vectors
+        In m/s and m.
+    """
+    now, g = s.integrals, STANDARD_GRAVITY_MPS2
+    return (
+        (now[3] - then[3], now[4] - then[4], now[5] - then[5] - g * lag),
+        (
+            now[6] - then[6] - then[3] * lag,
+            now[7] - then[7] - then[4] * lag,
+            now[8] - then[8] - then[5] * lag - 0.5 * g * lag * lag,
+        ),
+    )
+
+
+@compiled
+def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
+    """Write the row of one component of a late velocity."""
+    clear(s)
+    set_turned(s, k, (-once[0], -once[1], -once[2]))
+    s.h[VEL + k] = 1.0
+    set_bias_row(s, k, lag)
+
+
+@compiled
+def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
+    """Write the row of one component of a late position; GPS adds its slow error."""
+    clear(s)
+    w = (lag * once[0] - twice[0], lag * once[1] - twice[1], lag * once[2] - twice[2])
+    set_turned(s, k, w)
+    s.h[VEL + k] = -lag
+    s.h[POS + k] = 1.0
+    s.h[WANDER + k] = 1.0
+    set_bias_row(s, k, -0.5 * lag * lag)
+
+
+@compiled
+def larger(variance: float, accuracy: float, share: float) -> float:
+    """Raise a variance to what the receiver says of its own accuracy."""
+    if not math.isfinite(accuracy):
+        return variance
+    return max(variance, (share * accuracy) ** 2)
+
+
+@compiled
+def lateness(s: State, p: Gains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
+    """Compute the variances that the jitter of the latency adds to position and velocity."""
+    v, j = s.vel_n, p.gps_jitter_sq
+    span = max(lag, 0.02)
+    a = (once[0] / span, once[1] / span, once[2] / span + STANDARD_GRAVITY_MPS2)
+    return (
+        (j * v[0] * v[0], j * v[1] * v[1], j * v[2] * v[2]),
+        (j * a[0] * a[0], j * a[1] * a[1], j * a[2] * a[2]),
+    )
+
+
+@compiled
+def is_near(
+    s: State, p: Gains, row: FloatArray, off_pos: Vec3, once: Vec3, twice: Vec3, lag: float
+) -> bool:
+    """Judge the horizontal place of a fix before any of its numbers is used."""
+    worst = 0.0
+    variance = larger(p.gps_position_var, row[GPS_H_ACC], ACC_SHARE)
+    late, _ = lateness(s, p, once, lag)
+    for k in range(2):
+        position_row(s, k, once, twice, lag)
+        worst = max(worst, distance_sq(s, off_pos[k], variance + late[k]))
+    return bool(worst < p.gate_sq or math.hypot(off_pos[0], off_pos[1]) < p.gate_m)
+
+
+@compiled
+def absorb_fix(
+    s: State,
+    p: Gains,
+    row: FloatArray,
+    off_pos: Vec3,
+    off_vel: Vec3,
+    once: Vec3,
+    twice: Vec3,
+    lag: float,
+) -> None:
+    """Update by an accepted fix: three velocities, three positions.
+
+    Parameters
+    ----------
+    s : State
+        Changed in place.
+    p : Gains
+        Constants.
+    row : ndarray, shape (GPS_COLUMNS,)
+        The fix, for its accuracies.
+    off_pos, off_vel : tuple of 3 floats
+        Innovations; a velocity that is not finite is left out.
+    once, twice : tuple of 3 floats
+        See `lag_integrals`.
+    lag : float
+        Age of the fix, s.
+    """
+    late_pos, late_vel = lateness(s, p, once, lag)
+    repeated = max(1.0, VELOCITY_CORRELATION_S / max(s.time_s - s.fix_s, 0.05))
+    for k in range(3):
+        acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            noise = p.gps_velocity_var if k < 2 else p.gps_climb_var
+            noise = repeated * larger(noise, row[GPS_SPEED_ACC], SPEED_ACC_SHARE) + late_vel[k]
+            absorb(s, off_vel[k], noise, VELOCITY_GATE_SQ)
+        position_row(s, k, once, twice, lag)
+        noise = p.gps_position_var if k < 2 else p.gps_height_var
+        absorb(s, off_pos[k], larger(noise, acc, ACC_SHARE) + late_pos[k], p.gate_sq)
+    inject(s)
+
+
+@compiled
+def compass_row(s: State, field_n: Vec3) -> None:
+    """Write the row of a compass: the heading, and the tilt through the field's dip."""
+    clear(s)
+    north, east, down = field_n
+    level_sq = north * north + east * east
+    s.h[TILT] = -down * north / level_sq
+    s.h[TILT + 1] = -down * east / level_sq
+    s.h[TILT + 2] = 1.0
+    s.h[MAG_BIAS] = 1.0
+
+
+@compiled
+def absorb_compass(
+    s: State, p: Gains, field_n: Vec3, declination: float, weight: float, dt: float
+) -> None:
+    """Update by the direction of the horizontal field, `dt` after the last such update."""
+    propagate(s, p)
+    repeated = max(1.0, COMPASS_CORRELATION_S / dt)
+    measured = declination - math.atan2(field_n[1], field_n[0])
+    compass_row(s, field_n)
+    # The field's dip multiplies its errors: let them turn the heading, never tilt the horizon.
+    hold(s, TILT, 2)
+    hold(s, ACCEL_BIAS, 3)
+    absorb_considering(
+        s, wrap_pi(measured) - s.mag_bias_rad, repeated * p.mag_var / weight, p.gate_sq
+    )
+    inject(s)
+
+
+@compiled
+def absorb_baro(s: State, p: Gains, down_m: float) -> None:
+    """Update by the barometer's depth below zero height."""
+    propagate(s, p)
+    clear(s)
+    s.h[POS + 2] = 1.0
+    s.h[BARO_BIAS] = -1.0
+    absorb(s, down_m + s.baro_bias_m - s.pos_n[2], p.baro_var, p.gate_sq)
+    inject(s)
+
+
+@compiled
+def absorb_velocity(s: State, p: Gains, variance: float) -> None:
+    """Update by a velocity of about zero, for want of better."""
+    propagate(s, p)
+    for k in range(3):
+        clear(s)
+        s.h[VEL + k] = 1.0
+        # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
+        hold(s, ACCEL_BIAS, 3)
+        absorb_considering(s, -s.vel_n[k], variance, FAR_SQ)
+    inject(s)
+
+
+@compiled
+def absorb_rest(s: State, p: Gains) -> None:
+    """Update by standing still: no velocity, and a rate that is the bias."""
+    propagate(s, p)
+    rate = as_vec(s.gyro_rest)
+    for k in range(3):
+        clear(s)
+        s.h[GYRO_BIAS + k] = 1.0
+        absorb(s, rate[k] - s.gyro_bias_b[k], REST_RATE_VAR, FAR_SQ)
+    for k in range(3):
+        clear(s)
+        s.h[VEL + k] = 1.0
+        absorb(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
+    inject(s)
