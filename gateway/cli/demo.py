@@ -11,6 +11,7 @@ import typer
 from msgspec.structs import replace
 
 from gateway.cli.errors import refuse
+from gateway.cli.prepare import compile_everything
 from gateway.cli.run import (
     ConfigOption,
     EndpointOption,
@@ -55,6 +56,7 @@ def demo(
         return with_endpoints(load_settings(config), endpoint)
 
     settings = or_refuse(read)
+    compile_everything()
     try:
         if flight is None:
             line = simulate(settings.simulator, unix_time_us()).frames()

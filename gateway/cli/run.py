@@ -13,6 +13,7 @@ import typer
 from rich.live import Live
 
 from gateway.cli.errors import refuse
+from gateway.cli.prepare import compile_everything
 from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
 from gateway.daemon import Daemon
 from gateway.edges.live_view import LiveView, summary_line
@@ -59,6 +60,7 @@ def run_gateway(
         return with_endpoints(settings, endpoint)
 
     settings = or_refuse(read)
+    compile_everything()
     aircraft = read_aircraft(settings)
     asyncio.run(serve(lambda: Daemon(settings, aircraft), read, plain=plain))
 
