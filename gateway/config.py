@@ -16,6 +16,7 @@ import tomlkit
 
 from gateway.edges.serial_link import SerialSettings
 from gateway.estimation.select import EstimationSettings
+from gateway.flightlog.session import RecordingSettings
 from gateway.pipeline import AircraftSettings
 from gateway.routing.settings import HubSettings
 from gateway.sensing.chain import SensingSettings
@@ -35,6 +36,7 @@ class GatewaySettings(Settings, frozen=True):
     vehicle: VehicleSettings = VehicleSettings()
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
+    recording: RecordingSettings = RecordingSettings()
     simulator: SimulatorSettings = SimulatorSettings()
     aircraft_folder: Annotated[
         str,

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import demo, run, setup
+from gateway.cli import convert, demo, info, play, record, run, setup
 
 app = typer.Typer(
     name="mavgate",
@@ -21,6 +21,10 @@ app = typer.Typer(
 )
 run.register(app)
 demo.register(app)
+record.register(app)
+play.register(app)
+convert.register(app)
+info.register(app)
 setup.register(app)
 
 

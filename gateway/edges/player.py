@@ -2,9 +2,10 @@
 
 import asyncio
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, PlayState, check_speed
@@ -60,9 +61,11 @@ class TlogFile:
         except OSError:
             return b""
 
-    def track(self, *, shift_us: int = 0, system_id: int | None = None) -> Track:
+    def track(
+        self, *, shift_us: int = 0, system_ids: Mapping[int, int] = MappingProxyType({})
+    ) -> Track:
         """Make a track that plays it; see `Track`."""
-        return Track(self.read, self.index, shift_us=shift_us, system_id=system_id)
+        return Track(self.read, self.index, shift_us=shift_us, system_ids=system_ids)
 
     def close(self) -> None:
         """Close the file; its tracks end."""

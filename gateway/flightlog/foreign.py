@@ -101,7 +101,7 @@ class ForeignReader:
         value = {
             name: float(cells[c.column]) * c.scale + c.offset
             for name, c in self._columns.items()
-            if cells[c.column].strip()
+            if (cells[c.column] or "").strip()
         }
         time_us = round(value["time_us"]) if "time_us" in value else None
         if time_us is None:

@@ -128,7 +128,7 @@ class RowBuilder:
         self._baro: BaroRaw | None = None
         self._gps: GpsFix | None = None
 
-    def add(self, record: BaroRaw | GpsFix | FusedSample) -> list[TableRow]:
+    def add(self, record: BaroRaw | GpsFix | FusedSample | ImuCalibrated) -> list[TableRow]:
         """Take the next record and return the rows that it completes."""
         match record:
             case BaroRaw():
@@ -142,6 +142,11 @@ class RowBuilder:
                 rows = [TableRow(imu.time_us, self._baro, self._gps, record.imu, imu, record.state)]
                 self._baro = self._gps = None
         return rows
+
+    def _row(self, raw: ImuRaw | None, imu: ImuCalibrated, state: NavState | None) -> TableRow:
+        row = TableRow(imu.time_us, self._baro, self._gps, raw, imu, state)
+        self._baro = self._gps = None
+        return row
 
     def flush(self) -> list[TableRow]:
         """Return what waits for an IMU sample as a row without one."""

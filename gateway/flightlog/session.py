@@ -52,13 +52,13 @@ class RecordingSettings(Settings, frozen=True):
         True
     )
     rotate_mb: Annotated[
-        float, setting("A file that grows larger is closed and the next begun.", "MB", ge=1)
+        float, setting("A file that grows larger is closed and the next begun.", "MB", ge=1, le=1e6)
     ] = 512.0
     rotate_min: Annotated[
-        float, setting("A file that grows older is closed and the next begun.", "min", ge=1)
+        float, setting("A file that grows older is closed and the next begun.", "min", ge=1, le=1e4)
     ] = 120.0
     free_floor_mb: Annotated[
-        float, setting("Recording stops when the disk has less space left.", "MB", ge=0)
+        float, setting("Recording stops when the disk has less space left.", "MB", ge=0, le=1e6)
     ] = 200.0
     flush_s: Annotated[
         float, setting("What is lost at most when the gateway is killed.", "s", ge=0.05, le=1)

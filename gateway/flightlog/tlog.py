@@ -168,6 +168,8 @@ class TlogIndex:
         self.first_us: int | None = None
         self.last_us: int | None = None
         """Greatest time."""
+        self.systems: set[int] = set()
+        """Ids of all that sent."""
         self.damage: list[Damage] = []
         """The first `MAX_DAMAGE_RUNS` runs."""
         self.damaged_bytes = 0
@@ -180,6 +182,7 @@ class TlogIndex:
             self._add_damage(run)
         if not len(batch):
             return
+        self.systems |= set(np.flatnonzero(np.bincount(batch.origins >> 8)).tolist())
         if self.first_us is None or self.last_us is None:
             self.first_us = self.last_us = int(batch.time_us[0])
         greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))

@@ -1,6 +1,7 @@
 """One recording that is being played: a place in a tlog that moves on and can be sought."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from gateway.flightlog.readdress import readdress
@@ -40,17 +41,22 @@ class Track:
         Of the same file.
     shift_us : int
         Added to every time, to lay several recordings over one another.
-    system_id : int or None
-        Sender to put in place of the recorded one.
+    system_ids : mapping of int to int
+        Senders to put in place of recorded ones; others keep theirs.
     """
 
     def __init__(
-        self, read: Read, index: TlogIndex, *, shift_us: int = 0, system_id: int | None = None
+        self,
+        read: Read,
+        index: TlogIndex,
+        *,
+        shift_us: int = 0,
+        system_ids: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
         self._read = read
         self._index = index
         self._shift_us = shift_us
-        self._system_id = system_id
+        self._system_ids = system_ids
         self._records = self._read_from(0)
         self._next = next(self._records, None)
 
@@ -63,6 +69,11 @@ class Track:
     def last_us(self) -> int:
         """Time of the last record."""
         return (self._index.last_us or 0) + self._shift_us
+
+    @property
+    def systems(self) -> set[int]:
+        """Ids of all that send, as they are played."""
+        return {self._system_ids.get(system_id, system_id) for system_id in self._index.systems}
 
     def peek_us(self) -> int | None:
         """Tell the time of the next record, None at the end."""
@@ -111,7 +122,8 @@ class Track:
         return [self._addressed(frame) for frame in newest.values()]
 
     def _addressed(self, frame: bytes) -> bytes:
-        return frame if self._system_id is None else readdress(frame, self._system_id)
+        system_id = self._system_ids.get(origin_of(frame)[0])
+        return frame if system_id is None else readdress(frame, system_id)
 
     def _read_from(self, offset: int) -> Iterator[TlogRecord]:
         scanner = TlogScanner(offset)

@@ -87,7 +87,7 @@ def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
     file = TlogFile(tlog, seen.append)
     assert sum(seen) == tlog.stat().st_size
     assert file.index.count == COUNT
-    track = file.track(system_id=5)
+    track = file.track(system_ids={1: 5})
     track.seek(RECORDS[500].time_us)
     assert track.peek_us() == RECORDS[500].time_us
     file.close()

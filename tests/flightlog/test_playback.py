@@ -159,7 +159,7 @@ def test_a_clock_that_was_set_in_flight_is_not_waited_for(jump_us: int) -> None:
 
 def test_several_recordings_interleave_by_time() -> None:
     first = make_track(make_tlog(RECORDS))
-    second = make_track(make_tlog(RECORDS), shift_us=STEP_US // 2, system_id=2)
+    second = make_track(make_tlog(RECORDS), shift_us=STEP_US // 2, system_ids={1: 2})
     player = Player([first, second], 0)
     found = play_to_end(player)
     assert [origin_of(frame)[0] for _, frame in found] == [1, 2] * 100

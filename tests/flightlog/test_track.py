@@ -9,10 +9,10 @@ from gateway.wire.mavlink_splitter import message_id_of
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 
 
-def make_track(data: bytes, **options: int) -> Track:
+def make_track(data: bytes, **options: object) -> Track:
     index = TlogIndex()
     index.add(TlogScanner().feed(data, final=True))
-    return Track(lambda offset, size: data[offset : offset + size], index, **options)
+    return Track(lambda offset, size: data[offset : offset + size], index, **options)  # type: ignore[arg-type]
 
 
 def play_all(track: Track) -> list[TlogRecord]:
@@ -69,7 +69,7 @@ def test_every_parameter_is_told() -> None:
 
 def test_shift_and_sender() -> None:
     records = make_records(4)
-    track = make_track(make_tlog(records), shift_us=1000, system_id=9)
+    track = make_track(make_tlog(records), shift_us=1000, system_ids={1: 9})
     assert track.first_us == START_US + 1000
     found = play_all(track)
     assert [record.time_us for record in found] == [r.time_us + 1000 for r in records]

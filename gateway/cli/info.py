@@ -1,0 +1,204 @@
+"""`mavgate info` and `mavgate recover`: what a recording holds, and what can be saved of it."""
+
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import typer
+from pymavlink.dialects.v20 import common as mavlink
+from rich.console import Console
+from rich.table import Table as Grid
+
+from gateway.cli.flights import FlightError
+from gateway.cli.recording_files import PANEL, ForceOption, progress_of, refusing
+from gateway.edges.flight_files import (
+    FileKind,
+    Progress,
+    kind_of,
+    read_batches,
+    read_events,
+    write_new,
+)
+from gateway.flightlog.row import TableRow, row_to_line
+from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
+from gateway.flightlog.table import TableFault, TableMark, TableReader, encode_head, encode_mark
+from gateway.flightlog.tlog import encode_record
+from gateway.units import US_PER_S
+
+SHOWN: Final = 8
+"""Gaps and damaged places that are told one by one."""
+
+Tell = Callable[[str], None]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command("info", rich_help_panel=PANEL)(info)
+    app.command("recover", rich_help_panel=PANEL)(recover)
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="Recording.", show_default=False)],
+    *,
+    json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Tell what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
+    with progress_of([file]) as advance, refusing():
+        found = describe(file, advance)
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        _show(file, found)
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output [default: NAME.recovered.EXT].")
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Write what is sound in a damaged recording to a new file, and tell what was left out.
+
+    The checksum of every frame is checked. The damaged file is never changed.
+    """
+    target = out or file.with_name(f"{file.stem}.recovered{file.suffix}")
+    console = Console(highlight=False)
+    left_out: list[str] = []
+    with progress_of([file]) as advance, refusing():
+        sound = _sound_records if kind_of(file) is FileKind.TLOG else _sound_lines
+        size = write_new(target, sound(file, advance, left_out.append), overwrite=force)
+        before = file.stat().st_size
+    for line in left_out[:SHOWN]:
+        console.print(line)
+    if len(left_out) > SHOWN:
+        console.print(f"and {len(left_out) - SHOWN} more places")
+    verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
+    console.print(f"{target}: {size} of {before} bytes; {verdict}")
+
+
+def describe(file: Path, advance: Progress | None = None) -> FileInfo:
+    """Sum up a recording.
+
+    Parameters
+    ----------
+    file : Path
+        A tlog or a table.
+    advance : callable, optional
+        Told how many more bytes were read.
+
+    Returns
+    -------
+    FileInfo
+
+    Raises
+    ------
+    FlightError
+        If it is neither.
+    OSError
+        If it cannot be read.
+    """
+    kind, size = kind_of(file), file.stat().st_size
+    if kind is FileKind.TLOG:
+        tlog = TlogSummary()
+        for batch in read_batches(file, advance):
+            tlog.add(batch)
+        found = tlog.result(size)
+        if size and not found.records:
+            raise FlightError(f"{file}: holds no MAVLink")
+        return found
+    if kind is FileKind.FOREIGN:
+        raise FlightError(f"{file}: is a CSV of another program; convert it first")
+    table, reader = TableSummary(), TableReader()
+    for event in read_events(file, reader, advance):
+        table.add([event], reader.header)
+    return table.result(size)
+
+
+def _sound_records(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+    for batch in read_batches(file, advance, strict=True):
+        for run in batch.damage:
+            tell(f"at byte {run.offset}: {run.size} bytes that are no record")
+        yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
+
+
+def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+    reader = TableReader()
+    begun = False
+    for event in read_events(file, reader, advance):
+        if not begun and reader.header is not None:
+            begun = True
+            yield encode_head(reader.header).encode()
+        match event:
+            case TableRow():
+                yield row_to_line(event).encode()
+            case TableMark():
+                yield encode_mark(event).encode()
+            case TableFault():
+                tell(f"line {event.line}: {event.size} bytes: {event.reason}")
+    if not begun:
+        raise FlightError(f"{file}: has no head that can be read, so it cannot be mended")
+
+
+def _show(file: Path, found: FileInfo) -> None:
+    console = Console(highlight=False)
+    console.print(f"[bold]{file}[/bold]: {found.kind}, {found.size / 1e6:.3f} MB")
+    console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
+    if found.header is not None:
+        head = found.header
+        console.print(
+            f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}"
+        )
+    for vehicle in found.vehicles:
+        console.print(_grid(vehicle, found.kind))
+    for gap in found.gaps[:SHOWN]:
+        at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
+        console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
+    if len(found.gaps) > SHOWN:
+        console.print(f"and {len(found.gaps) - SHOWN} more gaps")
+    for mark in found.marks:
+        at_s = (mark.time_us - (found.first_us or 0)) / US_PER_S
+        console.print(f"mark at {_clock(at_s)}: {mark.text}", markup=False)
+    if found.damaged_bytes:
+        console.print(
+            f"[red]damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
+            "`mavgate recover` leaves them out[/red]"
+        )
+
+
+def _grid(vehicle: VehicleInfo, kind: str) -> Grid:
+    title = f"system {vehicle.system_id}" if kind == "tlog" else f"vehicle {vehicle.system_id}"
+    if vehicle.mav_type is not None:
+        title += f": {_enum_name('MAV_TYPE', vehicle.mav_type)}"
+        title += f", {_enum_name('MAV_AUTOPILOT', vehicle.autopilot or 0)}"
+    grid = Grid(title=f"{title}; {vehicle.distance_m / 1000:.3f} km", title_justify="left")
+    grid.add_column("what")
+    grid.add_column("count", justify="right")
+    grid.add_column("per s", justify="right")
+    for rate in vehicle.rates:
+        grid.add_row(rate.name, str(rate.count), f"{rate.rate_hz:.2f}")
+    return grid
+
+
+def _enum_name(enum: str, value: int) -> str:
+    entry = mavlink.enums[enum].get(value)
+    return entry.name.removeprefix(f"{enum}_").lower() if entry else f"{enum} {value}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    hours, minutes = divmod(int(minutes), 60)
+    return f"{hours}:{minutes:02d}:{rest:06.3f}" if hours else f"{minutes}:{rest:06.3f}"
+
+
+def _when(found: FileInfo) -> str:
+    begin_us = found.first_us
+    if found.header is not None:
+        zero_us = found.header.unix_us_at_zero
+        begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
+    if begin_us is None:
+        return ""
+    return f", from {datetime.fromtimestamp(begin_us / US_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -1,0 +1,347 @@
+"""`mavgate play` and the orders to a player that runs."""
+
+import asyncio
+import signal
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+
+from gateway.cli import flights
+from gateway.cli.convert import pipeline_settings
+from gateway.cli.errors import refuse
+from gateway.cli.flights import FlightError, Wishes
+from gateway.cli.record import ask
+from gateway.cli.recording_files import (
+    PANEL,
+    ColumnsOption,
+    Files,
+    FromOption,
+    PositionOption,
+    SettingsOption,
+    ToOption,
+    progress_of,
+    read_column_map,
+    read_moment,
+    refusing,
+)
+from gateway.cli.run import ConfigOption, EndpointOption, read_settings, with_endpoints
+from gateway.config import GatewaySettings
+from gateway.edges.clock import GatewayClock
+from gateway.edges.control_socket import ControlError, ControlServer, socket_path
+from gateway.edges.control_verbs import PlayerVerbs
+from gateway.edges.flight_files import FileKind, kind_of, write_new
+from gateway.edges.hub import Hub
+from gateway.edges.player import PlayerEdge, PlayerStatus, TlogFile
+from gateway.flightlog.moment import Moment, place_in
+from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, check_speed
+from gateway.flightlog.tlog import encode_record
+from gateway.flightlog.track import Track
+from gateway.records import Incoming, Outgoing
+from gateway.units import US_PER_S
+from gateway.vehicle.vehicle import Vehicle
+from gateway.wire.mavlink_splitter import message_id_of
+
+VIEW_INTERVAL_S: Final = 0.25
+FIRST_GROUND_STATION: Final = 250
+"""System ids from here on are by custom ground stations, which keep their id."""
+FASTEST: Final = "max"
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """How to play: range, speed, silences."""
+
+    begin: Moment | None
+    end: Moment | None
+    speed: float
+    max_gap_s: float | None
+    loop: bool
+    paused: bool
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command("play", rich_help_panel=PANEL)(play)
+    app.command("seek", rich_help_panel=PANEL)(seek)
+    app.add_typer(group, name="player", rich_help_panel=PANEL)
+
+
+def play(
+    files: Files,
+    *,
+    speed: Annotated[str, typer.Option("--speed", "-s", help="0.1 to 100, or max.")] = "1",
+    begin: FromOption = None,
+    end: ToOption = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Start anew at the end.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Wait at the begin.")] = False,
+    skip_gaps: Annotated[
+        float | None, typer.Option("--skip-gaps", min=0, help="Shorten silences to so many s.")
+    ] = None,
+    system: Annotated[
+        list[int] | None,
+        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each file."),
+    ] = None,
+    settings: SettingsOption = "recorded",
+    position: PositionOption = "causal",
+    columns: ColumnsOption = None,
+    endpoint: EndpointOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Play recordings to the ground stations, several at once if you like.
+
+    A tlog is sent byte for byte. A table is fused again first, so the recorded flight and its
+    re-fused twin can fly on one map. `mavgate seek` and `mavgate player` steer it meanwhile.
+    """
+    gateway = with_endpoints(read_settings(config), endpoint)
+    with tempfile.TemporaryDirectory(prefix="mavgate-play-") as folder, refusing():
+        course = Course(
+            read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused
+        )
+        wishes = Wishes(pipeline_settings(config), settings, position, read_column_map(columns))
+        tlogs = _open_all(files, wishes, Path(folder))
+        try:
+            tracks = _lay_out(tlogs, system or [])
+            asyncio.run(_serve(gateway, tracks, course, [file.name for file in files]))
+        except ControlError as error:
+            refuse(str(error))
+        finally:
+            for tlog in tlogs:
+                tlog.close()
+
+
+group = typer.Typer(help="Steer the player that runs.", no_args_is_help=True)
+
+
+def seek(to: Annotated[str, typer.Argument(help="80, 1:20, +10, -0:30 or a date.")]) -> None:
+    """Move the player to a moment; write `mavgate seek -- -0:30` to go back."""
+    _show(ask("seek", {"to": to}, of="play"))
+
+
+@group.command()
+def pause() -> None:
+    """Hold."""
+    _show(ask("play.pause", of="play"))
+
+
+@group.command()
+def resume() -> None:
+    """Go on."""
+    _show(ask("play.resume", of="play"))
+
+
+@group.command()
+def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> None:
+    """Pause and play the next frames."""
+    _show(ask("play.step", {"count": count}, of="play"))
+
+
+@group.command("speed")
+def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
+    """Go on at another speed."""
+    with refusing():
+        value = _speed(speed)
+    wanted = None if value == AS_FAST_AS_POSSIBLE else value
+    _show(ask("play.speed", {"speed": wanted}, of="play"))
+
+
+@group.command("loop")
+def set_loop(
+    *, on: Annotated[bool, typer.Option("--on/--off", help="Start anew at the end.")] = True
+) -> None:
+    """Start anew at the end, or not."""
+    _show(ask("play.loop", {"on": on}, of="play"))
+
+
+@group.command()
+def status() -> None:
+    """Tell what the player does."""
+    _show(ask("play.status", of="play"))
+
+
+class PlayerDaemon:
+    """A player with its clients: frames of recordings out, answers to what clients ask.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        The hub's and the vehicles'.
+    player : Player
+        What is due when.
+    systems : iterable of int
+        Ids of all that send in the recordings.
+    files : sequence of str
+        Names to show.
+    now_us : GatewayClock
+        The clock that the player was built on.
+    """
+
+    def __init__(
+        self,
+        settings: GatewaySettings,
+        player: Player,
+        systems: Iterable[int],
+        files: Sequence[str],
+        now_us: GatewayClock,
+    ) -> None:
+        self._now_us = now_us
+        self._hub = Hub(settings.hub, self._on_frame, now_us)
+        # A recording answers nothing, and ground stations wait for answers: parameters, mission.
+        self._vehicles = [
+            Vehicle(settings.vehicle, system_id)
+            for system_id in systems
+            if system_id < FIRST_GROUND_STATION
+        ]
+        self.ended = asyncio.Event()
+        self.edge = PlayerEdge(player, self._send, now_us, files=files, on_end=self.ended.set)
+        self._control = ControlServer(socket_path("play"))
+        PlayerVerbs(self.edge).register(self._control)
+
+    async def start(self) -> None:
+        """Open everything; raises ControlError if another player runs."""
+        await self._control.start()
+        self._hub.start()
+        self.edge.start()
+
+    def close(self) -> None:
+        """End everything."""
+        self.edge.close()
+        self._control.close()
+        self._hub.close()
+
+    def _send(self, frames: Iterable[bytes]) -> None:
+        for frame in frames:
+            self._hub.send(Outgoing(frame, message_id_of(frame)))
+
+    def _on_frame(self, incoming: Incoming) -> None:
+        # What is over cannot be changed, whoever asks.
+        harmless = replace(incoming, trusted=False)
+        for vehicle in self._vehicles:
+            for action in vehicle.handle(harmless, self._now_us()):
+                if isinstance(action, Outgoing):
+                    self._hub.send(action)
+
+
+async def _serve(
+    settings: GatewaySettings,
+    tracks: Sequence[Track],
+    course: Course,
+    files: Sequence[str],
+) -> None:
+    now_us = GatewayClock()
+    first_us = min(track.first_us for track in tracks)
+    player = Player(
+        tracks,
+        now_us(),
+        speed=course.speed,
+        begin_us=None if course.begin is None else place_in(course.begin, first_us),
+        end_us=None if course.end is None else place_in(course.end, first_us),
+        max_gap_us=None if course.max_gap_s is None else round(course.max_gap_s * US_PER_S),
+        loop=course.loop,
+    )
+    if course.paused:
+        player.pause(now_us())
+    systems = sorted({system_id for track in tracks for system_id in track.systems})
+    daemon = PlayerDaemon(settings, player, systems, files, now_us)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
+    try:
+        await daemon.start()
+        await _watch(daemon)
+    finally:
+        daemon.close()
+
+
+async def _watch(daemon: PlayerDaemon) -> None:
+    """Show the place until the end."""
+    console = Console()
+    progress = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}")
+    )
+    task = progress.add_task("", total=1.0, at="")
+    with Live(progress, console=console, auto_refresh=False, transient=True) as live:
+        while not daemon.ended.is_set():
+            status = daemon.edge.status()
+            progress.update(
+                task,
+                description=status.state,
+                completed=status.position_s,
+                total=max(status.duration_s, 1e-3),
+                at=_place(status),
+            )
+            if console.is_terminal:
+                live.refresh()
+            try:
+                async with asyncio.timeout(VIEW_INTERVAL_S):
+                    await daemon.ended.wait()
+            except TimeoutError:
+                continue
+    console.print(f"ended: {_place(daemon.edge.status())}")
+
+
+def _open_all(files: Sequence[Path], wishes: Wishes, folder: Path) -> list[TlogFile]:
+    """Index the tlogs; fuse what is none into one."""
+    opened = []
+    with progress_of(files) as advance:
+        for number, file in enumerate(files):
+            path = file
+            if kind_of(file) is not FileKind.TLOG:
+                told = replace(wishes, progress=advance)
+                path = folder / f"{number}.tlog"
+                table = flights.open_rows(file, told)
+                interpolated = wishes.position == "interpolated"
+                fixes = flights.fixes_of(file, wishes) if interpolated else ()
+                frames = flights.fused_frames(table, flights.fuse(table, told, fixes))
+                write_new(path, (encode_record(r.time_us, r.frame) for r in frames))
+            opened.append(TlogFile(path, advance if path is file else None))
+            if not opened[-1].index.count:
+                raise FlightError(f"{file}: holds no MAVLink")
+    return opened
+
+
+def _lay_out(tlogs: Sequence[TlogFile], wished: Sequence[int]) -> list[Track]:
+    """Give each vehicle its own system id, and recordings of other days the same begin."""
+    first = tlogs[0].index
+    begin_us, end_us = first.first_us or 0, first.last_us or 0
+    used: set[int] = set()
+    tracks = []
+    for number, tlog in enumerate(tlogs):
+        index = tlog.index
+        meets = (index.first_us or 0) <= end_us and begin_us <= (index.last_us or 0)
+        shift_us = 0 if meets else begin_us - (index.first_us or 0)
+        vehicles = sorted(s for s in index.systems if s < FIRST_GROUND_STATION)
+        system_ids: dict[int, int] = {}
+        for place, system_id in enumerate(vehicles):
+            wanted = wished[number] if place == 0 and number < len(wished) else system_id
+            while wanted in used:
+                wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
+            used.add(wanted)
+            if wanted != system_id:
+                system_ids[system_id] = wanted
+        tracks.append(tlog.track(shift_us=shift_us, system_ids=system_ids))
+    return tracks
+
+
+def _speed(text: str) -> float:
+    if text == FASTEST:
+        return AS_FAST_AS_POSSIBLE
+    try:
+        return check_speed(float(text))
+    except ValueError as error:
+        raise FlightError(f"--speed {text}: 0.1 to 100, or {FASTEST}") from error
+
+
+def _place(status: PlayerStatus) -> str:
+    speed = FASTEST if status.speed is None else f"{status.speed:g}x"
+    return f"{status.position_s:.1f} of {status.duration_s:.1f} s, {speed}, {status.sent} frames"
+
+
+def _show(status: dict[str, Any]) -> None:
+    place = PlayerStatus(**{**status, "files": tuple(status["files"])})
+    Console(highlight=False).print(f"{place.state}: {_place(place)}", markup=False)

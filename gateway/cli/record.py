@@ -1,0 +1,152 @@
+"""`mavgate record …` and `mavgate mark`: orders to the recorder of a gateway that runs."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table as Grid
+
+from gateway.cli.errors import refuse
+from gateway.cli.recording_files import PANEL
+from gateway.cli.run import ConfigOption, read_settings
+from gateway.edges.control_socket import ControlError, request, socket_path
+from gateway.edges.recordings import (
+    Recording,
+    RecordingError,
+    delete_recording,
+    list_recordings,
+    rename_recording,
+)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
+
+group = typer.Typer(help="Start, stop, name, list and delete recordings.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.add_typer(group, name="record", rich_help_panel=PANEL)
+    app.command("mark", rich_help_panel=PANEL)(mark)
+
+
+@group.command()
+def start() -> None:
+    """Record from now on, whatever the settings say."""
+    _show(ask("record.start"))
+
+
+@group.command()
+def stop() -> None:
+    """Stop recording until the next order or flight."""
+    _show(ask("record.stop"))
+
+
+@group.command()
+def status(*, json: JsonOption = False) -> None:
+    """Tell what the recorder does."""
+    found = ask("record.status")
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        _show(found)
+
+
+@group.command()
+def save(
+    name: Annotated[str, typer.Argument(help="Letters, digits, spaces, dots, hyphens.")],
+    *,
+    recording: Annotated[
+        str | None,
+        typer.Option("--recording", help="Which one [default: the one that runs, or ran last]."),
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Give a recording a name; nothing is ever overwritten."""
+    if recording is None and socket_path("run").exists():
+        _show(ask("record.save", {"name": name}))
+        return
+    try:
+        found = rename_recording(_folder(config), recording or "last", name)
+    except RecordingError as error:
+        refuse(str(error))
+    _list([found])
+
+
+@group.command()
+def delete(
+    name: NameArgument,
+    *,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    config: ConfigOption = None,
+) -> None:
+    """Delete a recording, after asking."""
+    if not yes:
+        typer.confirm(f"Delete the recording {name!r} for ever?", abort=True)
+    if socket_path("run").exists():
+        deleted = msgspec.convert(ask("record.delete", {"name": name}), Recording)
+    else:
+        try:
+            deleted = delete_recording(_folder(config), name)
+        except RecordingError as error:
+            refuse(str(error))
+    for path in deleted.files:
+        Console(highlight=False).print(f"deleted {path}", markup=False)
+
+
+@group.command("list")
+def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
+    """List the recordings, the newest last."""
+    found = list_recordings(_folder(config))
+    if json:
+        print(msgspec.json.encode(found, enc_hook=str).decode())
+    else:
+        _list(found)
+
+
+def mark(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
+    """Put a remark at this moment into the recording, and tell the ground stations."""
+    ask("mark", {"text": text})
+
+
+def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
+    """Ask the gateway (or the player) that runs; end the command if that fails."""
+    try:
+        return request(socket_path(of), verb, params)
+    except ControlError as error:
+        refuse(str(error))
+
+
+def _folder(config: Path | None) -> Path:
+    return Path(read_settings(config).recording.folder).expanduser()
+
+
+def _show(status: dict[str, Any]) -> None:
+    console = Console(highlight=False)
+    line = status["state"]
+    if status["name"]:
+        line += f": {status['name']}, part {status['part']}, {status['part_bytes'] / 1e6:.1f} MB"
+    if status["reason"]:
+        line += f" ({status['reason']})"
+    console.print(line, markup=False)
+    console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free", markup=False)
+
+
+def _list(recordings: list[Recording]) -> None:
+    grid = Grid()
+    grid.add_column("recording")
+    grid.add_column("files", justify="right")
+    grid.add_column("MB", justify="right")
+    grid.add_column("last written (UTC)")
+    for recording in recordings:
+        when = datetime.fromtimestamp(recording.modified_s, UTC)
+        grid.add_row(
+            recording.name,
+            str(len(recording.files)),
+            f"{recording.size / 1e6:.2f}",
+            f"{when:%Y-%m-%d %H:%M:%S}",
+        )
+    Console(highlight=False).print(grid)

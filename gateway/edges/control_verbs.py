@@ -1,0 +1,172 @@
+"""The verbs of the control socket for the recorder and the player; see docs/control.md."""
+
+import msgspec
+
+from gateway.edges.control_socket import ControlError, ControlServer, NoParams
+from gateway.edges.player import PlayerEdge, PlayerStatus
+from gateway.edges.recorder import Recorder, RecorderStatus
+from gateway.edges.recordings import (
+    Recording,
+    RecordingError,
+    delete_recording,
+    find_recording,
+    list_recordings,
+)
+from gateway.flightlog.moment import parse_moment
+from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
+from gateway.flightlog.session import SessionState
+
+
+class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A recording by its name."""
+
+    name: str
+
+
+class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A remark."""
+
+    text: str
+
+
+class To(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A moment, written as people write it; see `parse_moment`."""
+
+    to: str
+
+
+class Steps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How many frames."""
+
+    count: int = 1
+
+
+class Speed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How fast; None for as fast as possible."""
+
+    speed: float | None
+
+
+class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """On or off."""
+
+    on: bool
+
+
+class RecorderVerbs:
+    """`record.*` and `mark`.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        What obeys.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+
+    def register(self, server: ControlServer) -> None:
+        """Offer the verbs on a socket."""
+        server.register("record.start", NoParams, self._start)
+        server.register("record.stop", NoParams, self._stop)
+        server.register("record.status", NoParams, self._status)
+        server.register("record.save", Named, self._save)
+        server.register("record.delete", Named, self._delete)
+        server.register("record.list", NoParams, self._list)
+        server.register("mark", Text, self._mark)
+
+    def _start(self, _: NoParams) -> RecorderStatus:
+        self._recorder.record()
+        return self._recorder.status()
+
+    def _stop(self, _: NoParams) -> RecorderStatus:
+        self._recorder.stop()
+        return self._recorder.status()
+
+    def _status(self, _: NoParams) -> RecorderStatus:
+        return self._recorder.status()
+
+    async def _save(self, params: Named) -> RecorderStatus:
+        try:
+            await self._recorder.save(params.name)
+        except (RecordingError, OSError) as error:
+            raise ControlError(str(error)) from error
+        return self._recorder.status()
+
+    def _delete(self, params: Named) -> Recording:
+        folder, now = self._recorder.folder, self._recorder.status()
+        try:
+            name = find_recording(folder, params.name).name
+            if name != now.name or now.state == SessionState.IDLE:
+                return delete_recording(folder, name)
+        except (RecordingError, OSError) as error:
+            raise ControlError(str(error)) from error
+        raise ControlError(f"{name} is being recorded; stop it first")
+
+    def _list(self, _: NoParams) -> list[Recording]:
+        return list_recordings(self._recorder.folder)
+
+    def _mark(self, params: Text) -> RecorderStatus:
+        self._recorder.mark(params.text)
+        return self._recorder.status()
+
+
+class PlayerVerbs:
+    """`play.*` and `seek`.
+
+    Parameters
+    ----------
+    player : PlayerEdge
+        What obeys.
+    """
+
+    def __init__(self, player: PlayerEdge) -> None:
+        self._player = player
+
+    def register(self, server: ControlServer) -> None:
+        """Offer the verbs on a socket."""
+        server.register("seek", To, self._seek)
+        server.register("play.pause", NoParams, self._pause)
+        server.register("play.resume", NoParams, self._resume)
+        server.register("play.step", Steps, self._step)
+        server.register("play.speed", Speed, self._speed)
+        server.register("play.loop", Switch, self._loop)
+        server.register("play.status", NoParams, self._status)
+
+    def _seek(self, params: To) -> PlayerStatus:
+        try:
+            moment = parse_moment(params.to)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        if moment.time_us is not None:
+            self._player.seek_time(moment.time_us)
+        else:
+            self._player.seek(moment.offset_s or 0.0, relative=moment.relative)
+        return self._player.status()
+
+    def _pause(self, _: NoParams) -> PlayerStatus:
+        self._player.pause()
+        return self._player.status()
+
+    def _resume(self, _: NoParams) -> PlayerStatus:
+        self._player.resume()
+        return self._player.status()
+
+    def _step(self, params: Steps) -> PlayerStatus:
+        self._player.step(params.count)
+        return self._player.status()
+
+    def _speed(self, params: Speed) -> PlayerStatus:
+        speed = AS_FAST_AS_POSSIBLE if params.speed is None else params.speed
+        try:
+            self._player.set_speed(speed)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._player.status()
+
+    def _loop(self, params: Switch) -> PlayerStatus:
+        self._player.set_loop(params.on)
+        return self._player.status()
+
+    def _status(self, _: NoParams) -> PlayerStatus:
+        return self._player.status()
