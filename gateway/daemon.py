@@ -10,11 +10,15 @@ import msgspec
 
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock, unix_time_us
+from gateway.edges.control_socket import ControlError, ControlServer, socket_path
+from gateway.edges.control_verbs import HubVerbs, RecorderVerbs
 from gateway.edges.hub import Hub
 from gateway.edges.metrics import MetricsServer
 from gateway.edges.pty_port import PtyPort
+from gateway.edges.recorder import Recorder
 from gateway.edges.serial_link import SerialLink
 from gateway.edges.service import ServiceNotifier, set_realtime_priority
+from gateway.flightlog.table import TableHeader
 from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
@@ -24,6 +28,7 @@ from gateway.records import (
     Incoming,
     Outgoing,
 )
+from gateway.replay import header_for
 from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
@@ -70,9 +75,18 @@ class Daemon:
             settings.hub,
             self._on_frame,
             self.now_us,
+            on_foreign=self._on_foreign,
             on_gone=self._pipeline.forget_client,
             on_trouble=self._on_trouble,
         )
+        self._recorder = Recorder(
+            settings.recording, self.now_us, unix_time_us, self._table_head, self._tell
+        )
+        self._heard: bytes | None = None
+        self._control = ControlServer(socket_path("run"))
+        RecorderVerbs(self._recorder).register(self._control)
+        HubVerbs(self._hub, self.snapshot).register(self._control)
+        self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
         self._notifier = ServiceNotifier()
         self._serial = SerialLink(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
@@ -87,6 +101,8 @@ class Daemon:
         self._serial.start()
         if self._receiver is not None:
             self._receiver.start()
+        self._recorder.start()
+        self._opening = asyncio.get_running_loop().create_task(self._open_control())
         self._poll()
         self._notifier.ready()
 
@@ -112,6 +128,10 @@ class Daemon:
         self._serial.close()
         if self._timer is not None:
             self._timer.cancel()
+        if self._opening is not None:
+            self._opening.cancel()
+        self._control.close()
+        self._recorder.close()
         self._metrics.close()
         self._hub.close()
 
@@ -134,17 +154,39 @@ class Daemon:
         self._pipeline.disconnect(port)
 
     def _on_trouble(self, text: str) -> None:
-        self._perform(self._pipeline.say(Told(WARNING, text), self.now_us()))
+        self._tell(True, text)
+
+    def _tell(self, is_trouble: bool, text: str) -> None:
+        told = Told(WARNING if is_trouble else NOTICE, text)
+        self._perform(self._pipeline.say(told, self.now_us()))
+
+    async def _open_control(self) -> None:
+        try:
+            await self._control.start()
+        except ControlError as error:
+            log.warning("no orders can be taken: %s", error)
+
+    def _table_head(self, vehicle_id: int) -> TableHeader:
+        return header_for(self._pipeline.aircraft[vehicle_id].settings, vehicle_id)
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         self._perform(self._pipeline.feed(data, now_us))
 
+    def _on_foreign(self, frame: bytes) -> None:
+        # A ground station's broadcast comes both to us and past us.
+        if frame is not self._heard:
+            self._recorder.frame(frame)
+
     def _on_frame(self, incoming: Incoming) -> None:
+        self._heard = incoming.frame
+        self._recorder.frame(incoming.frame)
         self._perform(self._pipeline.handle(incoming, self.now_us()))
 
     def _poll(self) -> None:
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
+        self._recorder.set_in_flight(self._pipeline.in_flight)
+        self._pipeline.set_recording(self._recorder.recording)
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
         self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
@@ -156,12 +198,15 @@ class Daemon:
                 case Outgoing():
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
+                    self._recorder.frame(action.frame)
                 case ClientInterval():
                     self._hub.set_interval(action)
                 case SaveSettings():
                     self._save(action.vehicle_id)
-                case RecordingRequest() | FusedSample() | BaroRaw() | GpsFix():
-                    pass
+                case RecordingRequest():
+                    (self._recorder.record if action.start else self._recorder.stop)()
+                case FusedSample() | BaroRaw() | GpsFix():
+                    self._recorder.flight(action)
 
     def _save(self, vehicle_id: int) -> None:
         """Write an aircraft's settings to its file, and tell how that went."""

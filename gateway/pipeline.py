@@ -254,6 +254,16 @@ class Pipeline:
             actions += aircraft.perform(aircraft.vehicle.say(told, now_us), now_us)
         return actions
 
+    @property
+    def in_flight(self) -> bool:
+        """Whether an aircraft flies."""
+        return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
+
+    def set_recording(self, recording: bool) -> None:
+        """Note whether a recording runs; ground stations are told."""
+        for aircraft in self.aircraft.values():
+            aircraft.vehicle.set_recording(recording)
+
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""
         actions: list[Action] = []

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import convert, demo, info, play, record, run, setup
+from gateway.cli import clients, convert, demo, info, play, record, run, setup
 
 app = typer.Typer(
     name="mavgate",
@@ -25,6 +25,7 @@ record.register(app)
 play.register(app)
 convert.register(app)
 info.register(app)
+clients.register(app)
 setup.register(app)
 
 

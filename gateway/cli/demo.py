@@ -67,7 +67,9 @@ def demo(
         refuse(str(error))
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
-        settings = replace(settings, aircraft_folder=folder)
+        # Nor is a flight that goes round and round worth a disk, unless it is asked for.
+        recording = replace(settings.recording, mode="manual")
+        settings = replace(settings, aircraft_folder=folder, recording=recording)
         asyncio.run(serve(lambda: Daemon(settings, aircraft, line), read, plain=plain))
 
 

@@ -82,6 +82,11 @@ def or_refuse(read: Callable[[], GatewaySettings]) -> GatewaySettings:
         refuse(str(error))
 
 
+def read_settings(file: Path | None) -> GatewaySettings:
+    """Load the settings; end the command if they are wrong."""
+    return or_refuse(lambda: load_settings(file))
+
+
 def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
     """Load what is different for single aircraft."""
     try:

@@ -1,8 +1,12 @@
 """The verbs of the control socket for the recorder and the player; see docs/control.md."""
 
+from collections.abc import Callable
+
 import msgspec
 
 from gateway.edges.control_socket import ControlError, ControlServer, NoParams
+from gateway.edges.hub import Hub
+from gateway.edges.live_view import summary_line
 from gateway.edges.player import PlayerEdge, PlayerStatus
 from gateway.edges.recorder import Recorder, RecorderStatus
 from gateway.edges.recordings import (
@@ -15,12 +19,20 @@ from gateway.edges.recordings import (
 from gateway.flightlog.moment import parse_moment
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
 from gateway.flightlog.session import SessionState
+from gateway.routing.clients import ClientStats
+from gateway.status import Snapshot
 
 
 class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A recording by its name."""
 
     name: str
+
+
+class Url(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An endpoint, as the settings write it."""
+
+    url: str
 
 
 class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,12 +87,14 @@ class RecorderVerbs:
         server.register("record.list", NoParams, self._list)
         server.register("mark", Text, self._mark)
 
-    def _start(self, _: NoParams) -> RecorderStatus:
+    async def _start(self, _: NoParams) -> RecorderStatus:
         self._recorder.record()
+        await self._recorder.settle()
         return self._recorder.status()
 
-    def _stop(self, _: NoParams) -> RecorderStatus:
+    async def _stop(self, _: NoParams) -> RecorderStatus:
         self._recorder.stop()
+        await self._recorder.settle()
         return self._recorder.status()
 
     def _status(self, _: NoParams) -> RecorderStatus:
@@ -109,6 +123,50 @@ class RecorderVerbs:
     def _mark(self, params: Text) -> RecorderStatus:
         self._recorder.mark(params.text)
         return self._recorder.status()
+
+
+class HubVerbs:
+    """`status` and `clients.*`.
+
+    Parameters
+    ----------
+    hub : Hub
+        Whose clients.
+    snapshot : callable
+        Describes the gateway at this moment.
+    """
+
+    def __init__(self, hub: Hub, snapshot: Callable[[], Snapshot]) -> None:
+        self._hub = hub
+        self._snapshot = snapshot
+
+    def register(self, server: ControlServer) -> None:
+        """Offer the verbs on a socket."""
+        server.register("status", NoParams, self._status)
+        server.register("clients.list", NoParams, self._list)
+        server.register("clients.add", Url, self._add)
+        server.register("clients.remove", Named, self._remove)
+
+    def _status(self, _: NoParams) -> dict[str, object]:
+        snapshot = self._snapshot()
+        return {"summary": summary_line(snapshot), "snapshot": snapshot}
+
+    def _list(self, _: NoParams) -> tuple[ClientStats, ...]:
+        return self._hub.clients()
+
+    def _add(self, params: Url) -> tuple[str, ...]:
+        try:
+            self._hub.add(params.url)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._hub.endpoints()
+
+    def _remove(self, params: Named) -> tuple[str, ...]:
+        try:
+            self._hub.remove(params.name)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._hub.endpoints()
 
 
 class PlayerVerbs:

@@ -30,6 +30,7 @@ from gateway.flightlog.session import (
     Rename,
     Session,
     SessionAction,
+    SessionState,
 )
 from gateway.flightlog.stamps import CivilClock, Stamper
 from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_mark
@@ -122,6 +123,7 @@ class Recorder:
         self._sync_due_us = 0
         self._worker = ThreadPoolExecutor(1, "recorder")
         self._wake = asyncio.Event()
+        self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.folder = Path(settings.folder).expanduser()
         """Where the recordings are."""
@@ -144,6 +146,14 @@ class Recorder:
             files.close()
         except OSError as error:
             log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+
+    async def settle(self) -> None:
+        """Wait until orders given so far have been carried out."""
+        # The turn that is at work may have begun before the order came.
+        for _ in range(2):
+            self._turned.clear()
+            self._wake.set()
+            await self._turned.wait()
 
     def record(self) -> None:
         """Record from now on."""
@@ -196,6 +206,11 @@ class Recorder:
             folder=str(self.folder),
         )
 
+    @property
+    def recording(self) -> bool:
+        """Whether a recording runs."""
+        return self._session.state is SessionState.RECORDING
+
     def frame(self, frame: bytes) -> None:
         """Keep a MAVLink frame that was sent or received."""
         part = self._part
@@ -244,8 +259,9 @@ class Recorder:
 
     async def _run(self) -> None:
         while True:
-            await self._turn()
             self._wake.clear()
+            await self._turn()
+            self._turned.set()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), self._settings.flush_s)
 

@@ -34,6 +34,7 @@ from gateway.vehicle.health import Health
 from gateway.vehicle.home import Place
 from gateway.vehicle.intervals import IntervalService
 from gateway.vehicle.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
+from gateway.vehicle.motion import IN_AIR
 from gateway.vehicle.parameter_service import ParameterService
 from gateway.vehicle.parameters import ParameterTable
 from gateway.vehicle.places import PlaceService
@@ -155,6 +156,11 @@ class Vehicle:
     def faults(self) -> Counter[str]:
         """Frames of clients that were dropped, by reason."""
         return self._reader.faults
+
+    @property
+    def in_flight(self) -> bool:
+        """Whether the aircraft flies."""
+        return self.telemetry.motion.landed_state == IN_AIR
 
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in what the estimator made of one IMU sample."""

@@ -281,8 +281,8 @@ async def test_what_was_flushed_is_on_the_disk_without_closing(bench: Bench) -> 
 
 async def test_it_runs_by_itself(bench: Bench) -> None:
     bench.recorder.start()
-    while bench.recorder.status().state != "recording":
-        await bench.recorder._on_disk(os.getpid)
+    await bench.recorder.settle()
+    assert bench.recorder.recording
     bench.send(FRAMES)
     bench.recorder.close()
     assert frames_of(bench.recorder.folder) == FRAMES

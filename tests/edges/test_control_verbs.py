@@ -1,0 +1,85 @@
+"""The verbs do what docs/control.md says."""
+
+import math
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from gateway.edges.control_socket import ControlServer
+from gateway.edges.control_verbs import PlayerVerbs, RecorderVerbs
+from tests.conftest import ManualClock
+from tests.edges.test_player import Played
+from tests.edges.test_recorder import Bench
+from tests.flightlog.frames import START_US, make_frames, make_records, make_tlog
+
+pytestmark = pytest.mark.io
+
+
+async def ask(server: ControlServer, verb: str, **params: object) -> dict[str, Any]:
+    line = msgspec.json.encode({"verb": verb, "params": params})
+    answer: dict[str, Any] = msgspec.json.decode(await server.answer(line))
+    return answer
+
+
+@pytest.fixture
+async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path / "recordings", clock, mode="manual")
+    made.recorder.start()
+    yield made
+    made.recorder.close()
+
+
+async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "s")
+    RecorderVerbs(bench.recorder).register(server)
+    started = (await ask(server, "record.start"))["result"]
+    assert (started["state"], started["part"]) == ("recording", 1)
+    bench.send(make_frames(9))
+    assert (await ask(server, "mark", text="here"))["ok"]
+    await bench.recorder.settle()
+    saved = await ask(server, "record.save", name="first")
+    assert saved["result"]["name"] == "first"
+    assert not (await ask(server, "record.save", name="../x"))["ok"]
+    refused = await ask(server, "record.delete", name="last")
+    assert refused["error"] == "first is being recorded; stop it first"
+    stopped = (await ask(server, "record.stop"))["result"]
+    assert stopped["state"] == "idle"
+    (listed,) = (await ask(server, "record.list"))["result"]
+    assert listed["name"] == "first"
+    deleted = await ask(server, "record.delete", name="first")
+    assert [Path(file).name for file in deleted["result"]["files"]] == ["first_01.tlog"]
+    assert (await ask(server, "record.list"))["result"] == []
+    assert not (await ask(server, "record.delete", name="first"))["ok"]
+    assert bench.announced[1] == (False, "Mark: here")
+
+
+async def test_a_player_is_steered(clock: ManualClock, tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(make_tlog(make_records(500)))
+    played = Played(path, clock)
+    played.edge.start()
+    server = ControlServer(tmp_path / "s")
+    PlayerVerbs(played.edge).register(server)
+
+    async def state(verb: str, **params: object) -> dict[str, Any]:
+        answer = await ask(server, verb, **params)
+        assert answer["ok"], answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    assert (await state("play.pause"))["state"] == "paused"
+    assert (await state("seek", to="0:05"))["position_s"] == pytest.approx(5.0)
+    assert (await state("seek", to="-2"))["position_s"] == pytest.approx(3.0)
+    assert (await state("seek", to="2025-10-09T08:53:21Z"))["time_us"] == START_US + 1_000_000
+    assert (await state("play.step", count=3))["sent"] == 4
+    assert (await state("play.speed", speed=20))["speed"] == 20.0
+    assert (await state("play.speed", speed=None))["speed"] is None
+    assert (await state("play.loop", on=True))["loop"] is True
+    assert (await state("play.resume"))["state"] == "playing"
+    assert math.isclose((await state("play.status"))["duration_s"], 499 * 0.02)
+    assert not (await ask(server, "seek", to="soon"))["ok"]
+    assert not (await ask(server, "play.speed", speed=1000))["ok"]
+    played.close()
