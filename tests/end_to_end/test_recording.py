@@ -1,0 +1,145 @@
+"""The simulated flight, recorded, replayed and fused again, is the same flight."""
+
+from collections.abc import Iterator
+from itertools import takewhile
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gateway.cli.demo import calibrated_aircraft
+from gateway.cli.flights import Wishes, fuse, fused_rows, open_rows
+from gateway.config import GatewaySettings
+from gateway.edges.player import TlogFile
+from gateway.edges.recorder import Recorder
+from gateway.flightlog.playback import Player
+from gateway.flightlog.row import TableRow
+from gateway.flightlog.session import RecordingSettings
+from gateway.flightlog.table import TableReader
+from gateway.flightlog.tlog import TlogScanner
+from gateway.pipeline import Action, Pipeline, PipelineSettings
+from gateway.records import BaroRaw, FusedSample, GpsFix, NavState, Outgoing
+from gateway.replay import header_for
+from gateway.simulator.receiver import simulate
+from tests.conftest import ManualClock
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+START_UNIX_US = 1_781_187_930_000_000
+FLIGHT_S = 20.0
+TURN_US = 500_000
+
+
+class Flight:
+    """The simulated receiver's bytes through a pipeline, as the daemon would run it."""
+
+    def __init__(self, estimator: str, clock: ManualClock) -> None:
+        estimation = {"estimator": estimator}
+        self.settings = msgspec.convert({"estimation": estimation}, GatewaySettings)
+        self.aircraft = calibrated_aircraft(self.settings)
+        self.clock = clock
+        self.pipeline = Pipeline(
+            PipelineSettings(self.settings.default_aircraft, self.aircraft, START_UNIX_US)
+        )
+
+    def actions(self) -> Iterator[Action]:
+        frames = simulate(self.settings.simulator, START_UNIX_US).frames()
+        for frame in takewhile(lambda frame: frame.time_s < FLIGHT_S, frames):
+            self.clock.now_us = round(frame.time_s * 1e6)
+            yield from self.pipeline.feed(frame.data, self.clock.now_us)
+            if self.pipeline.next_due_us() <= self.clock.now_us:
+                yield from self.pipeline.poll(self.clock.now_us)
+
+
+class Recording:
+    """A recorder that is turned by hand."""
+
+    def __init__(self, folder: Path, clock: ManualClock, flight: Flight | None = None) -> None:
+        self._clock = clock
+        self._turned_us = clock()
+        self.recorder = Recorder(
+            RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0),
+            clock,
+            lambda: START_UNIX_US + clock(),
+            lambda vehicle_id: header_for(flight.aircraft[vehicle_id], vehicle_id),
+            lambda _, __: None,
+        )
+
+    async def turn(self) -> None:
+        if self._clock() - self._turned_us >= TURN_US:
+            self._turned_us = self._clock()
+            await self.recorder._turn()
+
+    async def __aenter__(self) -> Recorder:
+        await self.recorder._turn()
+        return self.recorder
+
+    async def __aexit__(self, *_: object) -> None:
+        self.recorder.close()
+
+
+@pytest.fixture(params=["complementary", "paper", "eskf"])
+async def recorded(
+    request: pytest.FixtureRequest, tmp_path: Path, clock: ManualClock
+) -> tuple[Path, list[bytes], list[NavState], Flight]:
+    flight = Flight(request.param, clock)
+    recording = Recording(tmp_path / "first", clock, flight)
+    frames: list[bytes] = []
+    states: list[NavState] = []
+    async with recording as recorder:
+        for action in flight.actions():
+            if isinstance(action, Outgoing):
+                frames.append(action.frame)
+                recorder.frame(action.frame)
+            elif isinstance(action, FusedSample | BaroRaw | GpsFix):
+                recorder.flight(action)
+            if isinstance(action, FusedSample):
+                states.append(action.state)
+            await recording.turn()
+    return tmp_path / "first", frames, states, flight
+
+
+def frames_in(folder: Path) -> list[bytes]:
+    (path,) = folder.glob("*.tlog")
+    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
+    assert batch.damage == ()
+    return [record.frame for record in batch.records()]
+
+
+async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message(
+    recorded: tuple[Path, list[bytes], list[NavState], Flight], tmp_path: Path, clock: ManualClock
+) -> None:
+    folder, frames, _, _ = recorded
+    assert len(frames) > 100 * FLIGHT_S
+    assert frames_in(folder) == frames
+    (path,) = folder.glob("*.tlog")
+    source = TlogFile(path)
+    player = Player([source.track()], clock(), speed=10.0)
+    recording = Recording(tmp_path / "second", clock)
+    async with recording as recorder:
+        while (due_us := player.next_due_us()) is not None:
+            clock.now_us = max(clock.now_us, due_us)
+            for frame in player.poll(clock(), 100):
+                recorder.frame(frame)
+            await recording.turn()
+    source.close()
+    assert frames_in(tmp_path / "second") == frames
+
+
+async def test_the_table_alone_gives_the_recorded_states_to_the_last_bit(
+    recorded: tuple[Path, list[bytes], list[NavState], Flight],
+) -> None:
+    folder, _, states, flight = recorded
+    (path,) = folder.glob("*.csv")
+    reader = TableReader()
+    events = reader.feed(path.read_bytes(), final=True)
+    rows = [event for event in events if isinstance(event, TableRow)]
+    assert rows == events
+    assert reader.header is not None
+    assert reader.header.cold_start
+    assert repr([row.state for row in rows if row.state is not None]) == repr(states)
+    wishes = Wishes(PipelineSettings(flight.settings.default_aircraft))
+    table = open_rows(path, wishes)
+    again = list(fused_rows(table, fuse(table, wishes)))
+    assert repr([row.state for row in again if row.state is not None]) == repr(states)
+    assert repr(again) == repr(rows)
