@@ -1,13 +1,17 @@
 """One recording that is being played: a place in a tlog that moves on and can be sought."""
 
 from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
 from types import MappingProxyType
 from typing import Final
+
+import numpy as np
 
 from gateway.flightlog.readdress import readdress
 from gateway.flightlog.tlog import (
     SEEK_BYTES,
     STRIDE,
+    Batch,
     TlogIndex,
     TlogRecord,
     TlogScanner,
@@ -22,7 +26,7 @@ BLOCK_BYTES: Final = 1 << 18
 
 CONTEXT_RECORDS: Final = 20 * STRIDE
 """How far back a seek looks for what a ground station must know: a minute and more."""
-CONTEXT_IDS: Final = frozenset({0, 1, 22, 24, 49, 148, 242, 245, 33, 30, 31, 74})
+CONTEXT_IDS: Final = (0, 1, 22, 24, 30, 31, 33, 49, 74, 148, 242, 245)
 """HEARTBEAT, SYS_STATUS, PARAM_VALUE, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
 HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
 PARAM_VALUE_ID: Final = 22
@@ -57,7 +61,7 @@ class Track:
         self._index = index
         self._shift_us = shift_us
         self._system_ids = system_ids
-        self._records = self._read_from(0)
+        self._records = _records_of(self._read_from(0))
         self._next = next(self._records, None)
 
     @property
@@ -109,30 +113,39 @@ class Track:
         """
         wanted_us = time_us - self._shift_us
         newest: dict[tuple[int, int, int, bytes], bytes] = {}
-        self._records = self._read_from(self._index.offset_before(wanted_us, CONTEXT_RECORDS))
-        self._next = None
-        for record in self._records:
-            if record.time_us >= wanted_us:
-                self._next = record
-                break
-            if message_id_of(record.frame) in CONTEXT_IDS:
-                key = _key_of(record.frame)
+        batches = self._read_from(self._index.offset_before(wanted_us, CONTEXT_RECORDS))
+        self._records = iter(())
+        for batch in batches:
+            reached = np.flatnonzero(batch.time_us >= wanted_us)
+            begin = int(reached[0]) if len(reached) else len(batch)
+            for i in np.flatnonzero(np.isin(batch.message_ids[:begin], CONTEXT_IDS)).tolist():
+                frame = batch.frame(i)
+                key = _key_of(frame)
+                # Taken out first, so that the newest come last.
                 newest.pop(key, None)
-                newest[key] = record.frame
+                newest[key] = frame
+            if len(reached):
+                self._records = chain(batch.records(begin), _records_of(batches))
+                break
+        self._next = next(self._records, None)
         return [self._addressed(frame) for frame in newest.values()]
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])
         return frame if system_id is None else readdress(frame, system_id)
 
-    def _read_from(self, offset: int) -> Iterator[TlogRecord]:
+    def _read_from(self, offset: int) -> Iterator[Batch]:
         scanner = TlogScanner(offset)
         size = SEEK_BYTES
         while data := self._read(offset, size):
-            yield from scanner.feed(data).records()
+            yield scanner.feed(data)
             offset += len(data)
             size = BLOCK_BYTES
-        yield from scanner.feed(b"", final=True).records()
+        yield scanner.feed(b"", final=True)
+
+
+def _records_of(batches: Iterator[Batch]) -> Iterator[TlogRecord]:
+    return chain.from_iterable(batch.records() for batch in batches)
 
 
 def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:

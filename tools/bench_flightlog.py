@@ -1,0 +1,308 @@
+"""Measure recordings: opening and seeking, replay, and what recording costs.
+
+Each figure stands beside pymavlink's `mavlogfile` (what MAVProxy and mavlogdump read with) in the
+same run, on the same file. Nothing leaves this machine.
+
+    python tools/bench_flightlog.py [--messages 1000000] [--json FILE]
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import math
+import os
+import resource
+import select
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.edges.clock import GatewayClock, unix_time_us
+from gateway.edges.hub import Hub
+from gateway.edges.player import PlayerEdge, TlogFile
+from gateway.edges.recorder import Recorder
+from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
+from gateway.flightlog.session import RecordingSettings
+from gateway.flightlog.table import TableHeader
+from gateway.flightlog.tlog import encode_record
+from gateway.records import (
+    FusedSample,
+    ImuFlags,
+    ImuRaw,
+    ImuSample,
+    NavFlags,
+    NavState,
+    NodeId,
+    Outgoing,
+)
+from gateway.routing.settings import HubSettings
+from gateway.wire.mavlink_splitter import message_id_of
+
+START_US = 1_781_187_930_000_000
+STEP_US = 7_000
+SEEKS = 100
+CLIENTS = 4
+REPLAYED = 200_000
+RECORDED = 100_000
+FUSED = 20_000
+
+
+def make_frames(count: int) -> list[bytes]:
+    """Pack the mix of messages that the gateway sends."""
+    mav = mavlink.MAVLink(None, 1, 1)
+    frames = []
+    for i in range(count):
+        message = (
+            mavlink.MAVLink_attitude_quaternion_message(7 * i, 1.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            mavlink.MAVLink_attitude_message(7 * i, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            mavlink.MAVLink_global_position_int_message(7 * i, i, i, i, i, 1, 2, 3, 4),
+            mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3),
+        )[i % 4]
+        frames.append(bytes(message.pack(mav)))
+        mav.seq = (mav.seq + 1) % 256
+    return frames
+
+
+def write_tlog(path: Path, count: int) -> None:
+    """Write a tlog of so many messages."""
+    frames = make_frames(1024)
+    with path.open("wb") as file:
+        for begin in range(0, count, 1024):
+            piece = (
+                encode_record(START_US + i * STEP_US, frames[i % 1024])
+                for i in range(begin, min(begin + 1024, count))
+            )
+            file.write(b"".join(piece))
+
+
+def timed(job: Callable[[], Any]) -> tuple[float, Any]:
+    """Run a job and return how long it took and what it gave."""
+    begin = time.perf_counter()
+    result = job()
+    return time.perf_counter() - begin, result
+
+
+def measure_index(path: Path, count: int) -> dict[str, float]:
+    """Open and seek, ours and pymavlink's."""
+    # Compiles, and brings the file into the page cache for all.
+    TlogFile(path).close()
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    open_s, file = timed(lambda: TlogFile(path))
+    assert file.index.count == count
+    grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
+    track = file.track()
+    places = np.random.default_rng(1).integers(0, count, SEEKS).tolist()
+
+    def seek_all() -> None:
+        for place in places:
+            track.seek(START_US + place * STEP_US)
+            assert track.peek_us() == START_US + place * STEP_US
+
+    seek_s = timed(seek_all)[0] / SEEKS
+    file.close()
+    peer_s, _ = timed(lambda: read_until(path, START_US + count // 2 * STEP_US))
+    mapped_s, mapped = timed(lambda: mavutil.mavmmaplog(str(path)))
+    mapped.close()
+    return {
+        "messages": count,
+        "open_s": open_s,
+        "seek_s": seek_s,
+        "memory_grown_mb": grown_kb / 1024,
+        "mavlogfile_open_and_seek_to_the_middle_s": peer_s,
+        "times_faster_than_mavlogfile": peer_s / (open_s + seek_s),
+        "mavmmaplog_open_s": mapped_s,
+        "times_faster_than_mavmmaplog": mapped_s / open_s,
+    }
+
+
+def read_until(path: Path, time_us: int) -> None:
+    """Seek as `mavlogfile` does: by reading on."""
+    log = mavutil.mavlogfile(str(path))
+    while (message := log.recv_msg()) is not None:
+        if round(message._timestamp * 1e6) >= time_us:  # noqa: SLF001
+            break
+    log.close()
+
+
+class Counter:
+    """Clients in a process of their own that count what they get."""
+
+    def __init__(self) -> None:
+        self.sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(CLIENTS)]
+        for place in self.sockets:
+            place.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+            place.bind(("127.0.0.1", 0))
+        self.ports = [place.getsockname()[1] for place in self.sockets]
+        self._read, self._write = os.pipe()
+        self.process = os.fork()
+        if self.process == 0:
+            self._count()
+
+    def _count(self) -> None:
+        """Count until nothing has come for a second, in the child."""
+        got = 0
+        while True:
+            ready, _, _ = select.select(self.sockets, [], [], 1.0 if got else 60.0)
+            if not ready:
+                break
+            for place in ready:
+                with contextlib.suppress(BlockingIOError):
+                    while True:
+                        place.recv(2048, socket.MSG_DONTWAIT)
+                        got += 1
+        os.write(self._write, str(got).encode())
+        os._exit(0)
+
+    def result(self) -> int:
+        """Return how many came."""
+        got = int(os.read(self._read, 32))
+        os.waitpid(self.process, 0)
+        for place in self.sockets:
+            place.close()
+        return got
+
+
+def measure_replay(path: Path) -> dict[str, float]:
+    """Play as fast as possible to UDP clients, beside a loop that only sends."""
+    counter = Counter()
+    sent_s, sent = asyncio.run(play_all(path, counter.ports))
+    delivered = counter.result()
+    plain = Counter()
+    frames = make_frames(1024)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as place:
+
+        def send_all() -> None:
+            for i in range(sent):
+                for port in plain.ports:
+                    place.sendto(frames[i % 1024], ("127.0.0.1", port))
+
+        plain_s = timed(send_all)[0]
+    plain.result()
+    return {
+        "clients": CLIENTS,
+        "messages": sent,
+        "messages_per_s": sent / sent_s,
+        "datagrams_per_s": CLIENTS * sent / sent_s,
+        "share_delivered": delivered / (CLIENTS * sent),
+        "plain_sendto_loop_messages_per_s": sent / plain_s,
+    }
+
+
+async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
+    """Play a tlog to the ports, and tell how long it took and how many frames it sent."""
+    clock = GatewayClock()
+    hub = Hub(
+        HubSettings(endpoints=tuple(f"udp:127.0.0.1:{port}" for port in ports)),
+        lambda _: None,
+        clock,
+    )
+    hub.start()
+    file = TlogFile(path)
+    ended = asyncio.Event()
+    player = Player([file.track()], clock(), speed=AS_FAST_AS_POSSIBLE)
+
+    def emit(frames: Iterable[bytes]) -> None:
+        for frame in frames:
+            hub.send(Outgoing(frame, message_id_of(frame)))
+
+    edge = PlayerEdge(player, emit, clock, on_end=ended.set)
+    begin = time.perf_counter()
+    edge.start()
+    await ended.wait()
+    elapsed = time.perf_counter() - begin
+    hub.close()
+    file.close()
+    return elapsed, player.sent
+
+
+def measure_recording(folder: Path) -> dict[str, float]:
+    """Record frames and fused samples; the disk's own time is told apart."""
+    return asyncio.run(record_all(folder))
+
+
+async def record_all(folder: Path) -> dict[str, float]:
+    """Measure what one frame and one sample cost the loop."""
+    settings = RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0)
+    recorder = Recorder(
+        settings, GatewayClock(), unix_time_us, lambda _: TableHeader(), lambda _, __: None
+    )
+    recorder.start()
+    await recorder.settle()
+    frames = make_frames(1024)
+    cpu = time.thread_time()
+    for i in range(RECORDED):
+        recorder.frame(frames[i % 1024])
+    frame_s = (time.thread_time() - cpu) / RECORDED
+    await recorder.settle()
+    samples = [make_sample(i) for i in range(1024)]
+    cpu = time.thread_time()
+    for i in range(FUSED):
+        recorder.flight(samples[i % 1024])
+    sample_s = (time.thread_time() - cpu) / FUSED
+    await recorder.settle()
+    recorder.close()
+    sizes = {path.suffix: path.stat().st_size for path in folder.iterdir()}
+    return {
+        "us_per_frame": frame_s * 1e6,
+        "bytes_per_frame": sizes[".tlog"] / RECORDED,
+        "us_per_sample": sample_s * 1e6,
+        "bytes_per_sample": sizes[".csv"] / FUSED,
+    }
+
+
+def make_sample(i: int) -> FusedSample:
+    """Make a sample with floats of full length, as in life."""
+    x = math.sin(i) / 3
+    v = (x, x * x, -x)
+    raw = ImuRaw(
+        *(10_000 * i, NodeId(1, 0), 10_000 * i, (i, -i, 4096), (i, i, i), (1, 2, 3)),
+        *(500, 8, 500, 1090, ImuFlags.MAG_NEW),
+    )
+    sample = ImuSample(10_000 * i, v, v, v, v, v, 21.5 + x, ImuFlags.MAG_NEW)
+    q = (math.cos(x), math.sin(x), x, x)
+    flags = NavFlags.ATTITUDE_VALID
+    state = NavState(10_000 * i, q, v, 47.0 + x, 8.0 + x, 430.0 + x, v, v, v, v, flags)
+    return FusedSample(1, raw, sample, state)
+
+
+def show(title: str, figures: dict[str, float]) -> None:
+    """Print one group of figures."""
+    print(title)
+    for name, value in figures.items():
+        text = f"{value:,}" if isinstance(value, int) else f"{value:,.6g}"
+        print(f"  {name.replace('_', ' '):<45}{text:>15}")
+
+
+def main() -> None:
+    """Measure all, print, and write the figures if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--messages", type=int, default=1_000_000)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    results: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory(prefix="mavgate-bench-") as name:
+        folder = Path(name)
+        short = folder / "short.tlog"
+        write_tlog(short, REPLAYED)
+        results["replay"] = measure_replay(short)
+        show("Replay as fast as possible to UDP clients", results["replay"])
+        results["recording"] = measure_recording(folder / "recordings")
+        show("Recording: processor time on the event loop", results["recording"])
+        long = folder / "long.tlog"
+        write_tlog(long, args.messages)
+        results["index"] = measure_index(long, args.messages)
+        show("Open and seek", results["index"])
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
