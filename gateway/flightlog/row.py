@@ -138,9 +138,9 @@ class RowBuilder:
                 rows = self.flush() if self._gps else []
                 self._gps = record
             case FusedSample():
-                imu = _calibrated(record)
-                rows = [TableRow(imu.time_us, self._baro, self._gps, record.imu, imu, record.state)]
-                self._baro = self._gps = None
+                rows = [self._row(record.imu, _calibrated(record), record.state)]
+            case ImuCalibrated():
+                rows = [self._row(None, record, None)]
         return rows
 
     def _row(self, raw: ImuRaw | None, imu: ImuCalibrated, state: NavState | None) -> TableRow:

@@ -63,6 +63,13 @@ def test_usual_records_share_one_row(rng: np.random.Generator) -> None:
     ]
 
 
+def test_calibrated_samples_without_states_make_rows_too(rng: np.random.Generator) -> None:
+    (row,) = RowBuilder().add(replace(make_fused(rng, 1000), imu=None))
+    assert row.imu is not None
+    fix = make_fix(rng, 900)
+    assert repr(rows_of([fix, row.imu])) == repr([TableRow(1000, gps=fix, imu=row.imu)])
+
+
 @pytest.mark.parametrize(("column", "text"), [("time_us", "x"), ("gps_fix_type", "9")])
 def test_a_cell_that_cannot_be_is_refused(rng: np.random.Generator, column: str, text: str) -> None:
     row = TableRow(5, gps=make_fix(rng, 5))

@@ -1,0 +1,171 @@
+"""Kill a recorder at random moments, and cut recordings at every byte: what is left must open.
+
+A child process records frames and fused samples at a true rate until it is killed (SIGKILL). Then
+its files are read: every record must be there in its order from the first one on, nothing may be
+damaged but the cut tail, and no more than the last second may be missing. Then one small recording
+is cut after each of its bytes, and every prefix must open and hold all of its whole records.
+
+    python tools/kill_recorder.py [--kills 200] [--seed 1]
+"""
+
+import argparse
+import asyncio
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.edges.clock import GatewayClock, unix_time_us
+from gateway.edges.recorder import Recorder
+from gateway.flightlog.row import TableRow
+from gateway.flightlog.session import RecordingSettings
+from gateway.flightlog.table import TableFault, TableHeader, TableReader
+from gateway.flightlog.tlog import Batch, TlogScanner
+from gateway.records import (
+    FusedSample,
+    ImuFlags,
+    ImuRaw,
+    ImuSample,
+    NavFlags,
+    NavState,
+    NodeId,
+)
+from gateway.wire.mavlink_splitter import message_id_of
+
+RATE_HZ = 200
+"""Fused samples a second; each goes with two frames."""
+LONGEST_S = 3.0
+SHORTEST_S = 0.3
+MAX_LOST_S = 1.0
+CUT_BYTES = 6000
+
+
+def make_frame(mav: mavlink.MAVLink, number: int, now_us: int) -> bytes:
+    """Make a frame that tells its number and the time at which it was recorded."""
+    return bytes(mavlink.MAVLink_system_time_message(now_us, number).pack(mav))
+
+
+def make_sample(number: int) -> FusedSample:
+    """Make a sample that tells its number."""
+    v = (0.1, 0.2, number / 3)
+    time_us = number * 1000
+    raw = ImuRaw(
+        *(time_us, NodeId(1, 0), number, (1, 2, 3), (4, 5, 6), (7, 8, 9)),
+        *(10, 8, 500, 1090, ImuFlags.MAG_NEW),
+    )
+    sample = ImuSample(time_us, v, v, v, v, v, 20.0, ImuFlags.MAG_NEW)
+    state = NavState(time_us, (1.0, *v), v, 47.0, 8.0, 4.0, v, v, v, v, NavFlags(0))
+    return FusedSample(1, raw, sample, state)
+
+
+async def record_for_ever(folder: Path) -> None:
+    """Record numbered frames and samples until somebody ends it."""
+    settings = RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0)
+    clock = GatewayClock()
+    recorder = Recorder(settings, clock, unix_time_us, lambda _: TableHeader(), lambda *_: None)
+    recorder.start()
+    await recorder.settle()
+    mav = mavlink.MAVLink(None, 1, 1)
+    number = 0
+    while True:
+        for _ in range(clock() * RATE_HZ // 1_000_000 - number):
+            recorder.flight(make_sample(number))
+            for frame in (2 * number, 2 * number + 1):
+                recorder.frame(make_frame(mav, frame, unix_time_us()))
+            number += 1
+        await asyncio.sleep(1 / RATE_HZ)
+
+
+def kill_one(folder: Path, life_s: float) -> float:
+    """Let a recorder live so long, kill it, and return how many seconds of its work are lost.
+
+    Raises
+    ------
+    AssertionError
+        If something is wrong with what it left.
+    """
+    child = os.fork()
+    if child == 0:
+        asyncio.run(record_for_ever(folder))
+    time.sleep(life_s)
+    os.kill(child, signal.SIGKILL)
+    killed_us = unix_time_us()
+    os.waitpid(child, 0)
+    born_us = killed_us - round(life_s * 1e6)
+    last_us = born_us
+    for path in folder.glob("*.tlog"):
+        last_us = max(last_us, check_tlog(path.read_bytes()) or born_us)
+    for path in folder.glob("*.csv"):
+        check_table(path.read_bytes())
+    return (killed_us - last_us) / 1e6
+
+
+def check_tlog(data: bytes) -> int | None:
+    """Check that a tlog holds all its frames from the first on; return the time of the last."""
+    batch = TlogScanner(strict=True).feed(data, final=True)
+    check_tail(batch, len(data))
+    decoder = mavlink.MAVLink(None)
+    last_us = None
+    for number, record in enumerate(batch.records()):
+        assert message_id_of(record.frame) == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME
+        message = decoder.decode(bytearray(record.frame))
+        assert message.time_boot_ms == number, f"frame {message.time_boot_ms} at place {number}"
+        last_us = message.time_unix_usec
+    return last_us
+
+
+def check_tail(batch: Batch, size: int) -> None:
+    """Check that nothing but the end is damaged."""
+    assert len(batch.damage) <= 1, batch.damage
+    assert all(run.offset + run.size == size for run in batch.damage), batch.damage
+
+
+def check_table(data: bytes) -> None:
+    """Check that a table holds all its rows from the first on, and only its end is damaged."""
+    events = TableReader().feed(data, final=True)
+    faults = [event for event in events if isinstance(event, TableFault)]
+    assert faults in ([], events[-1:]), faults
+    for number, row in enumerate(event for event in events if isinstance(event, TableRow)):
+        assert row.time_us == number * 1000, f"row of {row.time_us} µs at place {number}"
+
+
+def cut_everywhere(folder: Path) -> tuple[int, int]:
+    """Cut what a killed recorder left after every byte of its first `CUT_BYTES`."""
+    (tlog,) = (path.read_bytes()[:CUT_BYTES] for path in folder.glob("*.tlog"))
+    (table,) = (path.read_bytes()[:CUT_BYTES] for path in folder.glob("*.csv"))
+    for size in range(len(tlog)):
+        check_tlog(tlog[:size])
+    for size in range(len(table)):
+        check_table(table[:size])
+    return len(tlog), len(table)
+
+
+def main() -> None:
+    """Kill, cut, and tell how it went."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    lives_s = np.random.default_rng(args.seed).uniform(SHORTEST_S, LONGEST_S, args.kills)
+    lost_s = []
+    # Compiled here once, so that no child spends its short life on it.
+    check_tlog(b"")
+    with tempfile.TemporaryDirectory(prefix="mavgate-kill-") as name:
+        for number, life_s in enumerate(lives_s.tolist()):
+            folder = Path(name) / str(number)
+            lost_s.append(kill_one(folder, life_s))
+        tlog_cuts, table_cuts = cut_everywhere(folder)
+    print(f"{args.kills} kills: every recording opens, only the cut end is damaged")
+    print(f"lost: mean {np.mean(lost_s):.3f} s, most {max(lost_s):.3f} s")
+    print(f"cut at every byte: {tlog_cuts} prefixes of a tlog, {table_cuts} of a table, all open")
+    if max(lost_s) > MAX_LOST_S:
+        sys.exit(f"more than {MAX_LOST_S} s lost")
+
+
+if __name__ == "__main__":
+    main()
