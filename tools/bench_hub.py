@@ -178,13 +178,13 @@ class Bench:
             sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._poll.register(sink, select.POLLIN)
         with udp_socket() as probe:
-            port = probe.getsockname()[1]
+            self.port: int = probe.getsockname()[1]
         self._source = udp_socket()
-        self._source.connect(("127.0.0.1", port))
+        self._source.connect(("127.0.0.1", self.port))
         self._counts = [0] * clients
         self._stamps: list[list[int]] | None = None
         self.process = subprocess.Popen(
-            command(port, [sink.getsockname()[1] for sink in self._sinks]),
+            command(self.port, [sink.getsockname()[1] for sink in self._sinks]),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             stdin=subprocess.DEVNULL,

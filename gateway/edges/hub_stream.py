@@ -7,7 +7,7 @@ connection when nothing was acknowledged for long.
 import asyncio
 import logging
 import socket
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub_link import HubContext, Link
 from gateway.edges.hub_udp import RETRY_US
@@ -177,27 +177,33 @@ class TcpLink(StreamLink):
         self.state = "connecting"
 
     async def _connect(self) -> None:
-        sock: socket.socket | None = None
+        host, port = self.endpoint.host, self.endpoint.port
         try:
-            found = await self.loop.getaddrinfo(
-                self.endpoint.host, self.endpoint.port, type=socket.SOCK_STREAM
-            )
-            family, _, _, _, address = found[0]
-            sock = socket.socket(family, socket.SOCK_STREAM)
-            sock.setblocking(False)
-            await self.loop.sock_connect(sock, address)
-            self.adopt(sock)
-            sock = None
-        except socket.gaierror:
-            self.state = "resolving"
-        except ConnectionRefusedError:
-            self.state = "refused"
+            found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            for family, _, _, _, address in found:
+                if await self._connect_to(family, address):
+                    break
         except OSError:
-            self.state = "unreachable"
+            self.state = "resolving"
         finally:
             self._task = None
-            if sock is not None:
-                sock.close()
+
+    async def _connect_to(self, family: int, address: tuple[Any, ...]) -> bool:
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            await self.loop.sock_connect(sock, address)
+        except OSError as error:
+            sock.close()
+            refused = isinstance(error, ConnectionRefusedError)
+            self.state = "refused" if refused else "unreachable"
+            return False
+        except asyncio.CancelledError:
+            sock.close()
+            raise
+        self.remote = f"{address[0]}:{address[1]}"
+        self.adopt(sock)
+        return True
 
 
 class TcpPeer(StreamLink):
@@ -235,10 +241,13 @@ class TcpListener:
         return self._socket.getsockname()[1] if self._socket else 0
 
     def tick(self, now_us: int) -> None:
-        """Bind again if that failed."""
-        if self._socket is not None or now_us < self._retry_us:
+        """Bind or accept again if that failed."""
+        if now_us < self._retry_us:
             return
         self._retry_us = now_us + RETRY_US
+        if self._socket is not None:
+            self._loop.add_reader(self._socket, self._on_readable, self._socket)
+            return
         host, port = self.endpoint.host, self.endpoint.port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         sock = socket.socket(family, socket.SOCK_STREAM)
@@ -278,7 +287,12 @@ class TcpListener:
         for _ in range(READ_BUDGET):
             try:
                 connection, address = sock.accept()
-            except OSError:
+            except BlockingIOError:
+                return
+            except OSError as error:
+                log.warning("cannot accept a client: %s", error)
+                # Out of descriptors: the waiting client would wake us for ever.
+                self._loop.remove_reader(sock)
                 return
             if len(self._links) >= self._context.settings.max_clients:
                 self.refused += 1
