@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import demo, run, setup
+from gateway.cli import clients, demo, run, setup
 
 app = typer.Typer(
     name="mavgate",
@@ -21,6 +21,7 @@ app = typer.Typer(
 )
 run.register(app)
 demo.register(app)
+clients.register(app)
 setup.register(app)
 
 
