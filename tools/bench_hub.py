@@ -258,6 +258,8 @@ class Bench:
         total = 0
         while total < delivered:
             self.throughput(2.0, WINDOWS[0])
+            if not any(self._counts):
+                raise RuntimeError("the forwarder has stopped")
             total += sum(self._counts)
             yield total, resident_kib(self.process.pid)
 
@@ -268,6 +270,7 @@ class Bench:
             self._send(self._frames[0])
             self._drain(50)
             if min(self._counts) > 2:
+                time.sleep(0.2)
                 self._settle()
                 return
             time.sleep(0.05)

@@ -58,12 +58,13 @@ class StreamLink(Link):
         """Send one frame at once if nothing waits, else queue it."""
         if self._socket is None:
             self.counters.dropped += 1
-        elif self._partial or self._outbox:
-            self._drop(self._outbox.push(frame, message_id))
-            self.counters.sent += 1
+            return
+        self.counters.sent += 1
+        step = self._numbering.enter(frame)
+        if self._partial or self._outbox:
+            self._drop(self._outbox.push(frame, message_id, step))
         else:
-            self.counters.sent += 1
-            self._write(self._socket, self._numbering.number(frame))
+            self._write(self._socket, self._numbering.leave(frame, step))
 
     def adopt(self, sock: socket.socket) -> None:
         """Use a connected socket from now on."""
@@ -122,9 +123,9 @@ class StreamLink(Link):
 
     def _next_chunk(self) -> bytes:
         frames, size = [], 0
-        while size < CHUNK_BYTES and (frame := self._outbox.pop()) is not None:
-            frames.append(self._numbering.number(frame))
-            size += len(frame)
+        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+            frames.append(self._numbering.leave(*waiting))
+            size += len(frames[-1])
         return b"".join(frames)
 
     def _on_readable(self, sock: socket.socket) -> None:
