@@ -194,6 +194,9 @@ class TcpLink(StreamLink):
         try:
             sock.setblocking(False)
             await self.loop.sock_connect(sock, address)
+            if sock.getsockname() == sock.getpeername():
+                # A closed local port may be drawn as our own and so connect to itself.
+                raise ConnectionRefusedError
         except OSError as error:
             sock.close()
             refused = isinstance(error, ConnectionRefusedError)

@@ -130,7 +130,8 @@ async def test_chaos(rig: Any, seed: int) -> None:
     await rig.until(all_gone)
     last = rig.station(chaos.udp_port)
     last.say(last.sender.heartbeat())
-    await rig.until(lambda: len(chaos.hub.clients()) == 1)
+    remote = f"127.0.0.1:{last.port}"
+    await rig.until(lambda: remote in {client.remote for client in chaos.hub.clients()})
     frame = rig.vehicle.attitude()
     chaos.hub.send(rig.out(frame))
     while await last.receive() != frame:
