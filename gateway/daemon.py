@@ -3,12 +3,12 @@
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
 import msgspec
 
-from gateway.config import GatewaySettings, save_aircraft
+from gateway.config import ConfigError, GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.control_verbs import HubVerbs, RecorderVerbs
@@ -51,6 +51,8 @@ class Daemon:
         Everything that can be set.
     aircraft : mapping of int to AircraftSettings
         What is different for single aircraft, by vehicle id.
+    read : callable
+        Reads the settings again, or raises ConfigError.
     line : iterator of TimedFrame, optional
         What a simulated receiver says; it then takes the place of the serial port.
     """
@@ -59,6 +61,7 @@ class Daemon:
         self,
         settings: GatewaySettings,
         aircraft: Mapping[int, AircraftSettings],
+        read: Callable[[], GatewaySettings],
         line: Iterator[TimedFrame] | None = None,
     ) -> None:
         self.now_us = GatewayClock()
@@ -67,6 +70,7 @@ class Daemon:
         if self._receiver is not None:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
+        self._read = read
         self._pipeline = Pipeline(
             PipelineSettings(settings.default_aircraft, aircraft, unix_time_us() - self.now_us())
         )
@@ -85,7 +89,7 @@ class Daemon:
         self._heard: bytes | None = None
         self._control = ControlServer(socket_path("run"))
         RecorderVerbs(self._recorder).register(self._control)
-        HubVerbs(self._hub, self.snapshot).register(self._control)
+        HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(self._control)
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
         self._notifier = ServiceNotifier()
@@ -106,11 +110,22 @@ class Daemon:
         self._poll()
         self._notifier.ready()
 
-    def reload(self, settings: GatewaySettings) -> None:
+    def reload(self) -> str:
         """Take over changed settings of the hub; clients that stay notice nothing.
 
         The other sections hold from the next start on.
+
+        Returns
+        -------
+        str
+            What was done.
+
+        Raises
+        ------
+        ConfigError
+            If the settings are wrong; nothing has changed then.
         """
+        settings = self._read()
         self._notifier.reloading()
         later = msgspec.structs.replace(settings, hub=self._settings.hub) != self._settings
         self._settings = msgspec.structs.replace(self._settings, hub=settings.hub)
@@ -118,7 +133,9 @@ class Daemon:
         self._metrics.listen(settings.hub.metrics_port)
         set_realtime_priority(settings.hub.realtime_priority)
         self._notifier.ready()
-        log.info("settings of the hub applied%s", "; others need a new start" if later else "")
+        told = f"settings of the hub applied{'; others need a new start' if later else ''}"
+        log.info(told)
+        return told
 
     def close(self) -> None:
         """End everything: first what comes in, then what goes out."""
@@ -146,6 +163,12 @@ class Daemon:
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
         )
+
+    def _reload_or_refuse(self) -> str:
+        try:
+            return self.reload()
+        except ConfigError as error:
+            raise ControlError(f"settings not reloaded: {error}") from error
 
     def _on_open(self, port: str) -> None:
         self._pipeline.connect(port)

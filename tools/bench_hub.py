@@ -178,13 +178,13 @@ class Bench:
             sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._poll.register(sink, select.POLLIN)
         with udp_socket() as probe:
-            port = probe.getsockname()[1]
+            self.port: int = probe.getsockname()[1]
         self._source = udp_socket()
-        self._source.connect(("127.0.0.1", port))
+        self._source.connect(("127.0.0.1", self.port))
         self._counts = [0] * clients
         self._stamps: list[list[int]] | None = None
         self.process = subprocess.Popen(
-            command(port, [sink.getsockname()[1] for sink in self._sinks]),
+            command(self.port, [sink.getsockname()[1] for sink in self._sinks]),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             stdin=subprocess.DEVNULL,
@@ -258,6 +258,8 @@ class Bench:
         total = 0
         while total < delivered:
             self.throughput(2.0, WINDOWS[0])
+            if not any(self._counts):
+                raise RuntimeError("the forwarder has stopped")
             total += sum(self._counts)
             yield total, resident_kib(self.process.pid)
 
@@ -268,6 +270,7 @@ class Bench:
             self._send(self._frames[0])
             self._drain(50)
             if min(self._counts) > 2:
+                time.sleep(0.2)
                 self._settle()
                 return
             time.sleep(0.05)

@@ -89,7 +89,8 @@ async def soak(options: argparse.Namespace) -> int:
     serial = msgspec.structs.replace(settings.serial, port=os.ttyname(slave))
     endpoint = f"udp:127.0.0.1:{sink.getsockname()[1]}"
     hub = msgspec.structs.replace(settings.hub, endpoints=(endpoint,))
-    daemon = Daemon(msgspec.structs.replace(settings, serial=serial, hub=hub), {})
+    settings = msgspec.structs.replace(settings, serial=serial, hub=hub)
+    daemon = Daemon(settings, {}, lambda: settings)
     daemon.start()
     tracker, rng = Tracker(), np.random.default_rng(options.seed)
     total = round(options.seconds * options.rate)

@@ -1,6 +1,7 @@
-"""`mavgate status` and `mavgate clients …`: a gateway that runs, seen and changed from outside."""
+"""`mavgate status`, `mavgate clients …`, `mavgate reload`: a gateway that runs, and its clients."""
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -9,56 +10,128 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.record import JsonOption, ask
-from gateway.routing.clients import ClientStats
+from gateway.units import US_PER_S
 
-group = typer.Typer(help="List, add and remove clients.", no_args_is_help=True)
+PANEL: Final = "A gateway that runs"
+UNKNOWN: Final = "—"
+US_PER_MS: Final = 1000
+
+Record = Mapping[str, Any]
+"""What a dataclass becomes on the control socket."""
+
+group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command()(status)
-    app.add_typer(group, name="clients")
+    app.command(rich_help_panel=PANEL)(status)
+    app.add_typer(group, name="clients", rich_help_panel=PANEL)
+    app.command(rich_help_panel=PANEL)(reload)
 
 
 def status(*, json: JsonOption = False) -> None:
-    """Tell what the gateway does: link, aircraft, clients."""
-    found = ask("status")
+    """Tell how the gateway fares: receiver, nodes, aircraft, clients."""
+    snapshot = ask("status")
     if json:
-        print(msgspec.json.encode(found["snapshot"]).decode())
+        print(msgspec.json.encode(snapshot).decode())
         return
-    Console(highlight=False).print(found["summary"], markup=False)
+    console = Console()
+    console.print(_summary(snapshot), highlight=False)
+    if nodes := snapshot["report"]["nodes"]:
+        console.print(_nodes(nodes))
+    console.print(_clients(snapshot["clients"], snapshot["time_us"]))
 
 
 @group.command("list")
-def list_all(*, json: JsonOption = False) -> None:
-    """List the clients with what they were sent."""
-    found = ask("clients.list")
+def list_clients(*, json: JsonOption = False) -> None:
+    """List the clients with what was sent to them, and what got lost on this side."""
     if json:
-        print(msgspec.json.encode(found).decode())
+        print(msgspec.json.encode(ask("clients.list")).decode())
         return
-    grid = Table(box=box.SIMPLE_HEAD)
-    for column in ("client", "name", "place", "sent", "dropped", "received"):
-        grid.add_column(column)
-    for client in msgspec.convert(found, tuple[ClientStats, ...]):
-        grid.add_row(
-            *(str(client.client_id), client.name, client.remote),
-            *(str(client.sent), str(client.dropped), str(client.received)),
+    snapshot = ask("status")
+    Console().print(_clients(snapshot["clients"], snapshot["time_us"]))
+
+
+@group.command()
+def add(
+    url: Annotated[str, typer.Argument(help="As in the settings: udp:192.168.1.7:14550?name=…")],
+) -> None:
+    """Add a client or a source until the gateway ends."""
+    _show_endpoints(ask("clients.add", {"url": url}))
+
+
+@group.command()
+def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -> None:
+    """Remove a client, a source or a listening port."""
+    _show_endpoints(ask("clients.remove", {"name": name}))
+
+
+def reload() -> None:
+    """Apply changed settings of the hub; clients that stay notice nothing."""
+    print(ask("reload"))
+
+
+def _show_endpoints(urls: Sequence[str]) -> None:
+    for url in urls:
+        print(url)
+
+
+def _summary(snapshot: Record) -> str:
+    report = snapshot["report"]
+    up_s = snapshot["time_us"] // US_PER_S
+    receiver = f"{report['port']} {'connected' if report['connected'] else 'not connected'}"
+    up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
+    frames = f"{report['frames']} frames, {report['frames_lost']} lost"
+    lines = [f"up {up}, receiver {receiver}, {frames}"]
+    lines += [
+        f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "
+        f"{_number(state['alt_amsl_m'], '.1f')} m"
+        for vehicle_id, state in snapshot["states"]
+    ]
+    hub = snapshot["hub"]
+    lines.append(", ".join(f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"))
+    return "\n".join(lines)
+
+
+def _nodes(nodes: Sequence[Record]) -> Table:
+    table = _table("node", "rate Hz", "received", "lost", "restarts")
+    for node in nodes:
+        table.add_row(
+            f"{node['node']['vehicle_id']}.{node['node']['node_id']}",
+            _number(node["rate_hz"], ".0f"),
+            *(str(node[key]) for key in ("received", "lost", "restarts")),
         )
-    Console(highlight=False).print(grid)
+    return table
 
 
-@group.command()
-def add(url: Annotated[str, typer.Argument(help="Endpoint, as in the settings.")]) -> None:
-    """Add an endpoint until the gateway ends."""
-    _show(ask("clients.add", {"url": url}))
+def _clients(clients: Sequence[Record], now_us: int) -> Table:
+    table = _table(
+        "client", "state", "systems", "sent", "dropped", "waiting", "received", "heard s ago",
+        "trip ms",
+    )  # fmt: skip
+    for client in clients:
+        heard_us, trip_us = client["heard_us"], client["round_trip_us"]
+        table.add_row(
+            client["name"],
+            client["state"],
+            ", ".join(f"{system}.{component}" for system, component in client["systems"]),
+            *(str(client[key]) for key in ("sent", "dropped", "queued", "received")),
+            UNKNOWN if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.1f}",
+            UNKNOWN if trip_us is None else f"{trip_us / US_PER_MS:.1f}",
+        )
+    return table
 
 
-@group.command()
-def remove(name: Annotated[str, typer.Argument(help="Its name or URL.")]) -> None:
-    """Remove an endpoint and its clients."""
-    _show(ask("clients.remove", {"name": name}))
+def _table(*columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right")
+    return table
 
 
-def _show(endpoints: list[str]) -> None:
-    for endpoint in endpoints:
-        Console(highlight=False).print(endpoint, markup=False)
+def _place(lat_deg: float | None, lon_deg: float | None) -> str:
+    return f"{_number(lat_deg, '.6f')} {_number(lon_deg, '.6f')}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return UNKNOWN if value is None else format(value, form)

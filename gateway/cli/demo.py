@@ -70,7 +70,7 @@ def demo(
         # Nor is a flight that goes round and round worth a disk, unless it is asked for.
         recording = replace(settings.recording, mode="manual")
         settings = replace(settings, aircraft_folder=folder, recording=recording)
-        asyncio.run(serve(lambda: Daemon(settings, aircraft, line), read, plain=plain))
+        asyncio.run(serve(lambda: Daemon(settings, aircraft, read, line), plain=plain))
 
 
 def recorded_line(

@@ -62,7 +62,7 @@ def run_gateway(
     settings = or_refuse(read)
     compile_everything()
     aircraft = read_aircraft(settings)
-    asyncio.run(serve(lambda: Daemon(settings, aircraft), read, plain=plain))
+    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain))
 
 
 def load_settings(file: Path | None) -> GatewaySettings:
@@ -106,17 +106,13 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
     return msgspec.structs.replace(settings, hub=hub)
 
 
-async def serve(
-    daemon_of: Callable[[], Daemon], read: Callable[[], GatewaySettings], *, plain: bool
-) -> None:
+async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing what it does; SIGHUP reloads the settings.
 
     Parameters
     ----------
     daemon_of : callable
         Builds the daemon; called inside the event loop.
-    read : callable
-        Reads the settings again, or raises ConfigError.
     plain : bool
         Log lines even on a terminal.
     """
@@ -127,7 +123,7 @@ async def serve(
     if view is not None:
         logging.getLogger().handlers[:] = [view.log]
     daemon = daemon_of()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reload, daemon, read)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
     daemon.start()
     try:
         if view is None:
@@ -138,14 +134,11 @@ async def serve(
         daemon.close()
 
 
-def reload(daemon: Daemon, read: Callable[[], GatewaySettings]) -> None:
-    """Let a daemon take over changed settings; wrong ones are told and change nothing."""
+def _reload(daemon: Daemon) -> None:
     try:
-        settings = read()
+        daemon.reload()
     except ConfigError as error:
         log.warning("settings not reloaded: %s", error)
-        return
-    daemon.reload(settings)
 
 
 async def _live_view(daemon: Daemon, view: LiveView, stopped: asyncio.Event) -> None:

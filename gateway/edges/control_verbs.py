@@ -6,7 +6,6 @@ import msgspec
 
 from gateway.edges.control_socket import ControlError, ControlServer, NoParams
 from gateway.edges.hub import Hub
-from gateway.edges.live_view import summary_line
 from gateway.edges.player import PlayerEdge, PlayerStatus
 from gateway.edges.recorder import Recorder, RecorderStatus
 from gateway.edges.recordings import (
@@ -126,7 +125,7 @@ class RecorderVerbs:
 
 
 class HubVerbs:
-    """`status` and `clients.*`.
+    """`status`, `reload` and `clients.*`.
 
     Parameters
     ----------
@@ -134,22 +133,24 @@ class HubVerbs:
         Whose clients.
     snapshot : callable
         Describes the gateway at this moment.
+    reload : callable
+        Applies changed settings and tells how that went; raises ControlError.
     """
 
-    def __init__(self, hub: Hub, snapshot: Callable[[], Snapshot]) -> None:
+    def __init__(
+        self, hub: Hub, snapshot: Callable[[], Snapshot], reload: Callable[[], str]
+    ) -> None:
         self._hub = hub
         self._snapshot = snapshot
+        self._reload = reload
 
     def register(self, server: ControlServer) -> None:
         """Offer the verbs on a socket."""
-        server.register("status", NoParams, self._status)
+        server.register("status", NoParams, lambda _: self._snapshot())
+        server.register("reload", NoParams, lambda _: self._reload())
         server.register("clients.list", NoParams, self._list)
         server.register("clients.add", Url, self._add)
         server.register("clients.remove", Named, self._remove)
-
-    def _status(self, _: NoParams) -> dict[str, object]:
-        snapshot = self._snapshot()
-        return {"summary": summary_line(snapshot), "snapshot": snapshot}
 
     def _list(self, _: NoParams) -> tuple[ClientStats, ...]:
         return self._hub.clients()

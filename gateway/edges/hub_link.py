@@ -199,10 +199,18 @@ def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
     return True
 
 
-def _is_loopback(host: str) -> bool:
+def is_numeric(host: str) -> bool:
+    """Tell whether a host is an address and not a name."""
     try:
-        address = ipaddress.ip_address(host.partition("%")[0])
+        ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
         return False
+    return True
+
+
+def _is_loopback(host: str) -> bool:
+    if not is_numeric(host):
+        return False
+    address = ipaddress.ip_address(host.partition("%")[0])
     mapped = getattr(address, "ipv4_mapped", None)
     return (mapped or address).is_loopback

@@ -60,7 +60,7 @@ class SerialLink(Link):
             self.counters.dropped += 1
             return
         self.counters.sent += 1
-        self._drop(self._outbox.push(frame, message_id))
+        self._drop(self._outbox.push(frame, message_id, self._numbering.enter(frame)))
         if self._timer is None and not self._partial:
             self._pump()
 
@@ -120,10 +120,10 @@ class SerialLink(Link):
     def _write(self, port: serial.Serial) -> bool:
         """Write one frame; where the driver is full, wait for it."""
         if not self._partial:
-            frame = self._outbox.pop()
-            if frame is None:
+            waiting = self._outbox.pop()
+            if waiting is None:
                 return False
-            self._partial = self._numbering.number(frame)
+            self._partial = self._numbering.leave(*waiting)
         try:
             taken = os.write(port.fileno(), self._partial)
         except BlockingIOError:

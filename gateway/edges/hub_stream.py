@@ -7,7 +7,7 @@ connection when nothing was acknowledged for long.
 import asyncio
 import logging
 import socket
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub_link import HubContext, Link
 from gateway.edges.hub_udp import RETRY_US
@@ -58,12 +58,13 @@ class StreamLink(Link):
         """Send one frame at once if nothing waits, else queue it."""
         if self._socket is None:
             self.counters.dropped += 1
-        elif self._partial or self._outbox:
-            self._drop(self._outbox.push(frame, message_id))
-            self.counters.sent += 1
+            return
+        self.counters.sent += 1
+        step = self._numbering.enter(frame)
+        if self._partial or self._outbox:
+            self._drop(self._outbox.push(frame, message_id, step))
         else:
-            self.counters.sent += 1
-            self._write(self._socket, self._numbering.number(frame))
+            self._write(self._socket, self._numbering.leave(frame, step))
 
     def adopt(self, sock: socket.socket) -> None:
         """Use a connected socket from now on."""
@@ -122,9 +123,9 @@ class StreamLink(Link):
 
     def _next_chunk(self) -> bytes:
         frames, size = [], 0
-        while size < CHUNK_BYTES and (frame := self._outbox.pop()) is not None:
-            frames.append(self._numbering.number(frame))
-            size += len(frame)
+        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+            frames.append(self._numbering.leave(*waiting))
+            size += len(frames[-1])
         return b"".join(frames)
 
     def _on_readable(self, sock: socket.socket) -> None:
@@ -177,27 +178,36 @@ class TcpLink(StreamLink):
         self.state = "connecting"
 
     async def _connect(self) -> None:
-        sock: socket.socket | None = None
+        host, port = self.endpoint.host, self.endpoint.port
         try:
-            found = await self.loop.getaddrinfo(
-                self.endpoint.host, self.endpoint.port, type=socket.SOCK_STREAM
-            )
-            family, _, _, _, address = found[0]
-            sock = socket.socket(family, socket.SOCK_STREAM)
-            sock.setblocking(False)
-            await self.loop.sock_connect(sock, address)
-            self.adopt(sock)
-            sock = None
-        except socket.gaierror:
-            self.state = "resolving"
-        except ConnectionRefusedError:
-            self.state = "refused"
+            found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            for family, _, _, _, address in found:
+                if await self._connect_to(family, address):
+                    break
         except OSError:
-            self.state = "unreachable"
+            self.state = "resolving"
         finally:
             self._task = None
-            if sock is not None:
-                sock.close()
+
+    async def _connect_to(self, family: int, address: tuple[Any, ...]) -> bool:
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            await self.loop.sock_connect(sock, address)
+            if sock.getsockname() == sock.getpeername():
+                # A closed local port may be drawn as our own and so connect to itself.
+                raise ConnectionRefusedError
+        except OSError as error:
+            sock.close()
+            refused = isinstance(error, ConnectionRefusedError)
+            self.state = "refused" if refused else "unreachable"
+            return False
+        except asyncio.CancelledError:
+            sock.close()
+            raise
+        self.remote = f"{address[0]}:{address[1]}"
+        self.adopt(sock)
+        return True
 
 
 class TcpPeer(StreamLink):
@@ -235,10 +245,13 @@ class TcpListener:
         return self._socket.getsockname()[1] if self._socket else 0
 
     def tick(self, now_us: int) -> None:
-        """Bind again if that failed."""
-        if self._socket is not None or now_us < self._retry_us:
+        """Bind or accept again if that failed."""
+        if now_us < self._retry_us:
             return
         self._retry_us = now_us + RETRY_US
+        if self._socket is not None:
+            self._loop.add_reader(self._socket, self._on_readable, self._socket)
+            return
         host, port = self.endpoint.host, self.endpoint.port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         sock = socket.socket(family, socket.SOCK_STREAM)
@@ -278,7 +291,12 @@ class TcpListener:
         for _ in range(READ_BUDGET):
             try:
                 connection, address = sock.accept()
-            except OSError:
+            except BlockingIOError:
+                return
+            except OSError as error:
+                log.warning("cannot accept a client: %s", error)
+                # Out of descriptors: the waiting client would wake us for ever.
+                self._loop.remove_reader(sock)
                 return
             if len(self._links) >= self._context.settings.max_clients:
                 self.refused += 1

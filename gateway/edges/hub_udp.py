@@ -8,9 +8,9 @@ behind a slow interface from filling everybody's.
 import asyncio
 import socket
 from collections import deque
-from typing import Final
+from typing import Any, Final
 
-from gateway.edges.hub_link import HubContext, Link, Write, not_open
+from gateway.edges.hub_link import HubContext, Link, Write, is_numeric, not_open
 from gateway.routing.endpoint import Endpoint
 from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
@@ -21,6 +21,8 @@ READ_BUDGET: Final = 64
 """Datagrams taken at one wake-up, so that one flooding peer cannot starve the others."""
 RETRY_US: Final = US_PER_S
 """Between attempts to open a socket again: soon for a person, never spinning."""
+RESOLVE_AGAIN_US: Final = 60 * US_PER_S
+"""Names of home networks change their address at most some times a day."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """The default holds only about 256 small datagrams; a parameter upload bursts more."""
 BACKLOG_DATAGRAMS: Final = 256
@@ -222,9 +224,13 @@ class DatagramLink(Link):
 
 
 class UdpLink(DatagramLink):
-    """A UDP peer at a configured place, which may be a name that resolves only later."""
+    """A UDP peer at a configured place.
 
-    __slots__ = ("_port", "_retry_us", "_task")
+    A name may resolve only later, or to another address later: it is looked up again while nothing
+    is heard from there.
+    """
+
+    __slots__ = ("_port", "_resolve_us", "_retry_us", "_task")
 
     def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
         super().__init__(
@@ -235,11 +241,12 @@ class UdpLink(DatagramLink):
         )
         self._port = 0
         self._retry_us = 0
+        self._resolve_us = 0
         self._task: asyncio.Task[None] | None = None
         self.tick(context.now_us())
 
     def tick(self, now_us: int) -> None:
-        """Open the socket again if it failed; call a refusal off that was not repeated."""
+        """Open the socket or look the name up again; forget a refusal that was not repeated."""
         if now_us < self._retry_us:
             return
         self._retry_us = now_us + RETRY_US
@@ -248,7 +255,8 @@ class UdpLink(DatagramLink):
         if self.refused_us is not None and now_us - self.refused_us >= RETRY_US:
             self.refused_us = None
             self.state = "open"
-        if self._socket is None and self._task is None:
+        if self._task is None and (self._socket is None or self._wants_look_up(now_us)):
+            self._resolve_us = now_us + RESOLVE_AGAIN_US
             self._task = self.loop.create_task(self._open())
 
     def close(self) -> None:
@@ -257,22 +265,38 @@ class UdpLink(DatagramLink):
             self._task.cancel()
         super().close()
 
+    def _wants_look_up(self, now_us: int) -> bool:
+        silent = self.heard_us is None or now_us - self.heard_us > RESOLVE_AGAIN_US
+        return silent and now_us >= self._resolve_us and not is_numeric(self.endpoint.host)
+
     async def _open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
         try:
             found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-            family, _, _, _, address = found[0]
-            sock = self._connected(family, address)
-            self.remote = f"{address[0]!s}:{address[1]!s}"
-            self.adopt(sock, sock.send)
-        except socket.gaierror:
-            self.state = "resolving"
         except OSError:
-            self.state = "unreachable"
+            if self._socket is None:
+                self.state = "resolving"
+        else:
+            self._connect_one_of([(family, address) for family, _, _, _, address in found])
         finally:
             self._task = None
 
-    def _connected(self, family: int, address: tuple[object, ...]) -> socket.socket:
+    def _connect_one_of(self, places: list[tuple[int, tuple[Any, ...]]]) -> None:
+        """Use the first place that there is a way to, unless one of them is in use."""
+        if self._socket is not None and self.remote in {_text(address) for _, address in places}:
+            return
+        super().close()
+        for family, address in places:
+            try:
+                sock = self._connected(family, address)
+            except OSError:
+                self.state = "unreachable"
+                continue
+            self.remote = _text(address)
+            self.adopt(sock, sock.send)
+            return
+
+    def _connected(self, family: int, address: tuple[Any, ...]) -> socket.socket:
         """Open a socket that keeps the port it had, so that the peer sees the same client."""
         sock = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -286,3 +310,7 @@ class UdpLink(DatagramLink):
             raise
         self._port = sock.getsockname()[1]
         return sock
+
+
+def _text(address: tuple[Any, ...]) -> str:
+    return f"{address[0]}:{address[1]}"

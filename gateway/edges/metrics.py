@@ -64,7 +64,12 @@ class MetricsServer:
     def _on_readable(self, sock: socket.socket) -> None:
         try:
             connection, _ = sock.accept()
-        except OSError:
+        except BlockingIOError:
+            return
+        except OSError as error:
+            # Out of descriptors: the waiting connection would wake us for ever.
+            log.warning("no more metrics: %s", error)
+            self.close()
             return
         if len(self._tasks) >= MAX_CONNECTIONS:
             connection.close()

@@ -136,7 +136,8 @@ class Fanout:
     def answer(self, frame: bytes, client_id: int) -> None:
         """Send one of our own frames to one outlet only, past its filters."""
         origin = origin_of(frame)
-        for outlet in self._outlets.values():
+        # A copy: an outlet that breaks at this frame removes itself.
+        for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
             if outlet.client_id == client_id:
                 outlet.transmit(_shifted(frame, stamp.skipped), message_id_of(frame))

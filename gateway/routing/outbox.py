@@ -32,12 +32,21 @@ BULK_IDS: Final = frozenset(
 URGENT_RUN: Final = 4
 """Urgent frames in a row before one of another queue has its turn."""
 
+SEQUENCE_MASK: Final = 0xFF
 BITS_PER_BYTE: Final = 10
 """Start bit, eight data bits, stop bit."""
 
 
+Waiting = tuple[bytes, int | None]
+"""A frame and its step."""
+
+
 class Numbering:
-    """Give our own frames consecutive sequence numbers on one link.
+    """Renumber our own frames on a link that drops some and lets others overtake.
+
+    Each frame keeps its step from the one before it in our own order; at the exit the steps of
+    those that leave add up. So without drops every frame leaves as it came, gaps of a recording
+    included, and with drops the numbers run on without a gap.
 
     Parameters
     ----------
@@ -47,17 +56,29 @@ class Numbering:
 
     def __init__(self, is_own: Callable[[Origin], bool]) -> None:
         self._is_own = is_own
-        self._next: dict[Origin, int] = {}
+        self._came: dict[Origin, int] = {}
+        self._left: dict[Origin, int] = {}
 
-    def number(self, frame: bytes) -> bytes:
-        """Return the frame as it shall leave."""
+    def enter(self, frame: bytes) -> int | None:
+        """Return a frame's step, to be handed to `leave`; None for a frame of others."""
         origin = origin_of(frame)
         if not self._is_own(origin):
-            return frame
+            return None
         sequence = frame[4] if frame[0] == START_V2 else frame[2]
-        wanted = self._next.get(origin, sequence)
-        if len(self._next) < MAX_ORIGINS or origin in self._next:
-            self._next[origin] = wanted + 1 & 0xFF
+        before = self._came.get(origin, sequence - 1)
+        if len(self._came) < MAX_ORIGINS or origin in self._came:
+            self._came[origin] = sequence
+        return sequence - before & SEQUENCE_MASK
+
+    def leave(self, frame: bytes, step: int | None) -> bytes:
+        """Return a frame as it shall go out."""
+        if step is None:
+            return frame
+        origin = origin_of(frame)
+        sequence = frame[4] if frame[0] == START_V2 else frame[2]
+        wanted = self._left.get(origin, sequence - step) + step & SEQUENCE_MASK
+        if len(self._left) < MAX_ORIGINS or origin in self._left:
+            self._left[origin] = wanted
         return frame if wanted == sequence else restamp(frame, wanted)
 
 
@@ -74,16 +95,16 @@ class Outbox:
         self.max_bytes = max_bytes
         self.size = 0
         """Bytes that wait."""
-        self._urgent: deque[bytes] = deque()
-        self._usual: deque[bytes] = deque()
-        self._bulk: deque[bytes] = deque()
+        self._urgent: deque[Waiting] = deque()
+        self._usual: deque[Waiting] = deque()
+        self._bulk: deque[Waiting] = deque()
         self._run = 0
         self._bulk_turn = False
 
     def __len__(self) -> int:
         return len(self._urgent) + len(self._usual) + len(self._bulk)
 
-    def push(self, frame: bytes, message_id: int) -> int:
+    def push(self, frame: bytes, message_id: int, step: int | None = None) -> int:
         """Take a frame in.
 
         Parameters
@@ -92,6 +113,8 @@ class Outbox:
             A complete frame.
         message_id : int
             Tells the queue.
+        step : int, optional
+            Comes out again with the frame; see `Numbering`.
 
         Returns
         -------
@@ -104,29 +127,29 @@ class Outbox:
             queue = self._bulk if message_id in BULK_IDS else self._usual
         dropped = 0
         while self and self.size + len(frame) > self.max_bytes:
-            self.size -= len((self._usual or self._urgent or self._bulk).popleft())
+            self.size -= len((self._usual or self._urgent or self._bulk).popleft()[0])
             dropped += 1
-        queue.append(frame)
+        queue.append((frame, step))
         self.size += len(frame)
         return dropped
 
-    def pop(self) -> bytes | None:
-        """Return the frame that leaves next, or None if nothing waits."""
+    def pop(self) -> Waiting | None:
+        """Return the frame that leaves next with its step, or None if nothing waits."""
         others = bool(self._usual or self._bulk)
         if self._urgent and not (others and self._run >= URGENT_RUN):
             self._run += 1
-            frame = self._urgent.popleft()
+            waiting = self._urgent.popleft()
         elif others:
             self._run = 0
             self._bulk_turn = not self._bulk_turn
             first, second = self._usual, self._bulk
             if self._bulk_turn:
                 first, second = second, first
-            frame = (first or second).popleft()
+            waiting = (first or second).popleft()
         else:
             return None
-        self.size -= len(frame)
-        return frame
+        self.size -= len(waiting[0])
+        return waiting
 
     def clear(self) -> int:
         """Forget all that waits; return how many frames that were."""

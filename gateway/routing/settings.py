@@ -61,5 +61,9 @@ class HubSettings(Settings, frozen=True):
 
     def __post_init__(self) -> None:
         """Refuse a wrong endpoint when the settings are read, not when they are used."""
+        places: set[str] = set()
         for url in self.endpoints:
-            parse_endpoint(url)
+            place = parse_endpoint(url).place
+            if place in places:
+                raise ValueError(f"endpoint {place!r} is there twice")
+            places.add(place)

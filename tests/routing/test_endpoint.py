@@ -68,6 +68,11 @@ def test_refusals_name_the_endpoint_and_what_is_allowed(url: str, words: str) ->
     assert repr(url) in str(error.value)
 
 
+def test_settings_refuse_an_endpoint_that_is_there_twice() -> None:
+    with pytest.raises(ValueError, match="twice"):
+        HubSettings(endpoints=("udp:h:1", "udp:h:1?name=same"))
+
+
 def test_settings_refuse_a_wrong_endpoint_when_read() -> None:
     with pytest.raises(msgspec.ValidationError, match="carrier-pigeon"):
         msgspec.convert({"endpoints": ["carrier-pigeon:home:1"]}, HubSettings)

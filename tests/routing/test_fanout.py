@@ -73,6 +73,23 @@ def test_late_and_early_leavers(fanout: Fanout, vehicle: Vehicle) -> None:
     assert (len(first.frames), len(second.frames)) == (2, 2)
 
 
+def test_an_outlet_may_leave_while_it_is_sent_to(fanout: Fanout, vehicle: Vehicle) -> None:
+    frames: list[bytes] = []
+
+    def leave(frame: bytes, message_id: int) -> None:
+        frames.append(frame)
+        fanout.remove(1)
+
+    for send in (lambda f: fanout.publish(f, 0), lambda f: fanout.answer(f, 1)):
+        fanout.add(1, leave, parse_endpoint("tcp:h:1"))
+        other = Outlet(fanout, 2)
+        send(vehicle.attitude())
+        fanout.publish(vehicle.attitude(), 0)
+        assert other.frames
+        fanout.remove(2)
+    assert len(frames) == 2
+
+
 def test_denied_messages_leave_no_gap_in_the_sequence(fanout: Fanout, vehicle: Vehicle) -> None:
     picky, plain = Outlet(fanout, 1, "?deny=ATTITUDE"), Outlet(fanout, 2)
     for _ in range(300):

@@ -13,8 +13,8 @@ ATTITUDE, RAW_IMU, PARAM_VALUE = 30, 27, 22
 
 def drain(outbox: Outbox) -> list[bytes]:
     frames = []
-    while (frame := outbox.pop()) is not None:
-        frames.append(frame)
+    while (waiting := outbox.pop()) is not None:
+        frames.append(waiting[0])
     return frames
 
 
@@ -81,17 +81,35 @@ def heartbeat(system: int, sequence: int) -> bytes:
 
 
 class TestNumbering:
-    def test_gaps_in_our_own_are_closed(self) -> None:
-        numbering = Numbering(lambda origin: origin == (1, 1))
-        frames = [numbering.number(heartbeat(1, sequence)) for sequence in (254, 3, 9)]
-        assert [frame[4] for frame in frames] == [254, 255, 0]
-        assert all(split_datagram(frame) == [frame] for frame in frames)
+    @pytest.fixture
+    def numbering(self) -> Numbering:
+        return Numbering(lambda origin: origin == (1, 1))
 
-    def test_frames_of_others_stay(self) -> None:
-        numbering = Numbering(lambda origin: origin == (1, 1))
+    def test_without_drops_every_frame_leaves_as_it_came(self, numbering: Numbering) -> None:
+        for sequence in (254, 255, 0, 9, 9, 3):
+            frame = heartbeat(1, sequence)
+            assert numbering.leave(frame, numbering.enter(frame)) is frame
+
+    def test_dropped_frames_leave_no_gap(self, numbering: Numbering) -> None:
+        frames = [heartbeat(1, sequence & 0xFF) for sequence in range(250, 262)]
+        steps = [numbering.enter(frame) for frame in frames]
+        kept = [0, 3, 4, 9, 11]
+        left = [numbering.leave(frames[n], steps[n]) for n in kept]
+        assert [frame[4] for frame in left] == [250, 251, 252, 253, 254]
+        assert all(split_datagram(frame) == [frame] for frame in left)
+
+    def test_a_frame_that_overtakes_takes_the_number(self, numbering: Numbering) -> None:
+        first = heartbeat(1, 7)
+        numbering.leave(first, numbering.enter(first))
+        frames = [heartbeat(1, sequence) for sequence in (8, 9, 10)]
+        steps = [numbering.enter(frame) for frame in frames]
+        left = [numbering.leave(frames[n], steps[n]) for n in (2, 0, 1)]
+        assert [frame[4] for frame in left] == [8, 9, 10]
+
+    def test_frames_of_others_stay(self, numbering: Numbering) -> None:
         for sequence in (5, 9):
             frame = heartbeat(2, sequence)
-            assert numbering.number(frame) is frame
+            assert numbering.leave(frame, numbering.enter(frame)) is frame
 
 
 class TestPacker:

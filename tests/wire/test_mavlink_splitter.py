@@ -12,6 +12,7 @@ from gateway.wire.mavlink_splitter import (
     MavlinkSplitter,
     SplitFault,
     SplitFaultKind,
+    is_frame,
     is_signed,
     key_of,
     message_id_of,
@@ -76,6 +77,17 @@ class TestOneFrame:
             frames = [event for event in events if isinstance(event, bytes)]
             assert V2_COMMAND in frames
             assert frames.count(V2) == 30
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_short_way_knows_plain_frames_only(name: str) -> None:
+    frame = FRAMES[name]
+    assert is_frame(frame) == (name in {"version 2", "command"})
+    assert not is_frame(frame + b"x")
+    assert not is_frame(frame[:-1])
+    assert not is_frame(b"")
+    for at in range(len(frame)):
+        assert not is_frame(frame[:at] + bytes((frame[at] ^ 1,)) + frame[at + 1 :])
 
 
 def test_damaged_frame_is_a_crc_fault() -> None:

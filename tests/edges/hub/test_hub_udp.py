@@ -186,6 +186,29 @@ async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPa
     assert await station.receive() == frame
 
 
+async def test_a_name_moves_to_another_address(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new = rig.station(), rig.station()
+    ports = [old.port]
+
+    async def resolve(host: str, port: int, **_: object) -> list[object]:
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", ("127.0.0.1", ports[-1]))]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    hub = rig.hub("udp:observer.example:14550")
+    await rig.until_open(hub)
+    source = hub._links[1]._socket.getsockname()
+    for moved_at_us in (61_000_000, 122_000_000):
+        rig.clock.us = moved_at_us
+        await rig.until(lambda at_us=moved_at_us: hub._links[1]._resolve_us > at_us)
+        await rig.until(lambda: hub._links[1]._task is None)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        station = old if ports == [old.port] else new
+        assert await station.receive() == frame
+        assert hub._links[1]._socket.getsockname() == source
+        ports.append(new.port)
+
+
 async def test_an_answer_and_a_wish_concern_one_client(rig: Any) -> None:
     first, second = rig.station(), rig.station()
     hub = rig.hub(f"udp:127.0.0.1:{first.port}", f"udp:127.0.0.1:{second.port}")

@@ -1,0 +1,158 @@
+"""The commands about clients, against a control socket with canned answers."""
+
+import asyncio
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli import clients
+from gateway.cli.app import app
+from gateway.edges.control_socket import ControlError, ControlServer, NoParams, socket_path
+from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink
+from gateway.routing.clients import ClientStats, HubCounters
+from gateway.status import Snapshot
+
+pytestmark = pytest.mark.io
+
+NAN = float("nan")
+CLIENT = ClientStats(
+    client_id=1,
+    name="tablet",
+    endpoint="udp:10.0.0.7:14550?name=tablet",
+    remote="10.0.0.7:14550",
+    state="open",
+    trusted=True,
+    systems=((255, 190),),
+    sent=5000,
+    dropped=2,
+    bytes_sent=200_000,
+    received=10,
+    bytes_received=200,
+    bytes_garbage=0,
+    queued=3,
+    since_us=0,
+    heard_us=1_000_000,
+    round_trip_us=1500,
+)
+NODE = NodeLink(NodeId(1, 2), 0, 100, 7, 0, 0, 1, 60.0, 0, 0.0)
+SNAPSHOT = Snapshot(
+    time_us=3_723_000_000,
+    report=LinkReport(0, True, "/dev/ttyUSB0", 0, 103, 4, (), (NODE,), None),
+    states=(
+        (
+            1,
+            NavState(
+                time_us=0,
+                q_nb=(1.0, 0.0, 0.0, 0.0),
+                rate_b_radps=(0.0, 0.0, 0.0),
+                lat_deg=47.5,
+                lon_deg=NAN,
+                alt_amsl_m=NAN,
+                vel_n_mps=(NAN, NAN, NAN),
+                attitude_std_rad=(NAN, NAN, NAN),
+                vel_std_mps=(NAN, NAN, NAN),
+                pos_std_m=(NAN, NAN, NAN),
+                flags=NavFlags.ATTITUDE_VALID | NavFlags.AT_REST,
+            ),
+        ),
+    ),
+    clients=(CLIENT,),
+    sent=((30, 9),),
+    hub=HubCounters(published=9, looped=1),
+)
+
+
+class Url(msgspec.Struct):
+    url: str
+
+
+class Name(msgspec.Struct):
+    name: str
+
+
+class Gateway:
+    """A control socket in a loop of its own, as the command would meet it."""
+
+    def __init__(self) -> None:
+        self.asked: list[object] = []
+        self.loop = asyncio.new_event_loop()
+        self.server = ControlServer(socket_path("run"))
+        self.server.register("status", NoParams, lambda _: SNAPSHOT)
+        self.server.register("clients.list", NoParams, lambda _: SNAPSHOT.clients)
+        self.server.register("clients.add", Url, self._add)
+        self.server.register("clients.remove", Name, self._remove)
+        self.server.register("reload", NoParams, lambda _: "settings of the hub applied")
+        self.thread = threading.Thread(target=self.loop.run_forever)
+
+    def _add(self, params: Url) -> list[str]:
+        self.asked.append(params)
+        return ["udp:127.0.0.1:14550", params.url]
+
+    def _remove(self, params: Name) -> list[str]:
+        raise ControlError(f"no endpoint is called {params.name!r}")
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gateway]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("COLUMNS", "140")
+    gateway = Gateway()
+    gateway.loop.run_until_complete(gateway.server.start())
+    gateway.thread.start()
+    yield gateway
+    gateway.loop.call_soon_threadsafe(gateway.server.close)
+    gateway.loop.call_soon_threadsafe(gateway.loop.stop)
+    gateway.thread.join()
+    gateway.loop.run_until_complete(asyncio.sleep(0))
+    gateway.loop.close()
+
+
+def run(*words: str) -> Any:
+    return CliRunner().invoke(app, list(words))
+
+
+def test_status_for_people(gateway: Gateway) -> None:
+    text = run("status").output
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in text
+    assert "aircraft 1: 47.500000 —, — m" in text
+    assert "9 published, 1 looped" in text
+    assert "tablet" in text
+    assert "255.190" in text
+
+
+def test_status_for_programs(gateway: Gateway) -> None:
+    found = json.loads(run("status", "--json").output)
+    assert found["clients"][0]["round_trip_us"] == 1500
+    assert found["states"][0][1]["lon_deg"] is None
+    assert found["hub"]["published"] == 9
+
+
+def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
+    assert "3722.0" in run("clients", "list").output
+    assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
+    assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
+    assert gateway.asked == [Url("udp:10.0.0.8:14550")]
+    refused = run("clients", "remove", "phone")
+    assert refused.exit_code == 2
+    assert "no endpoint is called 'phone'" in refused.output
+
+
+def test_reload(gateway: Gateway) -> None:
+    assert "applied" in run("reload").output
+
+
+def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    answer = run("status")
+    assert answer.exit_code == 2
+    assert "nothing runs" in answer.output
+
+
+def test_unknown_numbers_are_shown_as_such() -> None:
+    assert clients._number(None, ".1f") == "—"
