@@ -44,21 +44,21 @@ void set_up(RadioSender *sender) {
     sender->since_us = clock_us();
 }
 
-void begin(RadioSender *sender, const Payload *payload) {
+void begin(RadioSender *sender, const Payload *payload, uint32_t now_us) {
     // The clock's low bits at an event differ from board to board: they seed the pauses.
-    sender->random ^= static_cast<uint16_t>(clock_us());
+    sender->random ^= static_cast<uint16_t>(now_us);
     if (sender->random == 0) {
         sender->random = 1;
     }
     sender->rounds = 1;
     sender->state = SENDING;
-    sender->since_us = clock_us();
+    sender->since_us = now_us;
     nrf24_send(payload->bytes, payload->size, draw_pause(sender), RETRIES);
 }
 
-void follow(RadioSender *sender) {
+void follow(RadioSender *sender, uint32_t now_us) {
     if (!lines_radio_low()) {
-        if (clock_passed(clock_us(), sender->since_us + LOST_US)) {
+        if (clock_passed(now_us, sender->since_us + LOST_US)) {
             count_lost(sender);
             sender->state = ABSENT;
         }
@@ -98,15 +98,15 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
     sender->failed = static_cast<uint16_t>(sender->failed + (sender->queue.dropped - dropped));
 }
 
-void radio_sender_poll(RadioSender *sender) {
+void radio_sender_poll(RadioSender *sender, uint32_t now_us) {
     if (sender->state == SENDING) {
-        follow(sender);
+        follow(sender, now_us);
     }
-    if (sender->state == ABSENT && clock_passed(clock_us(), sender->since_us + SET_UP_EVERY_US)) {
+    if (sender->state == ABSENT && clock_passed(now_us, sender->since_us + SET_UP_EVERY_US)) {
         set_up(sender);
     }
     const Payload *payload = payload_queue_front(&sender->queue);
     if (sender->state == IDLE && payload != nullptr) {
-        begin(sender, payload);
+        begin(sender, payload, now_us);
     }
 }

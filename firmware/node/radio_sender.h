@@ -38,4 +38,4 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
                        uint8_t size);
 
 // To be called at every event.
-void radio_sender_poll(RadioSender *sender);
+void radio_sender_poll(RadioSender *sender, uint32_t now_us);
