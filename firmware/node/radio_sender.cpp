@@ -13,15 +13,15 @@ namespace {
 
 enum State : uint8_t { ABSENT, IDLE, SENDING };
 
-// One retry by the chip alone, then a new pause: twenty attempts in all.
+// One retry by the chip alone, then a new pause: 24 attempts in all.
 constexpr uint8_t RETRIES = 1;
-constexpr uint8_t ROUNDS = 10;
+constexpr uint8_t ROUNDS = 12;
 // Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
 // 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
 // the acknowledgement (section 7.4.2 of the chip's specification).
 constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 7 : RADIO_KBPS == 1000 ? 3 : 2;
 constexpr uint8_t PAUSE_FIRST = 2;
-constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 4;
+constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 5;
 static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
 
 constexpr uint32_t LOST_US = 50000;
@@ -72,9 +72,13 @@ void follow(RadioSender *sender, uint32_t now_us) {
         sender->state = IDLE;
     } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
         ++sender->rounds;
+        sender->since_us = now_us;
         nrf24_send_again(draw_pause(sender), RETRIES);
     } else {
         count_lost(sender);
+        if (!nrf24_configured()) {
+            sender->state = ABSENT;
+        }
     }
 }
 
