@@ -46,11 +46,13 @@ int main() {
     radio_sender_start(&sender, GPS_RADIO_PIPE, wire_vehicle_node(VEHICLE_ID, GPS_NODE_ID));
     report.due_us = report.loop_began_us = clock_us();
     for (;;) {
-        node_report_wait(&report);
+        const uint32_t now_us = node_report_wait(&report);
         if (ublox_poll(&ublox)) {
             send_solution();
         }
-        radio_sender_poll(&sender);
-        node_report_poll(&report, health(), &sender);
+        if (node_report_due(&report, now_us)) {
+            node_report_send(&report, now_us, health(), &sender);
+        }
+        radio_sender_poll(&sender, now_us);
     }
 }

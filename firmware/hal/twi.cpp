@@ -131,8 +131,8 @@ void twi_begin(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_
     TWCR = CONTINUE | 1 << TWSTA;
 }
 
-TwiState twi_poll() {
-    if (state == TWI_BUSY && clock_passed(clock_us(), begun_us + TIMEOUT_US)) {
+TwiState twi_poll(uint32_t now_us) {
+    if (state == TWI_BUSY && clock_passed(now_us, begun_us + TIMEOUT_US)) {
         recover();
         ++errors;
         state = TWI_FAILED;
@@ -143,7 +143,7 @@ TwiState twi_poll() {
 bool twi_run(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_t *read,
              uint8_t read_size) {
     twi_begin(address, write, write_size, read, read_size);
-    while (twi_poll() == TWI_BUSY) {
+    while (twi_poll(clock_us()) == TWI_BUSY) {
         events_wait();  // at the latest the next tick ends it
     }
     return state == TWI_DONE;

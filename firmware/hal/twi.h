@@ -17,7 +17,7 @@ void twi_begin(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_
 
 // State of the last transfer. One that takes too long fails here: the bus is freed by clocking a
 // hung slave through its byte.
-TwiState twi_poll();
+TwiState twi_poll(uint32_t now_us);
 
 // The same, asleep until it ends: for set-up alone. True if it succeeded.
 bool twi_run(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_t *read,

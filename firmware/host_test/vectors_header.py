@@ -70,17 +70,12 @@ BODIES = {
 }
 
 
-def bytes_of(text: str) -> str:
-    """Build the initialiser of a byte vector from hexadecimal digits."""
-    return braces(list(bytes.fromhex(text)))
-
-
 def radio_vector(vector: dict[str, Any]) -> str:
     """Build one entry of the table of radio payloads."""
     struct, kind, body = BODIES[vector["kind"]]
     value = f"{struct}{{{header(vector, kind)}, {body(vector['fields'])}}}"
     place = f"{vector['frame_seq']}, {vector['pipe']}, {vector['receiver_time_us']}u"
-    images = ", ".join(bytes_of(vector[f"{name}_hex"]) for name in ("payload", "content", "frame"))
+    images = ", ".join(f'"{vector[f"{name}_hex"]}"' for name in ("payload", "content", "frame"))
     return f'    {{"{vector["name"]}", bytes_of({value}), {place}, {images}}},'
 
 
@@ -91,8 +86,8 @@ def status_vector(vector: dict[str, Any]) -> str:
     head = f"{{wire_version_kind(2), {f['frame_seq']}, WIRE_NO_PIPE, {f['receiver_time_us']}u}}"
     body = f"{f['channel']}, {f['noise_percent']}, {f['uart_dropped']}, {f['reset_cause']}"
     value = f"WireReceiverStatus{{{head}, {body}, {{{pipes}}}}}"
-    images = f"{bytes_of(vector['content_hex'])}, {bytes_of(vector['frame_hex'])}"
-    return f'    {{"{vector["name"]}", bytes_of({value}), 0, 0, 0u, {{}}, {images}}},'
+    images = f'"{vector["content_hex"]}", "{vector["frame_hex"]}"'
+    return f'    {{"{vector["name"]}", bytes_of({value}), 0, 0, 0u, "", {images}}},'
 
 
 def main() -> None:

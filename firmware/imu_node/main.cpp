@@ -61,8 +61,8 @@ void send_baro() {
     radio_sender_push(&sender, WIRE_BARO, readings.baro_us, &baro, sizeof baro);
 }
 
-void poll_sensors() {
-    const uint8_t news = sensors_poll(&sensors, &readings);
+void poll_sensors(uint32_t now_us) {
+    const uint8_t news = sensors_poll(&sensors, now_us, &readings);
     if ((news & SENSOR_NEWS_MAG) != 0) {
         mag_is_new = true;
     }
@@ -88,9 +88,11 @@ int main() {
     sensors_start(&sensors, board_started_cold());
     report.due_us = report.loop_began_us = clock_us();
     for (;;) {
-        node_report_wait(&report);
-        poll_sensors();
-        radio_sender_poll(&sender);
-        node_report_poll(&report, health(), &sender);
+        const uint32_t now_us = node_report_wait(&report);
+        poll_sensors(now_us);
+        if (node_report_due(&report, now_us)) {
+            node_report_send(&report, now_us, health(), &sender);
+        }
+        radio_sender_poll(&sender, now_us);
     }
 }

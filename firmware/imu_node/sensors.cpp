@@ -50,10 +50,10 @@ void try_set_up(Sensors *sensors, uint8_t index) {
     state->retry_us = clock_us() + RETRY_US;
 }
 
-void retry_absent(Sensors *sensors) {
+void retry_absent(Sensors *sensors, uint32_t now_us) {
     for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
         const SensorState *state = &sensors->states[index];
-        if (!state->answering && clock_passed(clock_us(), state->retry_us)) {
+        if (!state->answering && clock_passed(now_us, state->retry_us)) {
             try_set_up(sensors, index);
             if (index == SENSOR_IMU) {
                 sensors->imu_taken_us = lines_imu_us();
@@ -170,8 +170,7 @@ void watch_imu(Sensors *sensors, uint32_t now_us) {
     }
 }
 
-void begin_job(Sensors *sensors) {
-    const uint32_t now_us = clock_us();
+void begin_job(Sensors *sensors, uint32_t now_us) {
     const uint32_t imu_us = lines_imu_us();
     if (sensors->states[SENSOR_IMU].answering && imu_us != sensors->imu_taken_us) {
         sensors->imu_taken_us = imu_us;
@@ -208,18 +207,18 @@ void sensors_start(Sensors *sensors, bool self_test) {
     sensors->mag_due_us = clock_us();
 }
 
-uint8_t sensors_poll(Sensors *sensors, SensorReadings *readings) {
+uint8_t sensors_poll(Sensors *sensors, uint32_t now_us, SensorReadings *readings) {
     uint8_t news = 0;
     if (sensors->job != NO_JOB) {
-        const TwiState state = twi_poll();
+        const TwiState state = twi_poll(now_us);
         if (state == TWI_BUSY) {
             return 0;
         }
         news = end_job(sensors, state == TWI_DONE, readings);
         sensors->job = NO_JOB;
     }
-    retry_absent(sensors);
-    begin_job(sensors);
+    retry_absent(sensors, now_us);
+    begin_job(sensors, now_us);
     return news;
 }
 

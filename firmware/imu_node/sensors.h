@@ -56,7 +56,7 @@ struct SensorReadings {
 void sensors_start(Sensors *sensors, bool self_test);
 
 // To be called at every event; returns SensorNews and fills what they tell.
-uint8_t sensors_poll(Sensors *sensors, SensorReadings *readings);
+uint8_t sensors_poll(Sensors *sensors, uint32_t now_us, SensorReadings *readings);
 
 // WireSensor bits.
 uint8_t sensors_present(const Sensors *sensors);

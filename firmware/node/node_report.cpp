@@ -11,22 +11,23 @@ constexpr uint32_t EVERY_US = 1000000;
 
 }  // namespace
 
-uint8_t node_report_wait(NodeReport *report) {
+uint32_t node_report_wait(NodeReport *report) {
     const uint32_t loop_us = clock_us() - report->loop_began_us;
     if (loop_us > report->loop_max_us) {
         report->loop_max_us = loop_us;
     }
-    const uint8_t events = events_wait();
+    events_wait();
     report->loop_began_us = clock_us();
     board_feed_watchdog();
-    return events;
+    return report->loop_began_us;
 }
 
-void node_report_poll(NodeReport *report, const NodeHealth &health, RadioSender *sender) {
-    const uint32_t now_us = clock_us();
-    if (!clock_passed(now_us, report->due_us)) {
-        return;
-    }
+bool node_report_due(const NodeReport *report, uint32_t now_us) {
+    return clock_passed(now_us, report->due_us);
+}
+
+void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &health,
+                      RadioSender *sender) {
     report->due_us += EVERY_US;
     WireNodeStatus status = {};
     status.version_major = FIRMWARE_VERSION_MAJOR;

@@ -22,8 +22,12 @@ struct NodeHealth {
     uint16_t bus_errors;
 };
 
-// Sleeps until the next event, feeds the watchdog and times the loop's waking part.
-uint8_t node_report_wait(NodeReport *report);
+// Sleeps until the next event, feeds the watchdog and times the loop's waking part. Returns the
+// time, which holds for this turn of the loop: asking the clock costs 70 cycles.
+uint32_t node_report_wait(NodeReport *report);
 
-// Sends the status if a second has passed.
-void node_report_poll(NodeReport *report, const NodeHealth &health, RadioSender *sender);
+// Whether a second has passed since the last status.
+bool node_report_due(const NodeReport *report, uint32_t now_us);
+
+void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &health,
+                      RadioSender *sender);

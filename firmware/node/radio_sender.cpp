@@ -13,15 +13,15 @@ namespace {
 
 enum State : uint8_t { ABSENT, IDLE, SENDING };
 
-// One retry by the chip alone, then a new pause: twenty attempts in all.
+// One retry by the chip alone, then a new pause: 24 attempts in all.
 constexpr uint8_t RETRIES = 1;
-constexpr uint8_t ROUNDS = 10;
+constexpr uint8_t ROUNDS = 12;
 // Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
 // 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
 // the acknowledgement (section 7.4.2 of the chip's specification).
 constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 7 : RADIO_KBPS == 1000 ? 3 : 2;
 constexpr uint8_t PAUSE_FIRST = 2;
-constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 4;
+constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 5;
 static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
 
 constexpr uint32_t LOST_US = 50000;
@@ -44,21 +44,21 @@ void set_up(RadioSender *sender) {
     sender->since_us = clock_us();
 }
 
-void begin(RadioSender *sender, const Payload *payload) {
+void begin(RadioSender *sender, const Payload *payload, uint32_t now_us) {
     // The clock's low bits at an event differ from board to board: they seed the pauses.
-    sender->random ^= static_cast<uint16_t>(clock_us());
+    sender->random ^= static_cast<uint16_t>(now_us);
     if (sender->random == 0) {
         sender->random = 1;
     }
     sender->rounds = 1;
     sender->state = SENDING;
-    sender->since_us = clock_us();
+    sender->since_us = now_us;
     nrf24_send(payload->bytes, payload->size, draw_pause(sender), RETRIES);
 }
 
-void follow(RadioSender *sender) {
+void follow(RadioSender *sender, uint32_t now_us) {
     if (!lines_radio_low()) {
-        if (clock_passed(clock_us(), sender->since_us + LOST_US)) {
+        if (clock_passed(now_us, sender->since_us + LOST_US)) {
             count_lost(sender);
             sender->state = ABSENT;
         }
@@ -72,9 +72,13 @@ void follow(RadioSender *sender) {
         sender->state = IDLE;
     } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
         ++sender->rounds;
+        sender->since_us = now_us;
         nrf24_send_again(draw_pause(sender), RETRIES);
     } else {
         count_lost(sender);
+        if (!nrf24_configured()) {
+            sender->state = ABSENT;
+        }
     }
 }
 
@@ -98,15 +102,15 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
     sender->failed = static_cast<uint16_t>(sender->failed + (sender->queue.dropped - dropped));
 }
 
-void radio_sender_poll(RadioSender *sender) {
+void radio_sender_poll(RadioSender *sender, uint32_t now_us) {
     if (sender->state == SENDING) {
-        follow(sender);
+        follow(sender, now_us);
     }
-    if (sender->state == ABSENT && clock_passed(clock_us(), sender->since_us + SET_UP_EVERY_US)) {
+    if (sender->state == ABSENT && clock_passed(now_us, sender->since_us + SET_UP_EVERY_US)) {
         set_up(sender);
     }
     const Payload *payload = payload_queue_front(&sender->queue);
     if (sender->state == IDLE && payload != nullptr) {
-        begin(sender, payload);
+        begin(sender, payload, now_us);
     }
 }

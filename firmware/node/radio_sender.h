@@ -8,6 +8,7 @@
 // | SENDING | sent                     | forget it                             | IDLE    |
 // | SENDING | given up, rounds left    | new random pause, again               | SENDING |
 // | SENDING | given up, no round left  | count it, forget it                   | IDLE    |
+// | SENDING | the same, set-up lost    | the same                              | ABSENT  |
 // | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
 //
 // Two nodes whose packets collided would collide again if both paused for the same time; so every
@@ -27,7 +28,7 @@ struct RadioSender {
     uint16_t sequence;
     uint16_t failed;   // payloads given up, wraps
     uint16_t retries;  // wraps
-    uint32_t since_us;
+    uint32_t since_us;  // of the round, or of the set-up
     PayloadQueue queue;
 };
 
@@ -38,4 +39,4 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
                        uint8_t size);
 
 // To be called at every event.
-void radio_sender_poll(RadioSender *sender);
+void radio_sender_poll(RadioSender *sender, uint32_t now_us);

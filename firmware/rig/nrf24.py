@@ -179,7 +179,7 @@ class Nrf24:
 
     def _begin_attempt(self, job: int, at_ps: int) -> None:
         def send() -> None:
-            if job == self._job and self._tx:
+            if job == self._job and self._tx and self._powered:
                 payload, identity = self._tx[0]
                 packet = Packet(
                     self._channel, self._kbps, self.addresses[TX_ADDR], payload, identity, False
@@ -283,6 +283,10 @@ class Nrf24:
     def _kbps(self) -> int:
         low, high = self.registers[RF_SETUP] >> 5 & 1, self.registers[RF_SETUP] >> 3 & 1
         return 250 if low else 2000 if high else 1000
+
+    @property
+    def _powered(self) -> bool:
+        return bool(self.registers[CONFIG] & 0x02)
 
     def _receiving_mode(self) -> bool:
         return self.registers[CONFIG] & 0x03 == 0x03

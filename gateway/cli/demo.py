@@ -10,6 +10,7 @@ import msgspec
 import typer
 from msgspec.structs import replace
 
+from gateway.cli.bench import BenchError, firmware_line
 from gateway.cli.errors import refuse
 from gateway.cli.prepare import compile_everything
 from gateway.cli.run import (
@@ -46,6 +47,9 @@ def demo(
         Path | None,
         typer.Option("--flight", "-f", help="Send a recorded tracker log (CSV) in its place."),
     ] = None,
+    firmware: Annotated[
+        bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
+    ] = False,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
@@ -58,12 +62,15 @@ def demo(
     settings = or_refuse(read)
     compile_everything()
     try:
-        if flight is None:
-            line = simulate(settings.simulator, unix_time_us()).frames()
+        if flight is not None:
+            line, aircraft = recorded_line(settings, flight)
+        elif firmware:
+            line = firmware_line(settings.simulator, unix_time_us())
             aircraft = calibrated_aircraft(settings)
         else:
-            line, aircraft = recorded_line(settings, flight)
-    except (FlightFileError, ValueError) as error:
+            line = simulate(settings.simulator, unix_time_us()).frames()
+            aircraft = calibrated_aircraft(settings)
+    except (FlightFileError, BenchError, ValueError) as error:
         refuse(str(error))
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:

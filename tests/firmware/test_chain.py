@@ -23,11 +23,11 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import START_UNIX_US
 from gateway.simulator.settings import SimulatorSettings
 
-pytestmark = [pytest.mark.io, pytest.mark.slow]
+pytestmark = [pytest.mark.io, pytest.mark.slow, pytest.mark.xdist_group("chain")]
 
-START_S = 4.0
+START_S = 8.0
 """Into the flight: it stands on the runway until 12.9 s."""
-FLOWN_S = 34.0
+FLOWN_S = 28.0
 SETTLED_S = 4.0
 CHUNK_S = 0.01
 RMS_DEG = 1.2
