@@ -14,6 +14,10 @@ HEARTBEAT_INTERVAL_S = 1.0
 class Station:
     """A ground station over UDP or TCP, with the same verbs as the one of the pure tests."""
 
+    slice_s = 0.005
+    patience = 400
+    """Slices of time before it asks again: a busy machine may keep the gateway waiting."""
+
     def __init__(self, kind: int, port: int, version: int) -> None:
         self.version = version
         self.inbox: list[Any] = []
@@ -62,10 +66,11 @@ class Station:
         raise AssertionError(f"no {' or '.join(kinds)} after {retries} tries")
 
     def until_heard(self, seconds: float) -> None:
-        """Wait for the vehicle."""
+        """Wait for the vehicle's heartbeat; the gateway has one of its own."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            if any(m.get_type() == "HEARTBEAT" for m in self.wait(0.1)):
+            beats = (m for m in self.wait(0.1) if m.get_type() == "HEARTBEAT")
+            if any(m.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1 for m in beats):
                 return
         raise AssertionError("no vehicle")
 

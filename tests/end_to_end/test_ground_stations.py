@@ -1,6 +1,7 @@
 """The questions of real ground stations, answered by a running gateway."""
 
 import asyncio
+import json
 import math
 import socket
 import time
@@ -10,6 +11,11 @@ from pathlib import Path
 
 import pytest
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
+from mavsdk.asyncio.plugins.component_metadata import (
+    ComponentMetadataAsync,
+    ComponentMetadataError,
+    MetadataType,
+)
 from mavsdk.asyncio.plugins.info import InfoAsync
 from mavsdk.asyncio.plugins.mission_raw import MissionItem, MissionRawAsync
 from mavsdk.asyncio.plugins.param import ParamAsync
@@ -48,9 +54,12 @@ WAYPOINTS = "\n".join(
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 
-@pytest.fixture
-def gateway(start_gateway: Callable[..., Gateway]) -> Gateway:
-    return start_gateway("demo", config=CONFIG)
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    """One gateway for all of them: each start takes seconds, and none leaves it changed."""
+    running = Gateway(tmp_path_factory.mktemp("gateway"), "demo", config=CONFIG)
+    yield running
+    running.stop()
 
 
 @pytest.fixture
@@ -151,6 +160,23 @@ async def test_mavsdk_parameters(gateway: Gateway) -> None:
         assert refused.value.result == ParamResult.VALUE_OUT_OF_RANGE
         with pytest.raises(ParamError):
             await param.get_param_float("NO_SUCH")
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        metadata = ComponentMetadataAsync(system)
+        await metadata.request_autopilot_component()
+        while True:
+            try:
+                found = await metadata.get_metadata(1, MetadataType.PARAMETER)
+            except ComponentMetadataError:
+                await asyncio.sleep(0.1)
+            else:
+                break
+        described = {p["name"]: p for p in json.loads(found.json_metadata)["parameters"]}
+        assert described["SENS_ACC_CUTOFF"]["units"] == "Hz"
 
     await with_mavsdk(gateway, use)
 

@@ -37,6 +37,10 @@ class Foreign:
 class GroundStation:
     """One client of one vehicle."""
 
+    slice_s = 0.05
+    patience = 1
+    """Slices of time before it asks again."""
+
     def __init__(
         self,
         vehicle: Vehicle,
