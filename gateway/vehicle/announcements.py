@@ -66,9 +66,10 @@ class Announcements:
             return found
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
-            text = Told(NOTICE, f"Node {node} is back")
+            name = self._health.node_name(node)
+            text = Told(NOTICE, f"{name} is back")
             if node in silent:
-                text = Told(CRITICAL, f"Node {node} silent")
+                text = Told(CRITICAL, f"{name} silent")
             found += self._announcer.track(
                 f"node {node}", node not in silent, text, now_us, initially=True
             )
@@ -90,6 +91,8 @@ class Announcements:
         found = []
         for node, restarts in sorted(self._health.restarts().items()):
             if restarts > self._restarts.get(node, restarts):
-                found += self.say(Told(WARNING, f"Node {node} restarted"), now_us)
+                found += self.say(
+                    Told(WARNING, f"{self._health.node_name(node)} restarted"), now_us
+                )
             self._restarts[node] = restarts
         return found

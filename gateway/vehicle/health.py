@@ -30,7 +30,14 @@ GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
 PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
-NODE_SENSORS: Final = ((0, GYRO | ACCEL), (1, MAG), (2, PRESSURE), (3, GPS))
+NODE_IMU: Final = 1 << 0
+NODE_GPS: Final = 1 << 3
+NODE_SENSORS: Final = (
+    (NODE_IMU, GYRO | ACCEL),
+    (1 << 1, MAG),
+    (1 << 2, PRESSURE),
+    (NODE_GPS, GPS),
+)
 """Bits of NodeStatus' masks, and the sensors they stand for."""
 
 BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
@@ -45,6 +52,7 @@ class Health:
         self.recording = False
         self._seen_us: dict[int, int] = {}
         self._faulty: dict[int, int] = {}
+        self._roles: dict[int, str] = {}
         self._absent = 0
         self._imu_faults = 0
         self._fix: GpsFix | None = None
@@ -83,10 +91,11 @@ class Health:
         """Note what a node tells of its own sensors."""
         failed = 0
         for bit, sensors in NODE_SENSORS:
-            if status.sensors_failed & status.sensors_present & 1 << bit:
+            if status.sensors_failed & status.sensors_present & bit:
                 failed |= sensors
         self._faulty[status.node.node_id] = failed
-        if status.sensors_present & 1:
+        self._roles[status.node.node_id] = _role(status.sensors_present)
+        if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
 
@@ -191,6 +200,10 @@ class Health:
             if link.received and now_us - link.last_time_us > self.silent_us
         )
 
+    def node_name(self, node_id: int) -> str:
+        """Name a node by what it carries, as far as it has told."""
+        return f"{self._roles.get(node_id, 'Node')} {node_id}"
+
     def restarts(self) -> dict[int, int]:
         """Tell how often each node has started anew."""
         return {link.node.node_id: link.restarts for link in self._nodes}
@@ -198,3 +211,9 @@ class Health:
     def known_nodes(self) -> frozenset[int]:
         """Name the nodes that were ever heard."""
         return frozenset(link.node.node_id for link in self._nodes if link.received)
+
+
+def _role(sensors_present: int) -> str:
+    if sensors_present & NODE_IMU:
+        return "IMU node"
+    return "GPS node" if sensors_present & NODE_GPS else "Node"

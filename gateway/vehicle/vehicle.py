@@ -28,7 +28,7 @@ from gateway.vehicle.dialect import (
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
 )
 from gateway.vehicle.encoder import Encoder
-from gateway.vehicle.events import INFO, NOTICE, Told
+from gateway.vehicle.events import INFO, NOTICE, Announcer, Told
 from gateway.vehicle.ftp import FtpService
 from gateway.vehicle.health import Health
 from gateway.vehicle.home import Place
@@ -111,6 +111,8 @@ class Vehicle:
         self._encoder = Encoder(system_id, key, clock)
         self._reader = RequestReader(system_id, Verifier(key, clock) if key else None)
         self._announcements = Announcements(self.health)
+        # On its own, so that strangers cannot use up what is kept for events.
+        self._refusal_texts = Announcer()
         self._make_services({OWN_SECTION: settings, **(sections or {})})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
@@ -223,7 +225,7 @@ class Vehicle:
         name = _describe(request)
         told = Told(NOTICE, f"Refused {name} of system {request.system_id}")
         answers = service.refuse(request)
-        answers += self._replies(self._announcements.say(told, now_us))
+        answers += self._replies(self._refusal_texts.say(told, now_us))
         return self._finish(answers, now_us)
 
     def poll(self, now_us: int) -> list[Action]:

@@ -37,6 +37,10 @@ class Foreign:
 class GroundStation:
     """One client of one vehicle."""
 
+    slice_s = 0.05
+    patience = 1
+    """Slices of time before it asks again."""
+
     def __init__(
         self,
         vehicle: Vehicle,
@@ -59,6 +63,8 @@ class GroundStation:
         self.inbox: list[Any] = []
         self.actions: list[Action] = []
         """What the vehicle asked of the gateway."""
+        self.frames: list[Outgoing] = []
+        """Every frame that its requests led to, whomever it is for."""
         self._parser = mavlink.MAVLink(None)
 
     def frame(self, message: Any) -> bytes:
@@ -82,6 +88,7 @@ class GroundStation:
             if not isinstance(action, Outgoing):
                 self.actions.append(action)
                 continue
+            self.frames.append(action)
             if action.client_id not in (None, self.client_id):
                 continue
             message = self.decode(action.frame)
@@ -124,6 +131,13 @@ class GroundStation:
 
     def request(self, message_id: int, index: int = 0) -> list[Any]:
         return self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id, index)
+
+    @property
+    def broadcasts(self) -> set[str]:
+        """Kinds of message that went to all."""
+        return {
+            self.decode(frame.frame).get_type() for frame in self.frames if frame.client_id is None
+        }
 
     def of(self, kind: type[Action]) -> list[Any]:
         return [action for action in self.actions if isinstance(action, kind)]

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import NavFlags, Outgoing
+from gateway.records import Incoming, NavFlags, Outgoing
 from gateway.vehicle.settings import RateSettings, VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from tests.vehicle.samples import (
@@ -20,6 +20,7 @@ from tests.vehicle.samples import (
     report,
     sample_at,
     state_at,
+    status,
     texts,
 )
 
@@ -163,14 +164,15 @@ def test_heartbeats_go_on_when_everything_is_silent() -> None:
 def test_link_and_nodes_are_told() -> None:
     vehicle = make()
     both = link(), link(GPS_NODE)
+    vehicle.on_node_status(status(GPS_NODE, sensors_present=0b1000), 0)
     assert texts(vehicle.on_link(report(*both), ONE_S)) == ["Receiver connected: /dev/ttyUSB0"]
     found = vehicle.on_link(report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), 9 * ONE_S)
-    assert texts(found) == ["Node 1 silent"]
+    assert texts(found) == ["GPS node 1 silent"]
     found = vehicle.on_link(report(*both, connected=False), 20 * ONE_S)
     assert texts(found) == ["Receiver lost: /dev/ttyUSB0"]
     alive = link(last_time_us=30 * ONE_S), link(GPS_NODE, last_time_us=30 * ONE_S)
     found = vehicle.on_link(report(*alive), 30 * ONE_S)
-    assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "Node 1 is back"]
+    assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"]
 
 
 def test_a_node_that_restarts_is_told() -> None:
@@ -200,6 +202,21 @@ def test_system_time_follows_gps() -> None:
     vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
     after = [m for m in decode(vehicle.poll(3 * ONE_S)) if m.get_type() == "SYSTEM_TIME"]
     assert after[0].time_unix_usec == 1_790_000_002_000_000
+
+
+def test_each_aircraft_answers_for_itself() -> None:
+    mav = mavlink.MAVLink(None, 255, 190)
+
+    def ask(vehicle: Vehicle, target: int) -> list[Any]:
+        message = mavlink.MAVLink_param_request_read_message(target, 1, b"RATE_ATT", -1)
+        return decode(vehicle.handle(Incoming(7, message.pack(mav), trusted=True), 0))
+
+    one = Vehicle(VehicleSettings(), 1)
+    two = Vehicle(VehicleSettings(rates=RateSettings(attitude_hz=7.0)), 2)
+    assert [m.param_value for m in ask(one, 1)] == [50.0]
+    assert [m.param_value for m in ask(two, 2)] == [7.0]
+    assert ask(one, 2) == ask(two, 1) == []
+    assert {m.get_srcSystem() for v in (one, two) for m in ask(v, 0)} == {1, 2}
 
 
 def test_two_aircraft_keep_apart() -> None:

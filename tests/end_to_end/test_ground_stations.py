@@ -1,0 +1,225 @@
+"""The questions of real ground stations, answered by a running gateway."""
+
+import asyncio
+import json
+import math
+import socket
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
+from mavsdk.asyncio.plugins.component_metadata import (
+    ComponentMetadataAsync,
+    ComponentMetadataError,
+    MetadataType,
+)
+from mavsdk.asyncio.plugins.info import InfoAsync
+from mavsdk.asyncio.plugins.mission_raw import MissionItem, MissionRawAsync
+from mavsdk.asyncio.plugins.param import ParamAsync
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk.plugins.param import ParamError, ParamResult
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.simulator.settings import SimulatorSettings
+from tests.end_to_end.processes import START_LIMIT_S, Gateway
+from tests.end_to_end.station import Station
+from tests.end_to_end.test_demo import MavProxy
+from tests.vehicle.test_start_up import qgroundcontrol
+
+HOME = SimulatorSettings()
+
+CONFIG = """
+[hub]
+endpoints = [
+    "udp:127.0.0.1:{port}", "udp-listen:127.0.0.1:{listen}", "tcp-listen:127.0.0.1:{listen}",
+]
+
+[simulator]
+gps_first_fix_s = 0.5
+"""
+
+WAYPOINTS = "\n".join(
+    [
+        "QGC WPL 110",
+        *(
+            f"{seq}\t{int(seq == 0)}\t3\t16\t0\t0\t0\t0\t{HOME.home_lat_deg}\t{lon_deg}\t50\t1"
+            for seq, lon_deg in enumerate((HOME.home_lon_deg, HOME.home_lon_deg + 0.01))
+        ),
+    ]
+)
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    """One gateway for all of them: each start takes seconds, and none leaves it changed."""
+    running = Gateway(tmp_path_factory.mktemp("gateway"), "demo", config=CONFIG)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def stations(gateway: Gateway) -> Iterator[Callable[..., Station]]:
+    opened: list[Station] = []
+
+    def connect(kind: int, version: int) -> Station:
+        deadline_s = time.monotonic() + START_LIMIT_S
+        while True:
+            try:
+                station = Station(kind, gateway.listen_port, version)
+                opened.append(station)
+                station.until_heard(1.0)
+            except (ConnectionError, AssertionError):
+                assert time.monotonic() < deadline_s, gateway.log.read_text()
+                time.sleep(0.2)
+            else:
+                return station
+
+    yield connect
+    for station in opened:
+        station.close()
+
+
+def test_qgroundcontrols_start_up(stations: Callable[..., Station]) -> None:
+    for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+        for version in (1, 2):
+            qgroundcontrol(stations(kind, version))
+
+
+async def with_mavsdk(gateway: Gateway, use: Callable) -> None:
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
+        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+        async with asyncio.timeout(60):
+            await use(system)
+
+
+async def test_mavsdk_telemetry(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        telemetry = TelemetryAsync(system)
+        async for health in telemetry.subscribe_health():
+            if health.is_armable and health.is_home_position_ok:
+                break
+        assert health.is_gyrometer_calibration_ok
+        assert health.is_accelerometer_calibration_ok
+        assert health.is_magnetometer_calibration_ok
+        assert health.is_global_position_ok
+        home = await anext(telemetry.subscribe_home())
+        assert home.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=1e-3)
+        quaternion = await anext(telemetry.subscribe_attitude_quaternion())
+        norm = math.hypot(quaternion.w, quaternion.x, quaternion.y, quaternion.z)
+        assert norm == pytest.approx(1.0, abs=1e-5)
+        metrics = await anext(telemetry.subscribe_fixedwing_metrics())
+        assert math.isnan(metrics.airspeed_m_s), "nothing measures it"
+        assert math.isfinite(metrics.climb_rate_m_s)
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_rates(gateway: Gateway) -> None:
+    """Every set_rate is acknowledged, and a client gets more than the settings' 50 Hz."""
+
+    async def use(system: System) -> None:
+        telemetry = TelemetryAsync(system)
+        for set_rate in (
+            telemetry.set_rate_position,
+            telemetry.set_rate_home,
+            telemetry.set_rate_health,
+            telemetry.set_rate_fixedwing_metrics,
+            telemetry.set_rate_landed_state,
+        ):
+            await set_rate(20.0)
+        await telemetry.set_rate_attitude_quaternion(100.0)
+        stamps = []
+        async for quaternion in telemetry.subscribe_attitude_quaternion():
+            stamps.append(quaternion.timestamp_us)
+            if len(stamps) > 300:
+                break
+        gaps = sorted(b - a for a, b in pairwise(stamps[50:]))
+        assert gaps[len(gaps) // 2] == pytest.approx(10_000, abs=2_000)
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_parameters(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        version = await InfoAsync(system).get_version()
+        assert version.flight_sw_minor > 0
+        param = ParamAsync(system)
+        everything = await param.get_all_params()
+        assert {"SENS_ACC_CUTOFF", "RATE_ATT_QUAT"} <= {p.name for p in everything.float_params}
+        await param.set_param_float("SENS_ACC_CUTOFF", 12.5)
+        assert await param.get_param_float("SENS_ACC_CUTOFF") == 12.5
+        with pytest.raises(ParamError) as refused:
+            await param.set_param_float("SENS_ACC_CUTOFF", 1e9)
+        assert refused.value.result == ParamResult.VALUE_OUT_OF_RANGE
+        with pytest.raises(ParamError):
+            await param.get_param_float("NO_SUCH")
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        metadata = ComponentMetadataAsync(system)
+        await metadata.request_autopilot_component()
+        while True:
+            try:
+                found = await metadata.get_metadata(1, MetadataType.PARAMETER)
+            except ComponentMetadataError:
+                await asyncio.sleep(0.1)
+            else:
+                break
+        described = {p["name"]: p for p in json.loads(found.json_metadata)["parameters"]}
+        assert described["SENS_ACC_CUTOFF"]["units"] == "Hz"
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_mission_up_and_down(gateway: Gateway) -> None:
+    def item(seq: int) -> MissionItem:
+        return MissionItem(
+            seq=seq,
+            frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+            command=mavlink.MAV_CMD_NAV_WAYPOINT,
+            current=int(seq == 0),
+            autocontinue=1,
+            x=round(HOME.home_lat_deg * 1e7) + 1000 * seq,
+            y=round(HOME.home_lon_deg * 1e7),
+            z=50.0 + seq,
+        )
+
+    async def use(system: System) -> None:
+        missions = MissionRawAsync(system)
+        items = [item(seq) for seq in range(25)]
+        await missions.upload_mission(items)
+        found = await missions.download_mission()
+        assert [(i.seq, i.x, i.y, i.z) for i in found] == [(i.seq, i.x, i.y, i.z) for i in items]
+        await missions.set_current_mission_item(3)
+        await missions.clear_mission()
+        assert await missions.download_mission() == []
+
+    await with_mavsdk(gateway, use)
+
+
+def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
+    """Load the parameters, set one, upload waypoints and see the way to them."""
+    (tmp_path / "way.txt").write_text(WAYPOINTS)
+    mavproxy = MavProxy(gateway.port, tmp_path)
+    try:
+        mavproxy.until(r"Received \d+ parameters")
+        mavproxy.type("param set SENS_ACC_CUTOFF 12.5")
+        mavproxy.until(r"SENS_ACC_CUTOFF\s+12\.5", asking="param show SENS_ACC_CUTOFF")
+        mavproxy.type("wp load way.txt")
+        mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
+        mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
+        mavproxy.until(r"link 1 OK", asking="link")
+        assert "breach" not in mavproxy.output
+    finally:
+        mavproxy.process.kill()
+        mavproxy.process.communicate(timeout=10)

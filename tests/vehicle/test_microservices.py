@@ -1,0 +1,165 @@
+"""One table of what the standard's pages let a client ask, and what it must get.
+
+Each row is asked over a sound link and over one that loses a third of all messages each way; a
+client asks again as its page says. Pages are those of https://mavlink.io/en/services/.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from tests.vehicle.ground_station import GroundStation
+
+ME = (1, 1)
+ACK = "COMMAND_ACK"
+
+
+def command(number: int, *params: float) -> Callable[[], Any]:
+    padded = [*params, *[0.0] * (7 - len(params))]
+    return lambda: mavlink.MAVLink_command_long_message(*ME, number, 0, *padded)
+
+
+def command_int(number: int, x: int, y: int, z: float) -> Callable[[], Any]:
+    frame = mavlink.MAV_FRAME_GLOBAL_INT
+    return lambda: mavlink.MAVLink_command_int_message(
+        *ME, frame, number, 0, 0, 0, 0, 0, 0, x, y, z
+    )
+
+
+def ftp(opcode: int, data: bytes) -> Callable[[], Any]:
+    payload = struct.pack("<HBBBBBxI", 1, 0, opcode, len(data), 0, 0, 0) + data
+    return lambda: mavlink.MAVLink_file_transfer_protocol_message(0, *ME, payload.ljust(251, b"\0"))
+
+
+def param_set(name: bytes, value: float) -> Callable[[], Any]:
+    return lambda: mavlink.MAVLink_param_set_message(*ME, name, value, 9)
+
+
+ACCEPTED = {"result": mavlink.MAV_RESULT_ACCEPTED}
+DENIED = {"result": mavlink.MAV_RESULT_DENIED}
+UNSUPPORTED = {"result": mavlink.MAV_RESULT_UNSUPPORTED}
+IN_PROGRESS = {"result": mavlink.MAV_RESULT_IN_PROGRESS}
+HOME_PLACE = (475_000_000, 85_000_000, 500.0)
+
+TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
+    # command.html: every command is acknowledged by the same number.
+    "command/known": (command(512, 148), ACK, ACCEPTED | {"command": 512}),
+    "command/unknown": (command(31_000), ACK, UNSUPPORTED | {"command": 31_000}),
+    "command/int": (command_int(179, *HOME_PLACE), ACK, ACCEPTED | {"command": 179}),
+    "command/denied": (command(400, 1), ACK, DENIED | {"command": 400}),
+    "command/long-running": (command(241, 1), ACK, IN_PROGRESS | {"progress": 255}),
+    "command/cancelled": (command(241), ACK, ACCEPTED),
+    # The messages that MAV_CMD_REQUEST_MESSAGE asks for follow its acknowledgement.
+    "request/autopilot-version": (command(512, 148), "AUTOPILOT_VERSION", {"vendor_id": 0}),
+    "request/protocol-version": (command(512, 300), "PROTOCOL_VERSION", {}),
+    "request/home": (command(512, 242), "HOME_POSITION", {"latitude": 471_234_567}),
+    "request/unknown": (command(512, 12_345), ACK, UNSUPPORTED),
+    "request/interval": (command(510, 30), "MESSAGE_INTERVAL", {"interval_us": 20_000}),
+    "request/set-interval": (command(511, 30, 100_000), ACK, ACCEPTED),
+    # component_metadata.html and standard_modes.html
+    "metadata/announcement": (command(512, 397), "COMPONENT_METADATA", {}),
+    "metadata/deprecated": (command(512, 395), ACK, UNSUPPORTED),
+    "modes/available": (command(512, 435, 0), "AVAILABLE_MODES", {}),
+    "modes/current": (command(512, 436), "CURRENT_MODE", {}),
+    # parameter.html: read by name or index, set and told, unknown ones refused.
+    "parameter/list": (
+        lambda: mavlink.MAVLink_param_request_list_message(*ME), "PARAM_VALUE", {},
+    ),
+    "parameter/read-name": (
+        lambda: mavlink.MAVLink_param_request_read_message(*ME, b"RATE_ATT", -1),
+        "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 50.0},
+    ),
+    "parameter/read-index": (
+        lambda: mavlink.MAVLink_param_request_read_message(*ME, b"", 0),
+        "PARAM_VALUE", {"param_index": 0},
+    ),
+    "parameter/read-unknown": (
+        lambda: mavlink.MAVLink_param_request_read_message(*ME, b"NOPE", -1),
+        "PARAM_ERROR", {"error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST},
+    ),
+    "parameter/set": (
+        param_set(b"RATE_ATT", 5.0), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 5.0},
+    ),
+    "parameter/set-out-of-range": (
+        param_set(b"RATE_ATT", -5.0), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 50.0},
+    ),
+    "parameter/set-unknown": (
+        param_set(b"NOPE", 1.0), "PARAM_ERROR", {"error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST},
+    ),
+    # mission.html: the same for the three types.
+    **{
+        f"mission/list-{kind}": (
+            lambda kind=kind: mavlink.MAVLink_mission_request_list_message(*ME, kind),
+            "MISSION_COUNT", {"count": 0, "mission_type": kind},
+        )
+        for kind in (0, 1, 2)
+    },
+    "mission/upload": (
+        lambda: mavlink.MAVLink_mission_count_message(*ME, 2, 0), "MISSION_REQUEST_INT", {"seq": 0},
+    ),
+    "mission/too-large": (
+        lambda: mavlink.MAVLink_mission_count_message(*ME, 60_000, 0),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_NO_SPACE},
+    ),
+    "mission/no-such-item": (
+        lambda: mavlink.MAVLink_mission_request_int_message(*ME, 9, 0),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
+    ),
+    "mission/clear": (
+        lambda: mavlink.MAVLink_mission_clear_all_message(*ME, 255),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED},
+    ),
+    "mission/set-current-none": (
+        lambda: mavlink.MAVLink_mission_set_current_message(*ME, 4), "STATUSTEXT", {},
+    ),
+    # ftp.html: an answer to every opcode, with the request's opcode in it.
+    "ftp/open": (ftp(4, b"/general.json"), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 4)}),
+    "ftp/not-there": (ftp(4, b"@PARAM/param.pck"), "FILE_TRANSFER_PROTOCOL", {"opcode": (129, 4)}),
+    "ftp/list": (ftp(3, b"/"), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 3)}),
+    "ftp/write": (ftp(6, b"/x"), "FILE_TRANSFER_PROTOCOL", {"opcode": (129, 6)}),
+    "ftp/reset": (ftp(2, b""), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 2)}),
+    # ping.html and timesync.html
+    "ping": (lambda: mavlink.MAVLink_ping_message(5, 6, 0, 0), "PING", {"seq": 6}),
+    "timesync": (lambda: mavlink.MAVLink_timesync_message(0, 7), "TIMESYNC", {"ts1": 7}),
+}  # fmt: skip
+
+
+def answers(message: Any, field: str) -> Any:
+    if field == "opcode":
+        return (message.payload[3], message.payload[5])
+    return getattr(message, field)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.33])
+@pytest.mark.parametrize("row", TABLE)
+def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
+    request, kind, fields = TABLE[row]
+    rng = np.random.default_rng([*row.encode()])
+    station.loses = lambda *_: rng.random() < loss
+    answer = station.ask(request(), kind, retries=30, timeout_s=0.05)[0]
+    assert {field: answers(answer, field) for field in fields} == fields
+
+
+TOLD_TO_ALL = {
+    "command/int": {"HOME_POSITION", "STATUSTEXT"},
+    "command/denied": {"STATUSTEXT"},
+    "command/long-running": {"STATUSTEXT"},
+    "parameter/set": {"PARAM_VALUE"},
+    "parameter/set-out-of-range": {"PARAM_VALUE"},
+    "mission/set-current-none": {"STATUSTEXT"},
+}
+"""What changed, and why something was refused, concerns every ground station."""
+
+
+@pytest.mark.parametrize("row", TABLE)
+def test_it_is_given_once_and_to_the_one_who_asked(station: GroundStation, row: str) -> None:
+    request, kind, _ = TABLE[row]
+    found = station.send(request())
+    expected = 10 if row == "parameter/list" else 1
+    assert sum(m.get_type() == kind for m in found) == expected
+    assert {frame.client_id for frame in station.frames} <= {7, None}
+    assert station.broadcasts == TOLD_TO_ALL.get(row, set())
