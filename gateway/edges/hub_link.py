@@ -4,25 +4,14 @@ import asyncio
 import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Protocol
 
 from gateway.edges.hub_express import Express
 from gateway.routing.clients import ClientStats
-from gateway.routing.endpoint import Endpoint, EndpointKind
+from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_numeric
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import Origin
 from gateway.wire.mavlink_splitter import SplitFault
-
-OPEN_TO_ALL: Final = frozenset(
-    {
-        EndpointKind.UDP_LISTEN,
-        EndpointKind.TCP_LISTEN,
-        EndpointKind.UDP_BROADCAST,
-        EndpointKind.UDP_MULTICAST,
-    }
-)
-"""Kinds whose peers nobody has named."""
-
 
 Write = Callable[[bytes], object]
 
@@ -196,15 +185,6 @@ def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:
         return _is_loopback(remote.rpartition(":")[0])
-    return True
-
-
-def is_numeric(host: str) -> bool:
-    """Tell whether a host is an address and not a name."""
-    try:
-        ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return False
     return True
 
 

@@ -237,6 +237,7 @@ class TcpListener:
         self._links: dict[int, TcpPeer] = {}
         self._socket: socket.socket | None = None
         self._retry_us = 0
+        self._failed = False
         self.tick(context.now_us())
 
     @property
@@ -262,8 +263,11 @@ class TcpListener:
             sock.listen(ACCEPT_BACKLOG)
         except OSError as error:
             sock.close()
-            log.warning("cannot listen at %s: %s", self.endpoint.name, error)
+            if not self._failed:
+                log.warning("cannot listen at %s yet: %s", self.endpoint.name, error)
+            self._failed = True
             return
+        self._failed = False
         self._socket = sock
         self._loop.add_reader(sock, self._on_readable, sock)
 

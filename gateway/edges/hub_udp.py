@@ -10,8 +10,8 @@ import socket
 from collections import deque
 from typing import Any, Final
 
-from gateway.edges.hub_link import HubContext, Link, Write, is_numeric, not_open
-from gateway.routing.endpoint import Endpoint
+from gateway.edges.hub_link import HubContext, Link, Write, not_open
+from gateway.routing.endpoint import Endpoint, is_numeric
 from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_frame, split_datagram

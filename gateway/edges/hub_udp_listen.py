@@ -64,6 +64,7 @@ class UdpListener:
         self._links: dict[int, UdpPeer] = {}
         self._socket: socket.socket | None = None
         self._retry_us = 0
+        self._failed = False
         self.tick(context.now_us())
 
     @property
@@ -106,8 +107,11 @@ class UdpListener:
     def _bind(self) -> None:
         sock = _bound((self.endpoint.host, self.endpoint.port), shared=False)
         if sock is None:
-            log.warning("cannot listen at %s", self.endpoint.name)
+            if not self._failed:
+                log.warning("cannot listen at %s yet", self.endpoint.name)
+            self._failed = True
             return
+        self._failed = False
         if sock.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_RECVPKTINFO, 1)
         else:

@@ -12,6 +12,7 @@ IPv6 addresses stand in brackets. Options follow as in any URL:
 `?name=tablet&deny=RAW_IMU&pack=1100`.
 """
 
+import ipaddress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -40,6 +41,17 @@ class EndpointKind(StrEnum):
     TCP = "tcp"
     TCP_LISTEN = "tcp-listen"
     SERIAL = "serial"
+
+
+OPEN_TO_ALL: Final = frozenset(
+    {
+        EndpointKind.UDP_LISTEN,
+        EndpointKind.UDP_BROADCAST,
+        EndpointKind.UDP_MULTICAST,
+        EndpointKind.TCP_LISTEN,
+    }
+)
+"""Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +158,19 @@ def _split_place(url: str, kind: EndpointKind, place: str) -> tuple[str, int]:
         raise ValueError(f"endpoint {url!r}: write {kind}:HOST:PORT, an IPv6 host in [brackets]")
     if not port.isdecimal() or int(port) > MAX_PORT:
         raise ValueError(f"endpoint {url!r}: port {port!r} is not 0 to {MAX_PORT}")
-    return host.strip("[]"), int(port)
+    host = host.strip("[]")
+    if kind in OPEN_TO_ALL and not is_numeric(host):
+        raise ValueError(f"endpoint {url!r}: {host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
+    return host, int(port)
+
+
+def is_numeric(host: str) -> bool:
+    """Tell whether a host is an address and not a name."""
+    try:
+        ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return False
+    return True
 
 
 def _options(url: str, query: str) -> dict[str, str]:

@@ -52,6 +52,8 @@ def test_lists() -> None:
         ("udp:127.0.0.1", "HOST:PORT"),
         ("udp:::1:14550", "brackets"),
         ("udp:h:99999", "65535"),
+        ("udp-listen:localhost:14550", "no address"),
+        ("udp-multicast:group.example:14550", "no address"),
         ("serial:/dev/ttyUSB0:fast", "baud rate"),
         ("udp:h:1?colour=red", "colour"),
         ("udp:h:1?deny=NO_SUCH_MESSAGE", "NO_SUCH_MESSAGE"),
