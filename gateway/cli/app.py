@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import clients, convert, demo, info, play, record, run, setup
+from gateway.cli import clients, convert, demo, info, play, record, report, run, setup, sweep
 
 app = typer.Typer(
     name="mavgate",
@@ -27,6 +27,8 @@ convert.register(app)
 info.register(app)
 clients.register(app)
 setup.register(app)
+report.register(app)
+sweep.register(app)
 
 
 def _show_version(wanted: bool) -> None:

@@ -25,7 +25,7 @@ from gateway.flightlog.stamps import Stamper
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table import TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord
-from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
     FusedSample,
@@ -112,21 +112,25 @@ def open_rows(path: Path, wishes: Wishes) -> Table:
 
 def fuse(table: Table, wishes: Wishes, fixes: Iterable[GpsFix] = ()) -> Replay:
     """Make a replay with the settings that the wishes name, for one table."""
-    vehicle_id, correct = table.header.vehicle_id, None
-    aircraft = wishes.current.aircraft.get(vehicle_id, wishes.current.default)
-    if wishes.choice == "recorded" and table.header.settings:
-        try:
-            aircraft = settings_of(table.header)
-        except msgspec.ValidationError as error:
-            raise FlightError(
-                f"the recorded settings are of another version ({error}); "
-                "use the current ones: --settings current"
-            ) from error
+    aircraft, correct = aircraft_of(table, wishes), None
     if wishes.position == "interpolated":
         latency_s = aircraft.estimation.reference.gps_latency_s
         correct = InterpolatedPosition(fixes, latency_s)
     zero_us = table.header.unix_us_at_zero or 0
     return Replay(Pipeline(PipelineSettings(aircraft, {}, zero_us, correct)))
+
+
+def aircraft_of(table: Table, wishes: Wishes) -> AircraftSettings:
+    """Choose the settings for one table: its own, or those of today."""
+    if wishes.choice == "current" or not table.header.settings:
+        return wishes.current.aircraft.get(table.header.vehicle_id, wishes.current.default)
+    try:
+        return settings_of(table.header)
+    except msgspec.ValidationError as error:
+        raise FlightError(
+            f"the recorded settings are of another version ({error}); "
+            "use the current ones: --settings current"
+        ) from error
 
 
 def fixes_of(path: Path, wishes: Wishes) -> list[GpsFix]:

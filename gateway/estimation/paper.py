@@ -23,20 +23,19 @@ References
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
+import numpy as np
+
+from gateway.estimation import paper_kernels as kernels
+from gateway.estimation.paper_kernels import is_finite
+from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import (
     IDENTITY,
-    from_euler,
-    from_rotation_vector,
-    multiply,
-    normalise,
-    rotate,
-    to_euler,
-    wrap_pi,
 )
 from gateway.records import (
     NAN,
@@ -50,18 +49,7 @@ from gateway.records import (
     Vec3,
 )
 from gateway.settings import Settings, setting
-from gateway.units import DEG_PER_DEGE7, STANDARD_GRAVITY_MPS2, US_PER_S
-
-GAP_US: Final = 500_000
-"""A longer silence is not integrated over."""
-GAIN_INTERVAL_S: Final = 0.01
-"""The attitude gains are given for this interval; other intervals take the matching power."""
-STALE_GPS_US: Final = 1_500_000
-POSITION_HOLD_US: Final = 30_000_000
-"""Dead reckoning longer than this is no position any more."""
-STALE_MAG_US: Final = 2_000_000
-MIN_COS_PITCH: Final = 0.05
-"""Nose up or down, the accelerometer does not tell the roll."""
+from gateway.units import DEG_PER_DEGE7, US_PER_S
 
 
 class PaperSettings(Settings, frozen=True):
@@ -126,25 +114,6 @@ class PaperState:
     fix_vel_n_mps: Vec3 = UNKNOWN_VEC3
 
 
-def _finite(v: Vec3) -> bool:
-    return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
-
-
-def _blend(weight: float, predicted: Vec3, measured: Vec3) -> Vec3:
-    """Weigh the predicted path against the measured one; weight 0 and 1 are exact."""
-    w, v = weight, 1.0 - weight
-    return (
-        w * predicted[0] + v * measured[0],
-        w * predicted[1] + v * measured[1],
-        w * predicted[2] + v * measured[2],
-    )
-
-
-def _blend_angle(weight: float, predicted_rad: float, measured_rad: float) -> float:
-    """Weigh two angles the shortest way round."""
-    return measured_rad + weight * wrap_pi(predicted_rad - measured_rad)
-
-
 class PaperEstimator:
     """The paper's fusion behind the estimators' common interface.
 
@@ -194,15 +163,15 @@ class PaperEstimator:
         """
         s = self._s
         accel, gyro = sample.accel_lowpass_b_mps2, sample.gyro_highpass_b_radps
-        sound = _finite(sample.accel_b_mps2) and _finite(sample.gyro_b_radps)
-        sound = sound and _finite(accel) and _finite(gyro)
+        sound = is_finite(sample.accel_b_mps2) and is_finite(sample.gyro_b_radps)
+        sound = sound and is_finite(accel) and is_finite(gyro)
         if s.time_us is None:
             if not sound:
                 return self._nav(sample.time_us, sound)
             s.time_us = sample.time_us
             self._update_attitude(accel, gyro, None)
         dt_us = sample.time_us - s.time_us
-        if abs(dt_us) > GAP_US:
+        if abs(dt_us) > kernels.GAP_US:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
@@ -213,7 +182,7 @@ class PaperEstimator:
                 dt_s = dt_us / US_PER_S
                 self._update_attitude(accel, gyro, dt_s)
                 self._update_position(accel, dt_s)
-        if sample.mag_b_ut is not None and dt_us >= 0 and _finite(sample.mag_b_ut):
+        if sample.mag_b_ut is not None and dt_us >= 0 and is_finite(sample.mag_b_ut):
             self._update_yaw(sample.mag_b_ut)
         return self._nav(s.time_us, sound)
 
@@ -228,26 +197,77 @@ class PaperEstimator:
         if not is_usable(fix, self._reference):
             return
         s = self._s
+        self._carry_forward(fix)
+        if s.fix_time_us is None or not math.isfinite(s.lat_deg):
+            s.lat_deg, s.lon_deg, s.alt_m = s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m
+            s.vel_n_mps = s.fix_vel_n_mps
+        s.fix_time_us = fix.time_us
+        self._blend_fix()
+
+    def run(self, time_us: IntArray, samples: FloatArray, fixes: Iterable[GpsFix]) -> FloatArray:
+        """Fuse a whole log from the start; bit for bit what its samples give one at a time.
+
+        Parameters
+        ----------
+        time_us : ndarray of int, shape (n,)
+            Times of the IMU samples.
+        samples : ndarray, shape (n, paper_kernels.SAMPLE_COLUMNS)
+            See there.
+        fixes : iterable of GpsFix
+            In the order of their arrival.
+
+        Returns
+        -------
+        ndarray, shape (n, paper_kernels.OUT_COLUMNS)
+            One row an IMU sample. The estimator itself is reset.
+
+        Raises
+        ------
+        ValueError
+            If a time goes back: only a live clock begins anew.
+        """
+        self.reset()
+        declination_rad = self._earth.declination_rad
+        rows = []
+        for fix in fixes:
+            if is_usable(fix, self._reference):
+                rows.append((fix.time_us, *self._carry_forward(fix), self._earth.declination_rad))
+                self._s.fix_time_us = fix.time_us
+        self.reset()
+        table = np.array(rows, np.float64).reshape(-1, 1 + kernels.FIX_COLUMNS)
+        fix_time_us = np.array([row[0] for row in rows], np.int64)
+        if np.any(np.diff(time_us) < 0) or np.any(np.diff(fix_time_us) < 0):
+            raise ValueError("the times of a log must not go back")
+        gains = self._settings
+        return kernels.run(
+            (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity),
+            gains.blend == "at_fix",
+            declination_rad,
+            time_us,
+            samples,
+            fix_time_us,
+            np.ascontiguousarray(table[:, 1:]),
+        )
+
+    def _carry_forward(self, fix: GpsFix) -> tuple[float, ...]:
+        """Move a fix forward by its latency, and keep it; tells place and velocity."""
+        s = self._s
         lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
         self._earth.update(lat_deg, lon_deg, fix.alt_amsl_m, fix.utc_us)
-        vel = fix.vel_n_mps if _finite(fix.vel_n_mps) else self._bearing_velocity(fix)
+        vel = fix.vel_n_mps if is_finite(fix.vel_n_mps) else self._bearing_velocity(fix)
         latency_s = self._reference.gps_latency_s
         s.fix_lat_deg, s.fix_lon_deg = offset_deg(
             lat_deg, lon_deg, fix.alt_amsl_m, vel[0] * latency_s, vel[1] * latency_s
         )
         s.fix_alt_m = fix.alt_amsl_m - vel[2] * latency_s
         s.fix_vel_n_mps = vel
-        if s.fix_time_us is None or not math.isfinite(s.lat_deg):
-            s.lat_deg, s.lon_deg, s.alt_m = s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m
-            s.vel_n_mps = vel
-        s.fix_time_us = fix.time_us
-        self._blend_fix()
+        return (s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m, *vel)
 
     def _bearing_velocity(self, fix: GpsFix) -> Vec3:
         """Speed and bearing from the last fix to this one: eq. 3 to 6 over a short way."""
         s = self._s
         dt_s = 0.0 if s.fix_time_us is None else (fix.time_us - s.fix_time_us) / US_PER_S
-        if not 0.0 < dt_s < POSITION_HOLD_US / US_PER_S:
+        if not 0.0 < dt_s < kernels.POSITION_HOLD_US / US_PER_S:
             return (0.0, 0.0, 0.0)
         latency_s, old = self._reference.gps_latency_s, s.fix_vel_n_mps
         north_m, east_m = displacement_m(
@@ -264,71 +284,57 @@ class PaperEstimator:
         )
 
     def _update_attitude(self, accel: Vec3, gyro: Vec3, dt_s: float | None) -> None:
-        """First complementary filter: gyroscope against the accelerometer's tilt."""
         s = self._s
-        roll_rad = math.atan2(-accel[1], -accel[2])
-        pitch_rad = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
         s.rate_b_radps = gyro
         if dt_s is None:
-            s.q_nb = from_euler(roll_rad, pitch_rad, 0.0)
-            return
-        turn = from_rotation_vector((gyro[0] * dt_s, gyro[1] * dt_s, gyro[2] * dt_s))
-        s.q_nb = normalise(multiply(s.q_nb, turn))
-        if math.cos(pitch_rad) < MIN_COS_PITCH:
-            return
-        weight = self._settings.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
-        roll, pitch, yaw = to_euler(s.q_nb)
-        s.q_nb = from_euler(
-            _blend_angle(weight, roll, roll_rad), _blend_angle(weight, pitch, pitch_rad), yaw
-        )
+            s.q_nb = kernels.level_start(accel)
+        else:
+            s.q_nb = kernels.turn(s.q_nb, accel, gyro, dt_s, self._settings.alpha_gyro)
 
     def _update_yaw(self, mag_b_ut: Vec3) -> None:
-        """Second complementary filter: yaw against the tilt-compensated compass."""
         s = self._s
-        roll, pitch, yaw = to_euler(s.q_nb)
-        level = rotate(from_euler(roll, pitch, 0.0), mag_b_ut)
-        declination = self._earth.declination_rad
-        compass = math.atan2(-level[1], level[0])
-        if math.isfinite(declination):
-            compass += declination
-        weight = 0.0
-        if s.mag_time_us is not None and s.time_us is not None:
-            dt_s = max(s.time_us - s.mag_time_us, 0) / US_PER_S
-            weight = self._settings.alpha_yaw ** (dt_s / GAIN_INTERVAL_S)
+        s.q_nb = kernels.turn_to_compass(
+            s.q_nb,
+            mag_b_ut,
+            self._earth.declination_rad,
+            _known(s.time_us),
+            _known(s.mag_time_us),
+            self._settings.alpha_yaw,
+        )
         s.mag_time_us = s.time_us
-        s.q_nb = from_euler(roll, pitch, _blend_angle(weight, yaw, compass))
 
     def _update_position(self, accel: Vec3, dt_s: float) -> None:
-        """Third complementary filter, its inertial path: integrate twice."""
         s = self._s
         if not math.isfinite(s.lat_deg):
             return
-        a = rotate(s.q_nb, accel)
-        v = s.vel_n_mps
-        s.vel_n_mps = (
-            v[0] + a[0] * dt_s,
-            v[1] + a[1] * dt_s,
-            v[2] + (a[2] + STANDARD_GRAVITY_MPS2) * dt_s,
-        )
-        v = s.vel_n_mps
-        s.lat_deg, s.lon_deg = offset_deg(s.lat_deg, s.lon_deg, s.alt_m, v[0] * dt_s, v[1] * dt_s)
-        s.alt_m -= v[2] * dt_s
+        place = (s.lat_deg, s.lon_deg, s.alt_m)
+        place, s.vel_n_mps = kernels.advance(s.q_nb, accel, dt_s, place, s.vel_n_mps)
+        s.lat_deg, s.lon_deg, s.alt_m = place
         if self._settings.blend == "every_sample":
             self._blend_fix()
 
     def _blend_fix(self) -> None:
-        """Third complementary filter, its blend: eq. 1, 2, 7 and 8 as recursions."""
         s = self._s
-        s.vel_n_mps = _blend(self._settings.alpha_accel, s.vel_n_mps, s.fix_vel_n_mps)
-        predicted = (s.lat_deg, s.lon_deg, s.alt_m)
-        # The longitude may wrap between the two; blend the shortest way round.
-        lon_deg = s.lon_deg + (s.fix_lon_deg - s.lon_deg + 180.0) % 360.0 - 180.0
-        fix = (s.fix_lat_deg, lon_deg, s.fix_alt_m)
-        s.lat_deg, lon, s.alt_m = _blend(self._settings.beta_velocity, predicted, fix)
-        s.lon_deg = (lon + 180.0) % 360.0 - 180.0
+        place, s.vel_n_mps = kernels.blend_fix(
+            self._settings.alpha_accel,
+            self._settings.beta_velocity,
+            (s.lat_deg, s.lon_deg, s.alt_m),
+            s.vel_n_mps,
+            (s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m),
+            s.fix_vel_n_mps,
+        )
+        s.lat_deg, s.lon_deg, s.alt_m = place
 
     def _nav(self, time_us: int, sound: bool) -> NavState:
         s = self._s
+        flags = kernels.flags_of(
+            time_us,
+            s.time_us is not None,
+            _known(s.mag_time_us),
+            self._earth.declination_rad,
+            _known(s.fix_time_us),
+            sound,
+        )
         return NavState(
             time_us=time_us,
             q_nb=s.q_nb,
@@ -340,25 +346,9 @@ class PaperEstimator:
             attitude_std_rad=UNKNOWN_VEC3,
             vel_std_mps=UNKNOWN_VEC3,
             pos_std_m=UNKNOWN_VEC3,
-            flags=self._flags(time_us, sound),
+            flags=NavFlags(flags),
         )
 
-    def _flags(self, time_us: int, sound: bool) -> NavFlags:
-        s = self._s
-        flags = NavFlags(0)
-        if s.time_us is not None:
-            flags |= NavFlags.ATTITUDE_VALID
-        if s.mag_time_us is not None and time_us - s.mag_time_us < STALE_MAG_US:
-            flags |= NavFlags.USING_MAG
-            if math.isfinite(self._earth.declination_rad):
-                flags |= NavFlags.HEADING_VALID
-        if s.fix_time_us is not None:
-            age_us = time_us - s.fix_time_us
-            valid = NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
-            if age_us < POSITION_HOLD_US:
-                flags |= valid
-            fresh = age_us < STALE_GPS_US
-            flags |= NavFlags.USING_GPS if fresh else NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
-        if not sound:
-            flags |= NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
-        return flags
+
+def _known(time_us: int | None) -> int:
+    return kernels.NEVER if time_us is None else time_us

@@ -216,3 +216,49 @@ def test_reset_forgets() -> None:
     state = run(estimator, [imu(0)])
     assert math.isnan(state.lat_deg)
     assert state.q_nb == (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("blend", ["at_fix", "every_sample"])
+def test_a_whole_log_gives_the_same_bits(rng: np.random.Generator, blend: str) -> None:
+    """Noise, a gap, unsound and repeated samples, fixes with and without velocity."""
+    moments = [t for t in times(4.0) if not 1_500_000 < t < 2_300_000]
+    moments.insert(50, moments[49])
+    samples = [
+        ImuSample(
+            time_us=t,
+            accel_b_mps2=(math.nan, 0.0, 0.0) if k == 30 else (0.0, 0.0, -G),
+            gyro_b_radps=(0.0, 0.0, 0.0),
+            accel_lowpass_b_mps2=tuple(rng.normal((0.0, 0.0, -G), 2.0).tolist()),
+            gyro_highpass_b_radps=tuple(rng.normal(0.0, 1.0, 3).tolist()),
+            mag_b_ut=tuple(rng.normal(0.0, 30.0, 3).tolist()) if k % 3 == 0 else None,
+            temperature_degc=20.0,
+            flags=imu(0).flags,
+        )
+        for k, t in enumerate(moments)
+    ]
+    fixes = [
+        fix(t, north_m=t * 1e-5, vel=(math.nan,) * 3 if t == 900_000 else (9.0, 1.0, 0.2))
+        for t in range(300_000, 4_000_000, 200_000)
+    ]
+    reference = ReferenceSettings(gps_latency_s=0.1)
+    estimator = make(reference, blend=blend, alpha_accel=0.7, beta_velocity=0.4)
+    waiting, expected = list(fixes), []
+    for sample in samples:
+        while waiting and waiting[0].time_us <= sample.time_us:
+            estimator.update_gps(waiting.pop(0))
+        s = estimator.update_imu(sample)
+        expected.append((*s.q_nb, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps, float(s.flags)))
+    table = np.array(
+        [
+            (*s.accel_lowpass_b_mps2, *s.gyro_highpass_b_radps, *(s.mag_b_ut or (math.nan,) * 3))
+            for s in samples
+        ]
+    )
+    table[30, :6] = math.nan
+    found = estimator.run(np.array(moments), table, fixes)
+    np.testing.assert_array_equal(found, np.array(expected))
+
+
+def test_a_log_that_goes_back_is_refused() -> None:
+    with pytest.raises(ValueError, match="go back"):
+        make().run(np.array([2, 1]), np.zeros((2, 9)), [])

@@ -1,0 +1,69 @@
+"""One flight fused with every estimator: what all sections of a report start from."""
+
+from dataclasses import dataclass
+from typing import Final, get_args
+
+import msgspec
+
+from gateway.analysis.flight import Flight, FusionSettings, LocalFrame, Track, local_frame
+from gateway.analysis.fusion import Sensed, fuse, sense
+from gateway.estimation.select import EstimationSettings, EstimatorName
+
+ESTIMATORS: Final[tuple[str, ...]] = tuple(
+    name for name in get_args(EstimatorName) if name in EstimationSettings.__struct_fields__
+)
+"""Every estimator has a section of settings of its own name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A flight, the settings it is fused with, and what came out."""
+
+    flight: Flight
+    fusion: FusionSettings
+    sensed: Sensed
+    tracks: dict[str, Track]
+    """By estimator."""
+    frame: LocalFrame | None
+    """Metres about the first fix; None in a flight without GPS."""
+
+    @property
+    def chosen(self) -> str:
+        """The estimator that the settings name."""
+        return self.fusion.estimation.estimator
+
+    @property
+    def track(self) -> Track:
+        """The track of the chosen estimator."""
+        return self.tracks[self.chosen]
+
+    @property
+    def truth_name(self) -> str:
+        """What the reference is called in a legend."""
+        reference = self.flight.reference
+        return "truth" if reference is not None and reference.is_exact else "reference"
+
+
+def with_estimator(fusion: FusionSettings, name: str) -> FusionSettings:
+    """Choose another estimator."""
+    estimation = msgspec.structs.replace(fusion.estimation, estimator=name)
+    return msgspec.structs.replace(fusion, estimation=estimation)
+
+
+def make_case(flight: Flight, fusion: FusionSettings | None = None) -> Case:
+    """Fuse a flight with every estimator.
+
+    Parameters
+    ----------
+    flight : Flight
+    fusion : FusionSettings, optional
+        In place of the flight's own.
+
+    Returns
+    -------
+    Case
+    """
+    fusion = fusion or flight.fusion
+    sensed = sense(flight, fusion.sensing)
+    tracks = {name: fuse(flight, with_estimator(fusion, name), sensed) for name in ESTIMATORS}
+    return Case(flight, fusion, sensed, tracks, local_frame(flight))

@@ -1,0 +1,110 @@
+"""The two low-passes of the paper compared: by their design, and on a flight's acceleration."""
+
+import timeit
+from dataclasses import dataclass
+from typing import Final, get_args
+
+import numpy as np
+import pandas as pd
+from scipy import signal
+
+from gateway.analysis.flight import FloatArray
+from gateway.sensing.chain import SensingSettings
+from gateway.sensing.filters import Coefficients, Kind, VectorFilter, design_lowpass
+
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+PAPER_RATE_HZ: Final = 1000.0
+"""The paper's figures: order 2, 10 Hz cutoff at 1000 samples a second."""
+RESPONSE_POINTS: Final = 400
+STEP_S: Final = 0.5
+TIMED_SAMPLES: Final = 200_000
+TIMED_RUNS: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """Frequency response of one filter."""
+
+    kind: Kind
+    frequency_hz: FloatArray
+    gain_db: FloatArray
+    phase_deg: FloatArray
+    delay_ms: FloatArray
+    """Group delay."""
+
+
+def design(kind: Kind, settings: SensingSettings, rate_hz: float) -> Coefficients:
+    """Design the gateway's low-pass of one kind."""
+    return design_lowpass(kind, settings.accel_cutoff_hz, rate_hz, settings.chebyshev_ripple_db)
+
+
+def response(kind: Kind, settings: SensingSettings, rate_hz: float) -> Response:
+    """Compute the frequency response from a hundredth of the cutoff to half the sample rate."""
+    b, a = _polynomials(design(kind, settings, rate_hz))
+    low_hz = 0.01 * settings.accel_cutoff_hz
+    frequency = np.geomspace(low_hz, 0.499 * rate_hz, RESPONSE_POINTS)
+    _, h = signal.freqz(b, a, frequency, fs=rate_hz)
+    _, delay = signal.group_delay((b, a), frequency, fs=rate_hz)
+    return Response(
+        kind=kind,
+        frequency_hz=frequency,
+        gain_db=20.0 * np.log10(np.maximum(np.abs(h), 1e-12)),
+        phase_deg=np.degrees(np.unwrap(np.angle(h))),
+        delay_ms=1e3 * delay / rate_hz,
+    )
+
+
+def apply(kind: Kind, settings: SensingSettings, rate_hz: float, x: FloatArray) -> FloatArray:
+    """Filter an array of shape (N, 3) as the gateway does."""
+    finite = np.where(np.isfinite(x), x, 0.0)
+    low_pass = VectorFilter(lambda hz: design(kind, settings, hz), rate_hz)
+    return low_pass.run(finite)
+
+
+def compare(settings: SensingSettings, rate_hz: float) -> pd.DataFrame:
+    """Put the filters' properties side by side.
+
+    Returns
+    -------
+    DataFrame
+        One row a filter: ripple of the pass band, gain at the cutoff and at three times the
+        cutoff, group delay at 0 Hz and its maximum, overshoot of a step, time a sample.
+    """
+    return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
+
+
+def _properties(kind: Kind, settings: SensingSettings, rate_hz: float) -> dict[str, object]:
+    found = response(kind, settings, rate_hz)
+    cutoff = settings.accel_cutoff_hz
+    passed = found.gain_db[found.frequency_hz <= cutoff]
+    # The Butterworth gain falls steadily: only what rises again is ripple.
+    ripple_db = float(np.max(np.maximum.accumulate(passed[::-1])[::-1] - passed[0]))
+    steps = np.ones((round(STEP_S * rate_hz), 3))
+    steps[0] = 0.0
+    risen = apply(kind, settings, rate_hz, steps)[:, 0]
+    return {
+        "filter": kind,
+        "ripple, dB": max(ripple_db, 0.0),
+        "gain at cutoff, dB": float(np.interp(cutoff, found.frequency_hz, found.gain_db)),
+        "gain at 3 x cutoff, dB": float(np.interp(3 * cutoff, found.frequency_hz, found.gain_db)),
+        "delay at 0 Hz, ms": float(found.delay_ms[0]),
+        "greatest delay, ms": float(found.delay_ms.max()),
+        "step overshoot, %": 100.0 * float(risen.max() - 1.0),
+        "time a sample, ns": _time_ns(kind, settings, rate_hz),
+    }
+
+
+def _time_ns(kind: Kind, settings: SensingSettings, rate_hz: float) -> float:
+    """Measure the time a sample on three axes takes, best of some runs."""
+    x = np.zeros((TIMED_SAMPLES, 3))
+    low_pass = VectorFilter(lambda hz: design(kind, settings, hz), rate_hz)
+    low_pass.run(x)
+    return (
+        1e9
+        / TIMED_SAMPLES
+        * min(timeit.repeat(lambda: low_pass.run(x), number=1, repeat=TIMED_RUNS))
+    )
+
+
+def _polynomials(c: Coefficients) -> tuple[FloatArray, FloatArray]:
+    return np.array(c[:3]), np.array([1.0, c[3], c[4]])

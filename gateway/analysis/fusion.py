@@ -1,0 +1,166 @@
+"""A flight fused again, with any settings: the same code as live, over arrays where it can."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gateway.analysis.flight import (
+    Flight,
+    FloatArray,
+    FusionSettings,
+    Track,
+    track_of_states,
+)
+from gateway.estimation.columns import (
+    ACCEL,
+    CLIP_FLAGS,
+    CLIPPED,
+    GPS_COLUMNS,
+    GYRO,
+    IMU_COLUMNS,
+    MAG,
+    NAV_ALT,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_QUAT,
+    NAV_VEL,
+    GpsRow,
+)
+from gateway.estimation.interface import Estimator
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.paper import PaperEstimator
+from gateway.estimation.select import make_estimator
+from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings, SensorChain
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """A flight's samples behind the gateway's filters."""
+
+    samples: tuple[ImuSample, ...]
+    table: FloatArray
+    """The same, shape (N, 9), as `gateway.estimation.paper_kernels` takes it: specific force and
+    rate behind their filters, NaN where the unfiltered sample is not sound; magnetic field."""
+
+
+def sense(flight: Flight, settings: SensingSettings) -> Sensed:
+    """Filter a flight's samples as the gateway does live."""
+    chain = SensorChain(settings, NodeCalibration())
+    has_mag: list[bool] = np.asarray(np.isfinite(flight.mag_b_ut).all(axis=1)).tolist()
+    columns = zip(
+        flight.time_us.tolist(),
+        map(tuple, flight.accel_b_mps2.tolist()),
+        map(tuple, flight.gyro_b_radps.tolist()),
+        map(tuple, flight.mag_b_ut.tolist()),
+        has_mag,
+        flight.flags.tolist(),
+        strict=True,
+    )
+    samples = tuple(
+        chain.imu_si(time_us, accel, gyro, mag if new else None, NAN, ImuFlags(flags))
+        for time_us, accel, gyro, mag, new, flags in columns
+    )
+    table = np.column_stack(
+        [
+            np.array([s.accel_lowpass_b_mps2 for s in samples]),
+            np.array([s.gyro_highpass_b_radps for s in samples]),
+            flight.mag_b_ut,
+        ]
+    )
+    unsound = ~(np.isfinite(flight.accel_b_mps2) & np.isfinite(flight.gyro_b_radps)).all(axis=1)
+    table[unsound, :6] = np.nan
+    return Sensed(samples, table)
+
+
+def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> Track:
+    """Fuse a flight with the estimator that the settings name.
+
+    Parameters
+    ----------
+    flight : Flight
+        Its fixes and barometer samples enter at their arrival, before the IMU sample that is not
+        earlier.
+    settings : FusionSettings
+        Filters and estimator.
+    sensed : Sensed, optional
+        What `sense` gave for the same filters, to save doing it again.
+
+    Returns
+    -------
+    Track
+        One row per IMU sample.
+    """
+    estimator = make_estimator(settings.estimation)
+    if isinstance(estimator, KernelEstimator):
+        return _fuse_at_once(flight, estimator)
+    if sensed is None:
+        sensed = sense(flight, settings.sensing)
+    if isinstance(estimator, PaperEstimator) and not np.any(np.diff(flight.time_us) < 0):
+        out = estimator.run(flight.time_us, sensed.table, flight.fixes)
+        return _track(flight, out[:, :4], out[:, 4:7], out[:, 7:10], out[:, 10])
+    return _fuse_by_sample(flight, estimator, sensed)
+
+
+def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog:
+    """Lay a flight out for the compiled estimators."""
+    imu = np.zeros((len(flight.time_us), IMU_COLUMNS))
+    imu[:, ACCEL : ACCEL + 3] = flight.accel_b_mps2
+    imu[:, GYRO : GYRO + 3] = flight.gyro_b_radps
+    imu[:, MAG : MAG + 3] = flight.mag_b_ut
+    imu[:, CLIPPED] = (flight.flags & int(CLIP_FLAGS)) != 0
+    rows = np.array([fix_row(fix) for fix in flight.fixes], np.float64)
+    return SampleLog(
+        imu_time_us=flight.time_us,
+        imu=imu,
+        baro_time_us=flight.baro_time_us,
+        baro_alt_m=flight.baro_alt_m,
+        gps_time_us=np.array([fix.time_us for fix in flight.fixes], np.int64),
+        gps=rows.reshape(-1, GPS_COLUMNS),
+    )
+
+
+def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> Track:
+    out = estimator.run(sample_log(flight, estimator.fix_row))
+    return _track(
+        flight,
+        out[:, NAV_QUAT : NAV_QUAT + 4],
+        out[:, NAV_LAT : NAV_ALT + 1],
+        out[:, NAV_VEL : NAV_VEL + 3],
+        out[:, NAV_FLAGS],
+    )
+
+
+def _track(
+    flight: Flight, q_nb: FloatArray, place: FloatArray, vel: FloatArray, flags: FloatArray
+) -> Track:
+    track = Track(flight.time_us, q_nb, place[:, 0], place[:, 1], place[:, 2], vel)
+    return track.where_valid(flags.astype(np.int64))
+
+
+def _fuse_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> Track:
+    others: list[BaroSample | GpsFix] = [
+        *flight.fixes,
+        *(
+            BaroSample(time_us, NAN, NAN, alt_m)
+            for time_us, alt_m in zip(
+                flight.baro_time_us.tolist(), flight.baro_alt_m.tolist(), strict=True
+            )
+        ),
+    ]
+    others.sort(key=lambda record: record.time_us)
+    waiting = iter(others)
+    record = next(waiting, None)
+    states = []
+    for sample in sensed.samples:
+        while record is not None and record.time_us <= sample.time_us:
+            if isinstance(record, GpsFix):
+                estimator.update_gps(record)
+            else:
+                estimator.update_baro(record)
+            record = next(waiting, None)
+        states.append(estimator.update_imu(sample))
+    return track_of_states(states)

@@ -1,0 +1,120 @@
+"""Errors of an estimate against a reference: angles and metres, as arrays over time."""
+
+import numpy as np
+
+from gateway.analysis.flight import FloatArray, Track
+from gateway.geometry.geodesy import radii_m
+
+
+def rms(values: FloatArray) -> float:
+    """Root of the mean square of the known values; NaN if none is known."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
+
+
+def mean_abs(values: FloatArray) -> float:
+    """Mean size of the known values; NaN if none is known."""
+    known = values[np.isfinite(values)]
+    return float(np.mean(np.abs(known))) if len(known) else float("nan")
+
+
+def worst(values: FloatArray) -> float:
+    """Greatest size among the known values; NaN if none is known."""
+    known = values[np.isfinite(values)]
+    return float(np.max(np.abs(known))) if len(known) else float("nan")
+
+
+def rotation_error(q_nb: FloatArray, reference_q_nb: FloatArray) -> FloatArray:
+    """Find the rotation in NED from the reference to the estimate: `q * conj(reference)`.
+
+    Parameters
+    ----------
+    q_nb, reference_q_nb : ndarray, shape (N, 4)
+        Attitudes, scalar first.
+
+    Returns
+    -------
+    ndarray, shape (N, 4)
+        Quaternions with a scalar part of at least 0.
+    """
+    pw, px, py, pz = q_nb.T
+    w, x, y, z = reference_q_nb.T
+    error = np.column_stack(
+        [
+            pw * w + px * x + py * y + pz * z,
+            px * w - pw * x - py * z + pz * y,
+            py * w - pw * y + px * z - pz * x,
+            pz * w - pw * z - px * y + py * x,
+        ]
+    )
+    return np.where(error[:, :1] < 0.0, -error, error)
+
+
+def total_error_rad(error: FloatArray) -> FloatArray:
+    """Angle of a rotation error of shape (N, 4)."""
+    return np.asarray(2.0 * np.arctan2(np.linalg.norm(error[:, 1:], axis=1), error[:, 0]))
+
+
+def heading_error_rad(error: FloatArray) -> FloatArray:
+    """Part of a rotation error about the vertical, signed, clockwise from above positive."""
+    return np.asarray(2.0 * np.arctan2(error[:, 3], error[:, 0]))
+
+
+def inclination_error_rad(error: FloatArray) -> FloatArray:
+    """Part of a rotation error about a horizontal axis; at least 0."""
+    return np.asarray(
+        2.0 * np.arctan2(np.hypot(error[:, 1], error[:, 2]), np.hypot(error[:, 0], error[:, 3]))
+    )
+
+
+def euler_rad(q_nb: FloatArray) -> FloatArray:
+    """Split attitudes into roll, pitch and yaw, shape (N, 3): eq. 16, corrected."""
+    w, x, y, z = q_nb.T
+    return np.column_stack(
+        [
+            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        ]
+    )
+
+
+def wrap_pi(angle_rad: FloatArray) -> FloatArray:
+    """Bring angles into [-pi, pi)."""
+    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def position_error_m(track: Track, reference: Track) -> FloatArray:
+    """Displacement from the reference to the estimate, shape (N, 3): north, east, up."""
+    known = np.isfinite(reference.lat_deg)
+    if not known.any():
+        return np.full((len(track.lat_deg), 3), np.nan)
+    first = int(np.argmax(known))
+    meridian, parallel = radii_m(
+        float(reference.lat_deg[first]), float(np.nan_to_num(reference.alt_amsl_m[first]))
+    )
+    east_deg = (track.lon_deg - reference.lon_deg + 180.0) % 360.0 - 180.0
+    return np.column_stack(
+        [
+            np.radians(track.lat_deg - reference.lat_deg) * meridian,
+            np.radians(east_deg) * parallel,
+            track.alt_amsl_m - reference.alt_amsl_m,
+        ]
+    )
+
+
+def errors_over_time(track: Track, reference: Track) -> dict[str, FloatArray]:
+    """Compute every error at every sample, in the units that their names tell."""
+    turned = rotation_error(track.q_nb, reference.q_nb)
+    angles = np.degrees(wrap_pi(euler_rad(track.q_nb) - euler_rad(reference.q_nb)))
+    place = position_error_m(track, reference)
+    return {
+        "roll_deg": angles[:, 0],
+        "pitch_deg": angles[:, 1],
+        "yaw_deg": angles[:, 2],
+        "tilt_deg": np.degrees(inclination_error_rad(turned)),
+        "heading_deg": np.degrees(heading_error_rad(turned)),
+        "horizontal_m": np.hypot(place[:, 0], place[:, 1]),
+        "height_m": place[:, 2],
+        "speed_mps": np.linalg.norm(track.vel_n_mps - reference.vel_n_mps, axis=1),
+    }

@@ -1,0 +1,85 @@
+"""`mavgate report`: figures and tables of a flight as one page."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from gateway.cli.errors import refuse
+from gateway.cli.loading import (
+    FlightArgument,
+    Loading,
+    ReferenceOption,
+    SystemOption,
+    fusion_of,
+    load_flight,
+)
+from gateway.cli.recording_files import ColumnsOption, SettingsOption
+from gateway.cli.run import ConfigOption, load_settings, or_refuse
+
+NEEDED: Final = ("jinja2", "matplotlib", "pandas")
+
+OutputOption = Annotated[
+    Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(report)
+
+
+def report(
+    flight: FlightArgument = None,
+    *,
+    output: OutputOption = Path("report"),
+    against: Annotated[
+        Path | None, typer.Option("--against", help="Another recording to compare with.")
+    ] = None,
+    against_config: Annotated[
+        Path | None, typer.Option("--against-config", help="Other settings to compare with.")
+    ] = None,
+    reference: ReferenceOption = None,
+    columns: ColumnsOption = None,
+    system: SystemOption = None,
+    settings: SettingsOption = "recorded",
+    config: ConfigOption = None,
+) -> None:
+    """Make a page of figures and tables of a flight: the paper's own, and more.
+
+    Without a flight the built-in simulated one is taken.
+    """
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        refuse(f"a report needs {' and '.join(missing)}: install mavgate[plot]")
+    # These need what may be missing, and take a second to load.
+    from gateway.analysis.case import make_case
+    from gateway.analysis.page import count_pictures, write_report
+    from gateway.analysis.report import make_report
+
+    loading = Loading(
+        or_refuse(lambda: load_settings(config)), settings, columns, system, reference
+    )
+    loaded = load_flight(flight, loading)
+    other = loaded if against is None else load_flight(against, replace(loading, reference=None))
+    others = None
+    if against_config is not None:
+        others = fusion_of(or_refuse(lambda: load_settings(against_config)))
+    with _progress() as progress:
+        task = progress.add_task("fusing", total=None)
+        case = make_case(loaded)
+        compared = make_case(other, others) if other is not loaded or others else None
+        progress.update(task, description="measuring")
+        made = make_report(case, compared)
+        progress.update(task, description="drawing", total=count_pictures(made.sections))
+        page = write_report(made, output, lambda: progress.advance(task))
+    print(page)
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)

@@ -1,0 +1,75 @@
+import msgspec
+import numpy as np
+import pytest
+
+from gateway.analysis.case import ESTIMATORS, with_estimator
+from gateway.analysis.flight import Track
+from gateway.analysis.fusion import fuse, sense
+from gateway.analysis.metrics import position_error_m, rms
+from gateway.estimation.select import make_estimator
+from gateway.records import BaroSample, NavFlags
+from tests.analysis.flights import short_case, short_flight
+
+
+def test_sensing_gives_the_chains_samples() -> None:
+    flight, sensed = short_flight(), short_case().sensed
+    assert len(sensed.samples) == len(flight.time_us)
+    assert sensed.table[:, 6:] == pytest.approx(flight.mag_b_ut, nan_ok=True)
+    assert sensed.table[5, :3] == pytest.approx(sensed.samples[5].accel_lowpass_b_mps2)
+    noisy = np.diff(flight.accel_b_mps2, axis=0).std()
+    assert np.diff(sensed.table[:, :3], axis=0).std() < 0.7 * noisy
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_whole_flight_at_once_equals_sample_by_sample(name: str) -> None:
+    flight, case = short_flight(), short_case()
+    estimator = make_estimator(with_estimator(case.fusion, name).estimation)
+    baros = [
+        BaroSample(time_us, np.nan, np.nan, alt_m)
+        for time_us, alt_m in zip(
+            flight.baro_time_us.tolist(), flight.baro_alt_m.tolist(), strict=True
+        )
+    ]
+    fixes = list(flight.fixes)
+    for k, sample in enumerate(case.sensed.samples[:1500]):
+        # Between two IMU samples the barometer comes first, as in a log that is run at once.
+        while baros and baros[0].time_us <= sample.time_us:
+            estimator.update_baro(baros.pop(0))
+        while fixes and fixes[0].time_us <= sample.time_us:
+            estimator.update_gps(fixes.pop(0))
+        state = estimator.update_imu(sample)
+        if k % 300 == 299:
+            track, valid = case.tracks[name], NavFlags.POSITION_VALID in state.flags
+            assert state.q_nb == tuple(track.q_nb[k])
+            assert np.isfinite(track.lat_deg[k]) == valid
+            if valid:
+                assert (state.lat_deg, state.lon_deg) == (track.lat_deg[k], track.lon_deg[k])
+                assert state.vel_n_mps == tuple(track.vel_n_mps[k])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_fused_track_is_near_the_truth(name: str) -> None:
+    flight = short_flight()
+    assert flight.reference is not None
+    error = position_error_m(short_case().tracks[name], flight.reference.track)[flight.scored]
+    assert rms(np.hypot(error[:, 0], error[:, 1])) < 4.0
+
+
+def test_what_an_estimator_does_not_vouch_for_is_not_known() -> None:
+    track: Track = short_case().tracks["paper"]
+    first_s = short_flight().seconds(
+        np.array([f.time_us for f in short_flight().fixes if f.fix_ok])
+    )
+    unknown = short_flight().time_s < first_s[0]
+    assert np.isnan(track.lat_deg[unknown]).all()
+    assert np.isfinite(track.lat_deg[~unknown]).all()
+
+
+def test_another_cutoff_gives_another_track() -> None:
+    flight, case = short_flight(), short_case()
+    sensing = msgspec.structs.replace(case.fusion.sensing, accel_cutoff_hz=2.0)
+    settings = msgspec.structs.replace(with_estimator(case.fusion, "paper"), sensing=sensing)
+    changed = fuse(flight, settings)
+    assert not np.array_equal(changed.q_nb, case.tracks["paper"].q_nb)
+    same = fuse(flight, settings, sense(flight, sensing))
+    np.testing.assert_array_equal(changed.q_nb, same.q_nb)

@@ -1,0 +1,41 @@
+"""Table I on a real fixed-wing flight with its GPS thinned to one fix a second."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from gateway.analysis.blending import blend_table, grows
+from gateway.analysis.flight import FusionSettings
+from gateway.analysis.fusion import sense
+from gateway.analysis.sources import flight_of_rows
+from gateway.analysis.sweep import with_value
+from gateway.edges.flight_files import read_chunks
+from gateway.flightlog.foreign import ColumnMap, ForeignReader
+from gateway.sensing.calibration import NodeCalibration
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
+    text = b"".join(read_chunks(data_dir / "arduplane_testlog2.csv.gz")).decode()
+    columns = msgspec.toml.decode(
+        (ROOT / "config/columns/tracker-log.toml").read_bytes(), type=ColumnMap
+    )
+    fusion = FusionSettings()
+    for name, value in (
+        ("gps_latency_s", 0.28), ("declination", "fixed"), ("declination_deg", 11.0)
+    ):  # fmt: skip
+        fusion = with_value(fusion, f"estimation.reference.{name}", value)
+    flight = flight_of_rows(
+        ForeignReader(columns).rows(text.splitlines()),
+        NodeCalibration(), fusion, name="arduplane", story="",
+    )  # fmt: skip
+    table = blend_table(flight, fusion, sense(flight, fusion.sensing), 1.0)
+    for error in ("north_m", "east_m", "held_m"):
+        assert grows(table, error)
+    assert np.argmin(table["held_m"]) == 0
+    assert table.iloc[0]["north_m"] < 2.5

@@ -1,0 +1,100 @@
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.analysis.case import make_case
+from gateway.analysis.flight import Track, fixes_of
+from gateway.analysis.report import make_report
+from gateway.analysis.sources import at_times, flight_of_rows, ideal_calibration, judged_by
+from gateway.estimation.select import make_estimator
+from gateway.flightlog.row import TableRow
+from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensorChain
+from gateway.simulator.flight import SimulatedFlight, fly
+from gateway.simulator.settings import SimulatorSettings
+from tests.analysis.flights import short_case, short_flight
+
+SIMULATED: SimulatedFlight = fly(
+    SimulatorSettings(imu_rate_hz=50, gps_outages_s=((40.0, 3.0),)), duration_s=30.0
+)
+
+
+def rows(*, raw: bool) -> Iterator[TableRow]:
+    """What the recorder would have written, with states."""
+    fusion = short_case().fusion
+    chain = SensorChain(fusion.sensing, ideal_calibration(SIMULATED))
+    estimator = make_estimator(fusion.estimation)
+    for record in SIMULATED.records():
+        match record:
+            case ImuRaw():
+                sample = chain.imu(record)
+                state = estimator.update_imu(sample)
+                calibrated = ImuCalibrated(
+                    sample.time_us, record.node, sample.accel_b_mps2, sample.gyro_b_radps,
+                    sample.mag_b_ut, sample.temperature_degc, sample.flags,
+                )  # fmt: skip
+                yield TableRow(
+                    record.time_us, raw=record if raw else None, imu=calibrated, state=state
+                )
+            case BaroRaw():
+                estimator.update_baro(chain.baro(record))
+                yield TableRow(record.time_us, baro=record)
+            case GpsFix():
+                estimator.update_gps(record)
+                yield TableRow(record.time_us, gps=record)
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
+    flight = flight_of_rows(
+        rows(raw=raw), ideal_calibration(SIMULATED), short_case().fusion, name="a", story=""
+    )
+    live = short_flight()
+    count = len(flight.time_us)
+    np.testing.assert_array_equal(flight.accel_b_mps2, live.accel_b_mps2[:count])
+    np.testing.assert_array_equal(flight.mag_b_ut, live.mag_b_ut[:count])
+    assert len(fixes_of(flight)) > 100
+    assert (flight.node_time_us is not None) == raw
+    assert flight.recorded is not None
+    assert flight.recorded.lat_deg[-1] == pytest.approx(short_case().track.lat_deg[count - 1])
+
+
+def test_a_recording_without_reference_still_has_its_report() -> None:
+    flight = flight_of_rows(
+        rows(raw=False), NodeCalibration(), short_case().fusion, name="log.csv", story="A log."
+    )
+    assert flight.reference is None
+    report = make_report(make_case(flight))
+    titles = [section.title for section in report.sections]
+    assert "Estimators compared" in titles
+    assert "Timing and loss" not in titles
+    assert "recorded in flight" in report.sections[1].tables[0].frame["estimator"].tolist()
+
+
+def test_other_states_can_be_the_reference() -> None:
+    plain = replace(short_flight(), reference=None)
+    judged = judged_by(plain, rows(raw=False), "ref.csv")
+    assert judged.reference is not None
+    assert not judged.reference.is_exact
+    assert "ref.csv" in judged.reference.story
+    known = np.isfinite(judged.reference.track.lat_deg)
+    assert 20.0 < known.sum() / 50.0 < 30.0
+
+
+def test_a_reference_without_states_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"ref\.csv: holds no states"):
+        judged_by(short_flight(), [TableRow(0)], "ref.csv")
+
+
+def test_the_nearest_row_is_taken_if_it_is_near() -> None:
+    time_us = np.array([0, 100_000, 400_000])
+    values = np.array([1.0, 2.0, 3.0])
+    track = Track(
+        time_us, np.outer(values, [1, 0, 0, 0]), values, values, values, np.outer(values, [1, 1, 1])
+    )
+    found = at_times(track, np.array([10_000, 60_000, 200_000, 399_000, 500_000]))
+    assert found.lat_deg == pytest.approx([1.0, 2.0, np.nan, 3.0, np.nan], nan_ok=True)
+    assert found.vel_n_mps[3].tolist() == [3.0, 3.0, 3.0]
