@@ -23,13 +23,18 @@ from gateway.flightlog.row import TableRow
 from gateway.records import ImuCalibrated, NavState, RawRecord
 from gateway.replay import records_of
 from gateway.sensing.calibration import NodeCalibration
-from gateway.simulator.flight import SimulatedFlight, fly
+from gateway.simulator.flight import Aircraft
+from gateway.simulator.receiver import simulate
+from gateway.simulator.sensors import SensorErrors
 from gateway.simulator.settings import SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S
+from gateway.simulator.trajectory import FLIGHT_S, Trajectory
+from gateway.units import US_PER_S
+from gateway.wire.link import Link
 
 SIMULATED_STORY: Final = (
     "The built-in simulated flight of a small fixed-wing aircraft, 218 s like the paper's own: "
-    "rest, take-off, a circuit with a figure of eight, landing. GPS is lost for 10 s and for 3 s."
+    "rest, take-off, a circuit with a figure of eight, landing. GPS is lost for 10 s and for 3 s, "
+    "and some payloads are lost on the radio."
 )
 TRUTH_STORY: Final = "the simulation's exact truth"
 NEAR_US: Final = 50_000
@@ -56,24 +61,32 @@ def simulated_flight(
     Flight
         With exact truth as its reference.
     """
-    simulated = fly(settings or SimulatorSettings(), duration_s=duration_s)
+    settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
+    aircraft = Aircraft(settings)
     flight = flight_of_records(
-        simulated.records(),
-        ideal_calibration(simulated),
+        _received(settings, duration_s),
+        ideal_calibration(aircraft.errors),
         name="simulated flight",
         story=SIMULATED_STORY,
-        fusion=_with_latency(fusion or FusionSettings(), simulated.settings.gps_latency_s),
+        fusion=_with_latency(fusion or FusionSettings(), settings.gps_latency_s),
     )
-    return replace(flight, reference=_truth_of(simulated, flight))
+    return replace(flight, reference=_truth_of(aircraft.trajectory, flight))
 
 
-def ideal_calibration(simulated: SimulatedFlight) -> NodeCalibration:
+def _received(settings: SimulatorSettings, duration_s: float) -> Iterator[RawRecord]:
+    """Let the nodes' payloads go by radio and serial line, with losses and jitter, as live."""
+    link = Link()
+    for frame in simulate(settings).frames(duration_s):
+        yield from link.feed(frame.data, round(frame.time_s * US_PER_S))
+
+
+def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
     """Tell the calibration that undoes the simulated sensors' constant errors."""
-    return msgspec.convert(simulated.errors, NodeCalibration, from_attributes=True)
+    return msgspec.convert(errors, NodeCalibration, from_attributes=True)
 
 
-def _truth_of(simulated: SimulatedFlight, flight: Flight) -> Reference:
-    truth = simulated.trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
+def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
+    truth = trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
     track = Track(
         time_us=flight.time_us,
         q_nb=truth.q_nb,

@@ -6,6 +6,7 @@ import pytest
 
 from gateway.analysis.case import make_case
 from gateway.analysis.flight import Track, fixes_of
+from gateway.analysis.fusion import fuse
 from gateway.analysis.report import make_report
 from gateway.analysis.sources import at_times, flight_of_rows, ideal_calibration, judged_by
 from gateway.estimation.select import make_estimator
@@ -25,7 +26,7 @@ SIMULATED: SimulatedFlight = fly(
 def rows(*, raw: bool) -> Iterator[TableRow]:
     """What the recorder would have written, with states."""
     fusion = short_case().fusion
-    chain = SensorChain(fusion.sensing, ideal_calibration(SIMULATED))
+    chain = SensorChain(fusion.sensing, ideal_calibration(SIMULATED.errors))
     estimator = make_estimator(fusion.estimation)
     for record in SIMULATED.records():
         match record:
@@ -50,16 +51,26 @@ def rows(*, raw: bool) -> Iterator[TableRow]:
 @pytest.mark.parametrize("raw", [True, False])
 def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
     flight = flight_of_rows(
-        rows(raw=raw), ideal_calibration(SIMULATED), short_case().fusion, name="a", story=""
+        rows(raw=raw), ideal_calibration(SIMULATED.errors), short_case().fusion, name="a", story=""
     )
-    live = short_flight()
-    count = len(flight.time_us)
-    np.testing.assert_array_equal(flight.accel_b_mps2, live.accel_b_mps2[:count])
-    np.testing.assert_array_equal(flight.mag_b_ut, live.mag_b_ut[:count])
+    chain = SensorChain(flight.fusion.sensing, ideal_calibration(SIMULATED.errors))
+    samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
+    assert flight.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
+    assert np.isfinite(flight.mag_b_ut[:, 0]).tolist() == [s.mag_b_ut is not None for s in samples]
     assert len(fixes_of(flight)) > 100
     assert (flight.node_time_us is not None) == raw
     assert flight.recorded is not None
-    assert flight.recorded.lat_deg[-1] == pytest.approx(short_case().track.lat_deg[count - 1])
+    again = fuse(flight, flight.fusion)
+    assert flight.recorded.lat_deg[-1] == pytest.approx(again.lat_deg[-1], abs=1e-9)
+
+
+def test_the_simulated_flight_comes_over_the_radio() -> None:
+    flight = short_flight()
+    assert flight.node_time_us is not None
+    lost = np.rint(np.diff(flight.node_time_us) / 20_000) - 1
+    assert 0 < lost.sum() < 0.05 * len(lost)
+    jitter_us = np.diff(flight.time_us) - np.diff(flight.node_time_us)
+    assert 0.0 < jitter_us.std() < 2_000.0
 
 
 def test_a_recording_without_reference_still_has_its_report() -> None:

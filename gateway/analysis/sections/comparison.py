@@ -14,6 +14,7 @@ from gateway.analysis.summary import changed_settings, summarise
 
 SAME_PLACE_DEG: Final = 0.5
 """Flights further apart do not fit on one map."""
+NAMES: Final = ("A", "B")
 COLOURS: Final = (style.BLUE, style.RED)
 
 
@@ -30,7 +31,21 @@ def comparison(a: Case, b: Case) -> Section:
     Section
     """
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
-    names = ("A", "B")
+    what = "the same flight with other settings" if same else b.flight.name
+    lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."
+    pictures = [_difference(a, b) if same else _profiles(a, b)]
+    if _on_one_map(a, b):
+        pictures.append(
+            Picture(
+                "comparison_map",
+                lambda width: _draw_map(a, b, width),
+                "Both fused tracks from above.",
+            )
+        )
+    return Section("Comparison", lead, pictures, _tables(a, b))
+
+
+def _tables(a: Case, b: Case) -> list[Table]:
     first, second = summarise(a), summarise(b)
     rows = [
         {"": key, "A": first.get(key, np.nan), "B": second.get(key, np.nan)}
@@ -39,39 +54,26 @@ def comparison(a: Case, b: Case) -> Section:
     numbers = pd.DataFrame(rows)
     numbers["B − A"] = numbers["B"] - numbers["A"]
     tables = [Table("comparison", numbers, "Both in numbers, and B less A.")]
-    changes = changed_settings(a.fusion, b.fusion)
-    if changes:
+    if changes := changed_settings(a.fusion, b.fusion):
         settings = pd.DataFrame(changes, columns=["setting", "A", "B"]).astype(str)
         tables.append(Table("comparison_settings", settings, "Settings that differ."))
-    pictures = []
-    if same:
-        what = "the same flight with other settings"
-        pictures.append(
-            Picture(
-                "comparison_difference",
-                lambda width: _draw_difference(a, b, width),
-                "How far the two fused tracks are apart at each moment.",
-            )
-        )
-    else:
-        what = f"{b.flight.name}, fused by `{b.chosen}`"
-        pictures.append(
-            Picture(
-                "comparison_profiles",
-                lambda width: _draw_profiles(a, b, names, width),
-                "Height above the start and ground speed of both flights, each from its own start.",
-            )
-        )
-    if _on_one_map(a, b):
-        pictures.append(
-            Picture(
-                "comparison_map",
-                lambda width: _draw_map(a, b, names, width),
-                "Both fused tracks from above.",
-            )
-        )
-    lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}."
-    return Section("Comparison", lead, pictures, tables)
+    return tables
+
+
+def _difference(a: Case, b: Case) -> Picture:
+    return Picture(
+        "comparison_difference",
+        lambda width: _draw_difference(a, b, width),
+        "How far the two fused tracks are apart at each moment.",
+    )
+
+
+def _profiles(a: Case, b: Case) -> Picture:
+    return Picture(
+        "comparison_profiles",
+        lambda width: _draw_profiles(a, b, width),
+        "Height above the start and ground speed of both flights, each from its own start.",
+    )
 
 
 def _on_one_map(a: Case, b: Case) -> bool:
@@ -96,9 +98,9 @@ def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:
     return figure
 
 
-def _draw_profiles(a: Case, b: Case, names: tuple[str, str], width_in: float) -> Figure:
+def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
     figure, (above, below) = style.panels(width_in, 2, 2.0)
-    for case, name, colour in zip((a, b), names, COLOURS, strict=True):
+    for case, name, colour in zip((a, b), NAMES, COLOURS, strict=True):
         track, scored = case.track, case.flight.scored
         alt = np.where(scored, track.alt_amsl_m, np.nan)
         known = alt[np.isfinite(alt)]
@@ -112,11 +114,11 @@ def _draw_profiles(a: Case, b: Case, names: tuple[str, str], width_in: float) ->
     return figure
 
 
-def _draw_map(a: Case, b: Case, names: tuple[str, str], width_in: float) -> Figure:
+def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
     figure = Figure(figsize=(width_in, min(0.7 * width_in, 4.6)))
     axes = figure.subplots()
     frame = a.frame
-    for case, name, colour, width in zip((a, b), names, COLOURS, (2.6, 1.0), strict=True):
+    for case, name, colour, width in zip((a, b), NAMES, COLOURS, (2.6, 1.0), strict=True):
         if frame is not None:
             place = frame.place(case.track.lat_deg, case.track.lon_deg)
             step = max(1, len(place) // 4000)
