@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -44,7 +44,7 @@ from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry import Telemetry
 from gateway.vehicle.timing import TimingService
 
-OWN_SECTION = "vehicle"
+OWN_SECTION: Final = "vehicle"
 
 
 class Service(Protocol):
