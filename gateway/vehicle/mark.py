@@ -14,6 +14,7 @@ from gateway.records import NAN, NavState
 from gateway.vehicle import fields
 from gateway.vehicle.home import Place
 from gateway.vehicle.mission_items import Item
+from gateway.vehicle.place import is_on_earth
 
 
 class Mark:
@@ -60,7 +61,7 @@ class Mark:
             Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
             None without a mark or a position.
         """
-        if self.place is None or not math.isfinite(state.lat_deg + state.lon_deg):
+        if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
         distance_m, bearing_deg = vincenty.vdist(
             state.lat_deg, state.lon_deg, self.place.lat_deg, self.place.lon_deg
