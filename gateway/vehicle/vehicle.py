@@ -255,7 +255,13 @@ class Vehicle:
         self.health.recording = recording
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
-        """Mark a place (its height may be NaN), or clear the mark."""
+        """Mark a place (its height may be NaN), or clear the mark.
+
+        Raises
+        ------
+        ValueError
+            If it is no place on earth.
+        """
         return self._finish(self.places.put_mark(place, now_us), now_us)
 
     def say(self, text: Told, now_us: int) -> list[Action]:
