@@ -6,8 +6,9 @@ immutable bytes and hands back a result; nothing is shared, so there is nothing 
 is at work the event loop gathers the next bytes, up to a bound.
 
 Every `flush_s` the gathered bytes go to the kernel, which survives the death of the gateway; every
-`sync_s` the kernel is made to put them on the disk, which survives the loss of power. A sync at
-each flush would wear cards out and lets none of them keep up.
+`sync_s` the kernel is made to put them on the disk, which survives the loss of power. By default
+both are half a second, so that either costs less than a second; a card that is worn by this may be
+synced less often.
 """
 
 import asyncio
@@ -33,7 +34,7 @@ from gateway.flightlog.session import (
     SessionState,
 )
 from gateway.flightlog.stamps import CivilClock, Stamper
-from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_mark
+from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_header, encode_mark
 from gateway.flightlog.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, GpsFix
 from gateway.units import US_PER_S
@@ -229,11 +230,18 @@ class Recorder:
             self._write_rows(self._part, vehicle_id, rows.add(record))
         self._seen.add(vehicle_id)
 
+    def settings_changed(self, vehicle_id: int) -> None:
+        """Note that what comes is fused with other settings, which a new head tells."""
+        if self._part is not None and vehicle_id in self._part.tables:
+            self._write_rows(self._part, vehicle_id, self._rows[vehicle_id].flush())
+            head = encode_header(self._head(vehicle_id, self._part))
+            self._part.add(_table(vehicle_id), head.encode())
+
     def _write_rows(self, part: _Part, vehicle_id: int, rows: list[TableRow]) -> None:
         ending = _table(vehicle_id)
         if vehicle_id not in part.tables:
             part.tables.add(vehicle_id)
-            part.add(ending, self._head(vehicle_id, part).encode())
+            part.add(ending, encode_head(self._head(vehicle_id, part)).encode())
         for row in rows:
             part.add(ending, row_to_line(row).encode())
 
@@ -242,19 +250,17 @@ class Recorder:
             self._write_rows(part, vehicle_id, rows.flush())
         self._rows.clear()
 
-    def _head(self, vehicle_id: int, part: _Part) -> str:
+    def _head(self, vehicle_id: int, part: _Part) -> TableHeader:
         known = self._header_of(vehicle_id)
-        return encode_head(
-            TableHeader(
-                mavgate_version=known.mavgate_version,
-                vehicle_id=vehicle_id,
-                session=part.session,
-                part=part.number,
-                cold_start=vehicle_id not in self._seen,
-                unix_us_at_zero=part.stamper.offset_us,
-                settings=known.settings,
-                calibration=known.calibration,
-            )
+        return TableHeader(
+            mavgate_version=known.mavgate_version,
+            vehicle_id=vehicle_id,
+            session=part.session,
+            part=part.number,
+            cold_start=vehicle_id not in self._seen,
+            unix_us_at_zero=part.stamper.offset_us,
+            settings=known.settings,
+            calibration=known.calibration,
         )
 
     async def _run(self) -> None:

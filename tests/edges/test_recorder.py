@@ -19,7 +19,7 @@ from gateway.flightlog.tlog import TlogRecord, TlogScanner
 from gateway.records import FusedSample
 from tests.conftest import ManualClock
 from tests.flightlog.frames import make_frames
-from tests.flightlog.samples import make_flight
+from tests.flightlog.samples import make_baro, make_flight, make_fused
 
 pytestmark = pytest.mark.io
 
@@ -117,6 +117,21 @@ async def test_a_flight_is_in_the_table_with_its_head(
     wanted = [r.imu if isinstance(r, FusedSample) else r for r in flight]
     assert repr(flat) == repr(wanted)
     assert [e.text for e in events if isinstance(e, TableMark)] == ["over the wood"]
+
+
+async def test_changed_settings_make_a_new_head_behind_what_came_before(
+    bench: Bench, rng: np.random.Generator
+) -> None:
+    await bench.turn()
+    bench.recorder.settings_changed(3)
+    for record in (make_fused(rng, 1000), make_baro(rng, 1500)):
+        bench.recorder.flight(record)
+    bench.recorder.settings_changed(3)
+    bench.recorder.flight(make_fused(rng, 2000))
+    bench.recorder.close()
+    data = (bench.recorder.folder / f"{NAME}_01_v3.csv").read_bytes()
+    events = TableReader().feed(data, final=True)
+    assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
 
 
 async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.Generator) -> None:
