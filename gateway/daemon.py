@@ -101,11 +101,11 @@ class Daemon:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
         set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
+        self._recorder.start()
         self._metrics.listen(self._settings.hub.metrics_port)
         self._serial.start()
         if self._receiver is not None:
             self._receiver.start()
-        self._recorder.start()
         self._opening = asyncio.get_running_loop().create_task(self._open_control())
         self._poll()
         self._notifier.ready()
