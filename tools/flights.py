@@ -1,19 +1,36 @@
 """Logs with a reference, read for scoring: samples for the estimators, truth for the judge."""
 
+import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from gateway.estimation.columns import GPS_COLUMNS, IMU_COLUMNS
+from gateway.estimation.columns import (
+    GPS_COLUMNS,
+    IMU_COLUMNS,
+    NAV_COLUMNS,
+    NAV_LAT,
+    NAV_VEL,
+    gps_row,
+    imu_row,
+)
 from gateway.estimation.kernel import SampleLog
+from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
-from gateway.geometry.geodesy import displacement_m
+from gateway.geometry.geodesy import radii_m
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.simulator.flight import fly
+from gateway.simulator.settings import SimulatorSettings
 
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
 QUAT_NAMES = ["ref_qw", "ref_qx", "ref_qy", "ref_qz"]
+SETTLED_S = 20.0
+"""A simulated flight counts from here on: the estimators have met their first fixes."""
 GPS_NAMES = ["gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"]
 
 
@@ -33,7 +50,8 @@ class Flight:
     """(n,) whether the sample is scored."""
     free_heading: bool = False
     """The reference's heading holds only up to a constant."""
-    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    truth: dict[str, np.ndarray] = field(default_factory=dict)
+    """Of a simulated flight: velocity NED and depth."""
 
     def with_gps(self, keep: np.ndarray) -> "Flight":
         """Leave out fixes."""
@@ -96,8 +114,91 @@ def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
 
 
 def north_east_m(flight: Flight, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
-    """Turn degrees into metres from the flight's origin."""
+    """Turn degrees into metres from the flight's origin, shape (n, 2)."""
     lat0, lon0 = flight.origin_deg
-    return np.array(
-        [displacement_m(lat0, lon0, a, b, 0.0) for a, b in zip(lat_deg, lon_deg, strict=True)]
-    ).reshape(-1, 2)
+    meridian_m, parallel_m = radii_m(lat0, 0.0)
+    north = np.radians(lat_deg - lat0) * meridian_m
+    return np.column_stack([north, np.radians(lon_deg - lon0) * parallel_m])
+
+
+def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
+    """Fly the simulator's flight; its truth is exact.
+
+    The magnetometer is always calibrated; `calibrated` says whether the inertial sensors are too.
+    """
+    flown = fly(SimulatorSettings(seed=seed))
+    ideal = asdict(flown.errors)
+    known = ideal if calibrated else {k: v for k, v in ideal.items() if k.startswith("mag")}
+    chain = SensorChain(SensingSettings(), NodeCalibration(**known))
+    settings = ReferenceSettings(gps_latency_s=flown.settings.gps_latency_s)
+    earth = EarthField(settings)
+    imu_us, imu, baro_us, baro, gps_us, gps = [], [], [], [], [], []
+    for record in flown.records():
+        match record:
+            case ImuRaw():
+                imu_us.append(record.time_us)
+                imu.append(imu_row(chain.imu(record)))
+            case BaroRaw():
+                baro_us.append(record.time_us)
+                baro.append(chain.baro(record).alt_pressure_m)
+            case GpsFix():
+                gps_us.append(record.time_us)
+                gps.append(gps_row(record, settings, earth))
+    log = SampleLog(*(np.array(column) for column in (imu_us, imu, baro_us, baro, gps_us, gps)))
+    truth = flown.trajectory.truth_at(log.imu_time_us * 1e-6)
+    origin = (flown.settings.home_lat_deg, flown.settings.home_lon_deg)
+    flight = Flight(
+        name=f"simulated {seed}{'' if calibrated else ' uncalibrated'}",
+        log=log,
+        reference=settings,
+        q_nb=truth.q_nb,
+        pos_ne_m=np.empty((0, 2)),
+        origin_deg=origin,
+        counts=log.imu_time_us > SETTLED_S * 1e6,
+        truth={"vel": truth.vel_n_mps, "down": -truth.alt_amsl_m},
+    )
+    return replace(flight, pos_ne_m=north_east_m(flight, truth.lat_deg, truth.lon_deg))
+
+
+def run_paper(flight: Flight) -> np.ndarray:
+    """Run the paper's estimator, which takes records one at a time, over a flight."""
+    estimator = PaperEstimator(PaperSettings(), flight.reference)
+    chain = SensorChain(SensingSettings(), NodeCalibration())
+    log, fix = flight.log, 0
+    out = np.full((len(log.imu_time_us), NAV_COLUMNS), np.nan)
+    for i, (time_us, row) in enumerate(
+        zip(log.imu_time_us.tolist(), log.imu.tolist(), strict=True)
+    ):
+        while fix < len(log.gps_time_us) and log.gps_time_us[fix] <= time_us:
+            estimator.update_gps(_fix_of(int(log.gps_time_us[fix]), log.gps[fix].tolist()))
+            fix += 1
+        mag = tuple(row[6:9]) if math.isfinite(row[6]) else None
+        sample = chain.imu_si(time_us, tuple(row[:3]), tuple(row[3:6]), mag, math.nan, ImuFlags(0))
+        state = estimator.update_imu(sample)
+        out[i, :4] = state.q_nb
+        out[i, NAV_LAT : NAV_LAT + 3] = state.lat_deg, state.lon_deg, state.alt_amsl_m
+        out[i, NAV_VEL : NAV_VEL + 3] = state.vel_n_mps
+    return out
+
+
+def _fix_of(time_us: int, row: list[float]) -> GpsFix:
+    return GpsFix(
+        time_us=time_us,
+        node=NodeId(1, 1),
+        node_time_us=time_us,
+        itow_ms=0,
+        fix_type=GpsFixType.FIX_3D if row[0] else GpsFixType.NONE,
+        fix_ok=bool(row[0]),
+        satellites=0,
+        lat_dege7=round(row[1] * 1e7),
+        lon_dege7=round(row[2] * 1e7),
+        alt_amsl_m=row[3],
+        vel_n_mps=(row[4], row[5], row[6]),
+        alt_ellipsoid_m=math.nan,
+        h_acc_m=row[7],
+        v_acc_m=row[8],
+        speed_acc_mps=row[9],
+        course_acc_deg=math.nan,
+        pdop=math.nan,
+        utc_us=None,
+    )

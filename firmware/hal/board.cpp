@@ -23,7 +23,11 @@ uint8_t reset_cause __attribute__((section(".noinit")));
 // start-up code runs.
 extern "C" void board_keep_reset_cause() __attribute__((naked, used, section(".init3")));
 extern "C" void board_keep_reset_cause() {
-    reset_cause = MCUSR;
+    // A bootloader has cleared MCUSR before the program starts; optiboot hands it on in r2, which
+    // nothing has touched yet.
+    uint8_t from_bootloader;
+    __asm__ __volatile__("mov %0, r2" : "=r"(from_bootloader));
+    reset_cause = MCUSR != 0 ? MCUSR : from_bootloader & 0x0F;
     MCUSR = 0;
     wdt_disable();
 }

@@ -79,9 +79,9 @@ class Board:
         Board._restore_lines(self)
         self.mcu.on_reset = self._restore_lines
 
-    def reset(self, cause: int) -> None:
+    def reset(self, cause: int, through_bootloader: bool = False) -> None:
         """Restart the chip; radio and sensors keep their state."""
-        self.mcu.reset(cause)
+        self.mcu.reset(cause, through_bootloader)
 
     def close(self) -> None:
         """Free the chip."""

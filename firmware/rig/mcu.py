@@ -22,6 +22,7 @@ BUS_START, BUS_ADDRESS, BUS_WRITE, BUS_READ, BUS_STOP = range(5)
 _RUNNING: Final = (2, 3)
 _UART_OUT: Final = 4096
 _SRAM_OFFSET: Final = 0x800000
+_R2: Final = 2
 _RJMP_TO_ITSELF: Final = 0xCFFF
 
 _SPI = ctypes.CFUNCTYPE(ctypes.c_uint8, ctypes.c_uint8)
@@ -129,9 +130,11 @@ class Mcu:
             self._lib.board_free(self._board)
             self._board = None
 
-    def reset(self, cause: int = POWER_ON) -> None:
-        """Restart the program; `cause` is what it finds in MCUSR."""
-        self._lib.board_reset(self._board, cause)
+    def reset(self, cause: int = POWER_ON, through_bootloader: bool = False) -> None:
+        """Restart the program; `cause` is what it finds in MCUSR, behind optiboot in r2."""
+        self._lib.board_reset(self._board, 0 if through_bootloader else cause)
+        if through_bootloader:
+            self._lib.board_poke(self._board, _R2, cause)
 
     def run(self, cycle: int) -> None:
         """Run to at least this cycle.
@@ -187,7 +190,9 @@ class Mcu:
     def uart_take(self) -> list[tuple[int, int]]:
         """Return what was sent since the last call: the cycle of each stop bit's end, the byte."""
         count = self._lib.board_uart_take(self._board, self._bytes, self._cycles)
-        return list(zip(self._cycles[:count], self._bytes.raw[:count], strict=True))
+        if not count:
+            return []
+        return list(zip(self._cycles[:count], ctypes.string_at(self._bytes, count), strict=True))
 
     @functools.cached_property
     def symbols(self) -> dict[str, int]:

@@ -26,6 +26,7 @@ from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.edges.flight_file import FlightFileError, read_flight
+from gateway.flightlog.session import Mode
 from gateway.pipeline import AircraftSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import Aircraft
@@ -43,6 +44,7 @@ def demo(
     config: ConfigOption = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
+    record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
     flight: Annotated[
         Path | None,
         typer.Option("--flight", "-f", help="Send a recorded tracker log (CSV) in its place."),
@@ -75,7 +77,8 @@ def demo(
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
         # Nor is a flight that goes round and round worth a disk, unless it is asked for.
-        recording = replace(settings.recording, mode="manual")
+        mode: Mode = "always" if record else "manual"
+        recording = replace(settings.recording, mode=mode)
         settings = replace(settings, aircraft_folder=folder, recording=recording)
         asyncio.run(serve(lambda: Daemon(settings, aircraft, read, line), plain=plain))
 

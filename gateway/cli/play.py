@@ -1,6 +1,7 @@
 """`mavgate play` and the orders to a player that runs."""
 
 import asyncio
+import contextlib
 import signal
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -49,6 +50,10 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.mavlink_splitter import message_id_of
 
 VIEW_INTERVAL_S: Final = 0.25
+READY_S: Final = 3.0
+"""A name that takes longer to be resolved is not waited for."""
+READY_STEP_S: Final = 0.01
+RESOLVING: Final = "resolving"
 FIRST_GROUND_STATION: Final = 250
 """System ids from here on are by custom ground stations, which keep their id."""
 FASTEST: Final = "max"
@@ -207,6 +212,10 @@ class PlayerDaemon:
         """Open everything; raises ControlError if another player runs."""
         await self._control.start()
         self._hub.start()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(READY_S):
+                while any(client.state == RESOLVING for client in self._hub.clients()):
+                    await asyncio.sleep(READY_STEP_S)
         self.edge.start()
 
     def close(self) -> None:
@@ -245,14 +254,16 @@ async def _serve(
         max_gap_us=None if course.max_gap_s is None else round(course.max_gap_s * US_PER_S),
         loop=course.loop,
     )
-    if course.paused:
-        player.pause(now_us())
+    # It waits for the network, and then if the user wants it to.
+    player.pause(now_us())
     systems = sorted({system_id for track in tracks for system_id in track.systems})
     daemon = PlayerDaemon(settings, player, systems, files, now_us)
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
     try:
         await daemon.start()
+        if not course.paused:
+            daemon.edge.resume()
         await _watch(daemon)
     finally:
         daemon.close()

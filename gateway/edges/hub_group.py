@@ -7,7 +7,7 @@ of the first.
 
 import socket
 import struct
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub_link import HubContext
 from gateway.edges.hub_udp import MAX_DATAGRAM, READ_BUDGET, RETRY_US, DatagramLink
@@ -69,7 +69,8 @@ class GroupLink(DatagramLink):
                 _prepare_sender(sock, address)
             else:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            sock.bind((_route_source(family, address), 0))
+            host, _, *scope = _route_source(family, address)
+            sock.bind((host, 0, *scope))
         except OSError:
             if sock is not None:
                 sock.close()
@@ -90,12 +91,12 @@ class GroupLink(DatagramLink):
                 self.accept(data, self.context.now_us())
 
 
-def _route_source(family: int, address: tuple[object, ...]) -> str:
-    """Return the address of ours from which the group is reached."""
+def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:
+    """Return the address of ours from which the group is reached, as sockets have it."""
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         probe.connect(address)
-        return str(probe.getsockname()[0])
+        return tuple(probe.getsockname())
 
 
 def _prepare_sender(sock: socket.socket, address: tuple[object, ...]) -> None:
@@ -118,7 +119,7 @@ def _ear(family: int, address: tuple[object, ...]) -> socket.socket:
             member = group + struct.pack("=I", address[3])
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, member)
         else:
-            source = socket.inet_aton(_route_source(family, address))
+            source = socket.inet_aton(_route_source(family, address)[0])
             sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + source)
     except OSError:
         sock.close()

@@ -41,10 +41,31 @@ class UdpPeer(DatagramLink):
     def __init__(self, context: HubContext, client_id: int, listener: Endpoint, peer: str) -> None:
         super().__init__(context, client_id, listener, remote=peer, name=peer)
 
+    def accept(self, data: bytes, now_us: int) -> None:
+        """Take one datagram of the client, which is alive then."""
+        self._end_hold()
+        super().accept(data, now_us)
+
     def tick(self, now_us: int) -> None:
-        """Call trouble off that was not repeated."""
+        """Call trouble off that was not repeated; try a client again that refused."""
+        self._end_hold()
         if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
             self.state = "open"
+
+    def _note_refusal(self) -> None:
+        """Hold back until the next tick: a client that is dead costs more than one that lives."""
+        super()._note_refusal()
+        if self.write == self._direct:
+            self.write = self._hold
+
+    def _hold(self, data: bytes) -> None:
+        self.counters.dropped += 1
+        self.counters.sent -= 1
+        self.counters.bytes_sent -= len(data)
+
+    def _end_hold(self) -> None:
+        if self.write == self._hold:
+            self.write = self._direct
 
     def has_died(self, now_us: int) -> bool:
         """Tell whether the client is silent and its machine says that nobody listens."""

@@ -34,11 +34,14 @@ MAX_NAME: Final = 100
 PART_DIGITS: Final = 2
 
 
+Mode = Literal["manual", "in_flight", "always"]
+
+
 class RecordingSettings(Settings, frozen=True):
     """What is recorded, where, and when."""
 
     mode: Annotated[
-        Literal["manual", "in_flight", "always"],
+        Mode,
         setting(
             "manual: on command only; in_flight: from arming or take-off to landing; always: as "
             "long as the gateway runs."

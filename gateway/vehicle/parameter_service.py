@@ -97,13 +97,13 @@ class ParameterService:
             return ACCEPTED, [SaveSettings(self._vehicle_id, tuple(sections.items()))]
         if asked not in (RESET, RESET_CALIBRATION):
             return UNSUPPORTED, []
+        before = self._numbers()
         answers: list[Answer] = []
-        for key, settings in list(sections.items()):
+        for key in sections:
             if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
-                fresh = type(settings)()
+                fresh = self.table.reset(key)
                 answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
-                answers += self.take(key, fresh)
-        return ACCEPTED, answers
+        return ACCEPTED, answers + self._told_since(before)
 
     def told(self, parameter: Parameter) -> Reply:
         """Tell all the present value of a parameter."""
@@ -111,10 +111,16 @@ class ParameterService:
 
     def take(self, section: str, settings: Any) -> list[Answer]:
         """Take over a section that was changed elsewhere, and tell what differs."""
-        before = {p.name: self.table.number(p) for p in self.table.parameters}
+        before = self._numbers()
         self.table.sections[section] = settings
-        after = {p.name: self.table.number(p) for p in self.table.parameters}
-        return [self.told(p) for p in self.table.parameters if before[p.name] != after[p.name]]
+        return self._told_since(before)
+
+    def _numbers(self) -> list[float]:
+        return [self.table.number(parameter) for parameter in self.table.parameters]
+
+    def _told_since(self, before: list[float]) -> list[Answer]:
+        changed = zip(self.table.parameters, before, self._numbers(), strict=True)
+        return [self.told(parameter) for parameter, old, new in changed if old != new]
 
     def _set(self, request: Request) -> list[Answer]:
         message = request.message

@@ -152,6 +152,19 @@ class ParameterTable:
         self.sections[parameter.section] = tree
         return tree
 
+    def reset(self, section: str) -> Settings:
+        """Give every parameter of a tree its default; what is no parameter stays as it is.
+
+        Returns
+        -------
+        Settings
+            The whole tree.
+        """
+        for parameter in self.parameters:
+            if parameter.section == section:
+                self.change(parameter, parameter.to_number(parameter.field.default))
+        return self.sections[section]
+
     def _value(self, parameter: Parameter) -> Any:
         value: Any = self.sections[parameter.section]
         for key in parameter.path:

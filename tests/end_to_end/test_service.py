@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway.edges.control_socket import ControlError, request, socket_path
 from tests.end_to_end.processes import Client, Gateway, free_udp_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -69,3 +70,27 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert gateway.stop() == 0
     assert systemd.recv(200) == b"STOPPING=1"
     assert "settings not reloaded" in gateway.log.read_text()
+
+
+def test_orders_reach_the_hub(
+    start_gateway: Callable[..., Gateway],
+    connect: Callable[..., Client],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    gateway = start_gateway("demo")
+    connect(gateway.port).until(lambda seen: "HEARTBEAT" in seen)
+    control = socket_path("run")
+    (extra,) = free_udp_ports(1)
+    url = f"udp:127.0.0.1:{extra}?name=tablet&allow=HEARTBEAT"
+    assert url in request(control, "clients.add", {"url": url})
+    newcomer = connect(extra)
+    assert {message.get_type() for _ in range(3) for message in newcomer.receive()} == {"HEARTBEAT"}
+    (tablet,) = (c for c in request(control, "status")["clients"] if c["name"] == "tablet")
+    assert (tablet["state"], tablet["trusted"]) == ("open", True)
+    assert tablet["sent"] >= 3
+    assert "applied" in request(control, "reload")
+    assert url not in request(control, "clients.remove", {"name": "tablet"})
+    with pytest.raises(ControlError, match="tablet"):
+        request(control, "clients.remove", {"name": "tablet"})

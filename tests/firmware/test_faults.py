@@ -18,13 +18,17 @@ OVERFLOWS_16_MHZ = 1 << 17
 """Of timer 1 in 2**32 us: 65536 ticks of half a microsecond each."""
 
 
-@pytest.mark.parametrize("cause", [BROWN_OUT, WATCHDOG])
-def test_a_reset_in_flight_costs_little_and_is_told(bench: MakeBench, cause: int) -> None:
+@pytest.mark.parametrize(
+    ("cause", "through_bootloader"), [(BROWN_OUT, False), (WATCHDOG, False), (WATCHDOG, True)]
+)
+def test_a_reset_in_flight_costs_little_and_is_told(
+    bench: MakeBench, cause: int, through_bootloader: bool
+) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(1.2)
     reset_s = rig.now_s
-    node.reset(cause)
+    node.reset(cause, through_bootloader)
     rig.run(1.2)
     first = next(t for t, f in rig.frames if t > reset_s + 0.005)
     assert first - reset_s < 0.1

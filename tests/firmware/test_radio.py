@@ -1,5 +1,6 @@
 """The radio driver, the sender and the receiver on an air that loses and collides."""
 
+import bisect
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +40,20 @@ def test_nothing_is_lost_up_to_30_percent_on_the_air(bench: MakeBench, loss: flo
     assert [p.lost for p in last.pipes] == [0] * 6
     assert last.uart_dropped == 0
     assert not rig.faults
+
+
+def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> None:
+    rig = bench(loss=0.1)
+    node = rig.imu_node()
+    rig.run(RUNNING_S + 1.0)
+    late_s = []
+    for end_s, frame in rig.frames:
+        if isinstance(frame.payload, ImuPayload):
+            # The node's clock starts within half a millisecond behind the reset.
+            stamp_ps = frame.header.node_time_us * PS_PER_US + PS_PER_US * 500
+            at = bisect.bisect(node.mpu6050.sampled_ps, stamp_ps) - 1
+            late_s.append(end_s - node.mpu6050.sampled_ps[at] / PS_PER_S)
+    assert 0.002 < np.median(late_s) < 0.005
 
 
 def test_the_receiver_counts_what_went_by(bench: MakeBench) -> None:

@@ -13,7 +13,7 @@ from gateway.settings import Settings, setting
 from gateway.vehicle.actions import SaveSettings, SettingsChange
 from gateway.vehicle.parameter_names import parameter_name
 from gateway.vehicle.parameters import ParameterTable, decode_value
-from gateway.vehicle.settings import RateSettings
+from gateway.vehicle.settings import RateSettings, VehicleSettings
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.test_start_up import load_parameters
 
@@ -201,6 +201,13 @@ def test_storage_goes_back_to_the_defaults(station: GroundStation) -> None:
     assert told == {"TUNING_ORDER": 2.0, "RATE_ATT": 50.0}
     assert station.vehicle.telemetry.streams[30].interval_us == 20_000
     assert station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 0)[0].result == 3
+
+
+def test_the_defaults_leave_alone_what_is_no_parameter() -> None:
+    settings = VehicleSettings(signing_passphrase="correct horse", node_silent_s=9.0)
+    table = ParameterTable({"vehicle": settings})
+    fresh = table.reset("vehicle")
+    assert fresh == VehicleSettings(signing_passphrase="correct horse")
 
 
 def test_two_settings_of_one_name_are_a_fault_of_the_caller() -> None:

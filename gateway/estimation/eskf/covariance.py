@@ -46,9 +46,9 @@ def propagate(s: State, p: Gains) -> None:
     if dt <= 0.0:
         return
     transit(s)
-    turned = p.gyro_scale_sq * SCALE_S * s.pending_rate_sq
-    pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq
-    s.pending_rate_sq = s.pending_accel_sq = 0.0
+    turned = p.gyro_scale_sq * SCALE_S * s.pending_rate_sq + p.gyro_roughness_sq * s.rough_gyro
+    pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
+    s.pending_rate_sq = s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
     for k in range(3):
         s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
         s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt

@@ -2,7 +2,8 @@
 
 from typing import Final
 
-from gateway.estimation.eskf.kernels import run, take_baro, take_gps, take_imu
+from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.kernels import run, take_baro, take_imu
 from gateway.estimation.eskf.output import tell
 from gateway.estimation.eskf.settings import EskfSettings, Gains, make_gains
 from gateway.estimation.eskf.start import start

@@ -17,7 +17,16 @@ class EskfSettings(Settings, frozen=True):
     gyro_noise_degprs: Annotated[
         float,
         setting("Noise of the gyroscope, vibration included.", "deg/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.15
+    ] = 0.1
+    gyro_roughness: Annotated[
+        float,
+        setting(
+            "How much of the sample-to-sample change of the angular rate is taken for noise, "
+            "vibration and what the sampling misses; 1 if all of it.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 1.0
     gyro_scale: Annotated[
         float,
         setting(
@@ -25,46 +34,49 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.1,
         ),
-    ] = 0.002
+    ] = 0.0005
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.15
+    ] = 0.08
+    accel_roughness: Annotated[
+        float, setting("The same of the specific force.", ge=0.0, le=10.0)
+    ] = 0.5
     accel_scale: Annotated[
         float,
         setting("Share by which the specific force beyond gravity is wrong.", ge=0.0, le=0.2),
-    ] = 0.002
+    ] = 0.01
     gyro_bias_walk_degpsprs: Annotated[
         float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.01
+    ] = 0.007
     accel_bias_walk_mps2prs: Annotated[
         float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.0005
+    ] = 0.0015
     gyro_bias_degps: Annotated[
         float, setting("Gyroscope bias at the start.", "deg/s", ge=0.01, le=20.0)
     ] = 1.0
     accel_bias_mps2: Annotated[
         float, setting("Accelerometer bias at the start.", "m/s2", ge=0.001, le=2.0)
-    ] = 0.05
+    ] = 0.03
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.3
+    ] = 0.6
     gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 0.6
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.7
+    ] = 0.6
     gps_height_wander_m: Annotated[
         float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
-    ] = 1.5
+    ] = 2.5
     gps_wander_s: Annotated[
         float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
-    ] = 20.0
+    ] = 8.0
     gps_velocity_mps: Annotated[
         float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
-    ] = 0.15
+    ] = 0.2
     gps_climb_mps: Annotated[
         float, setting("The same of its vertical velocity.", "m/s", ge=0.01, le=10.0)
-    ] = 0.25
+    ] = 0.1
     gps_jitter_s: Annotated[
         float,
         setting(
@@ -74,16 +86,16 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.5,
         ),
-    ] = 0.05
+    ] = 0.06
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
-    ] = 5.0
+    ] = 4.5
     mag_wander_deg: Annotated[
         float, setting("Slow error of the compass.", "deg", ge=0.01, le=45.0)
-    ] = 1.5
+    ] = 0.25
     mag_wander_s: Annotated[
         float, setting("Correlation time of the compass's slow error.", "s", ge=0.5, le=3600.0)
-    ] = 100.0
+    ] = 20.0
     mag_norm_tolerance: Annotated[
         float,
         setting("Share by which the field may differ from its usual strength.", ge=0.01, le=1.0),
@@ -93,10 +105,10 @@ class EskfSettings(Settings, frozen=True):
     ] = 10.0
     baro_noise_m: Annotated[
         float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
-    ] = 0.7
+    ] = 1.4
     baro_walk_mprs: Annotated[
         float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
-    ] = 0.1
+    ] = 1.0
     unaided_velocity_mps: Annotated[
         float,
         setting(
@@ -106,7 +118,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.01,
             le=100.0,
         ),
-    ] = 0.5
+    ] = 0.1
     dead_reckoning_s: Annotated[
         float,
         setting("How long position and velocity are carried without GPS.", "s", ge=1.0, le=600.0),
@@ -163,6 +175,8 @@ class Gains(RestGains, FieldGains):
 
     gyro_density: float
     """rad2/s."""
+    gyro_roughness_sq: float
+    accel_roughness_sq: float
     gyro_scale_sq: float
     """Times the squared rate and `SCALE_S`, rad2/s."""
     accel_density: float
@@ -212,6 +226,8 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
     s = settings
     values = {
         "gyro_density": (s.gyro_noise_degprs * DEG) ** 2,
+        "gyro_roughness_sq": s.gyro_roughness**2,
+        "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_sq": s.gyro_scale**2,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,

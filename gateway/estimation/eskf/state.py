@@ -51,6 +51,10 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     pending_force_n: Annotated[FloatArray, (3,)]
     pending_rate_sq: float
     """Integral of the squared angular rate over that time."""
+    rough_gyro: float
+    """Variance of the angle over that time if the changes of the rate were white noise."""
+    rough_accel: float
+    """The same of the velocity."""
     pending_accel_sq: float
     """The same of the acceleration."""
     pending_turn: Annotated[FloatArray, (3, 3)]

@@ -110,6 +110,29 @@ async def test_a_killed_client_goes_when_its_machine_says_so(rig: Any) -> None:
     await rig.until(lambda: not hub.clients())
 
 
+async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    station.socket.close()
+    hub.send(rig.out(rig.vehicle.attitude()))
+    await rig.until(lambda: hub.clients()[0].state == "refused")
+    for _ in range(100):
+        hub.send(rig.out(rig.vehicle.attitude()))
+    assert hub.clients()[0].sent + hub.clients()[0].dropped == 101
+    assert hub.clients()[0].dropped >= 99
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
+        again.setblocking(False)
+        again.bind(("127.0.0.1", station.port))
+        again.sendto(station.sender.heartbeat(), station.target)
+        await rig.until(lambda: hub.clients()[0].received == 2)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert again.recv(100) == frame
+    assert len(hub.clients()) == 1
+
+
 async def test_back_on_another_port_replaces_itself(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     before, after = (rig.station(hub.listening_ports()[0]) for _ in range(2))

@@ -1,0 +1,205 @@
+"""Recordings in other people's hands: mavlogdump, MAVProxy, MAVSDK and a bare client."""
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.edges.control_socket import request
+from gateway.flightlog.tlog import TlogRecord, TlogScanner
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, free_udp_ports
+from tests.end_to_end.test_demo import MavProxy
+from tests.flightlog.frames import START_US, make_tlog
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+LAT_DEG, LON_DEG = 47.1, 8.5
+SECONDS = 60
+
+
+def make_flight() -> list[TlogRecord]:
+    """Make what a foreign vehicle (system 3) sends while it flies north."""
+    mav = mavlink.MAVLink(None, 3, 1)
+    records = []
+    for i in range(SECONDS * 10):
+        lat, lon = round(LAT_DEG * 1e7) + 10 * i, round(LON_DEG * 1e7)
+        messages = [
+            mavlink.MAVLink_attitude_quaternion_message(100 * i, 1.0, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_global_position_int_message(
+                100 * i, lat, lon, 430_000, 0, 100, 0, 0, 0
+            ),
+        ]
+        if i % 10 == 0:
+            messages += [
+                mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_GENERIC, 128, 0, 4, 3),
+                mavlink.MAVLink_home_position_message(
+                    lat, lon, 430_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
+                ),
+            ]
+        for message in messages:
+            records.append(TlogRecord(START_US + 100_000 * i, bytes(message.pack(mav))))
+            mav.seq = (mav.seq + 1) % 256
+    return records
+
+
+RECORDS = make_flight()
+
+
+@pytest.fixture
+def tlog(tmp_path: Path) -> Path:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(make_tlog(RECORDS))
+    return path
+
+
+class Playing:
+    """A running `mavgate play`."""
+
+    def __init__(self, folder: Path, *arguments: str, port: int = 0) -> None:
+        self.port = port or free_udp_ports(1)[0]
+        self.socket = folder / "mavgate" / "play.sock"
+        environment = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "gateway.cli", "play", *arguments),
+                *("--endpoint", f"udp:127.0.0.1:{self.port}"),
+            ],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+        )
+
+
+@pytest.fixture
+def play(tmp_path: Path) -> Iterator[Callable[..., Playing]]:
+    started: list[Playing] = []
+
+    def start(*arguments: str, port: int = 0) -> Playing:
+        started.append(Playing(tmp_path, *arguments, port=port))
+        return started[-1]
+
+    yield start
+    for playing in started:
+        playing.process.kill()
+        playing.process.wait(10)
+
+
+def test_a_client_gets_every_frame_byte_for_byte(
+    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+) -> None:
+    (port,) = free_udp_ports(1)
+    client = connect(port)
+    playing = play(str(tlog), "--speed", "50", port=port)
+    frames = [client.sock.recv(2048) for _ in RECORDS]
+    assert frames == [record.frame for record in RECORDS]
+    assert playing.process.wait(START_LIMIT_S) == 0
+
+
+def test_a_paused_player_is_steered_by_its_socket(
+    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+) -> None:
+    (port,) = free_udp_ports(1)
+    client = connect(port)
+    playing = play(str(tlog), "--loop", "--from", "0:10", port=port)
+    client.until(lambda seen: "HOME_POSITION" in seen)
+    assert request(playing.socket, "play.pause")["state"] == "paused"
+    status = request(playing.socket, "seek", {"to": "0:30"})
+    assert status["position_s"] == pytest.approx(30.0)
+    wanted = round(LAT_DEG * 1e7) + 10 * 10 * 40 - 10
+    seen = client.until(lambda seen: getattr(seen.get("GLOBAL_POSITION_INT"), "lat", 0) == wanted)
+    assert seen["HEARTBEAT"].get_srcSystem() == 3
+
+
+def test_two_recordings_fly_as_two_vehicles(
+    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+) -> None:
+    (port,) = free_udp_ports(1)
+    client = connect(port)
+    play(str(tlog), str(tlog), "--as", "3", "--as", "7", "--speed", "10", port=port)
+    systems: set[int] = set()
+    while systems != {3, 7}:
+        systems |= {message.get_srcSystem() for message in client.receive()}
+
+
+def test_a_recorded_vehicle_answers_a_ground_station(
+    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+) -> None:
+    (port,) = free_udp_ports(1)
+    client = connect(port)
+    play(str(tlog), port=port)
+    _, address = client.sock.recvfrom(2048)
+    client.send(mavlink.MAVLink_param_request_list_message(3, 1), address[1])
+    seen = client.until(lambda seen: "PARAM_VALUE" in seen)
+    assert seen["PARAM_VALUE"].get_srcSystem() == 3
+
+
+def test_mavlogdump_reads_our_tlogs(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
+) -> None:
+    config = """
+[hub]
+endpoints = ["udp:127.0.0.1:{port}", "udp-listen:127.0.0.1:{listen}"]
+
+[recording]
+folder = "FOLDER"
+"""
+    gateway = start_gateway("demo", "--record", config=config.replace("FOLDER", str(tmp_path)))
+    connect(gateway.port).until(lambda seen: "HIGHRES_IMU" in seen)
+    assert gateway.stop() == 0
+    (path,) = tmp_path.glob("*.tlog")
+    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
+    assert batch.damage == ()
+    dumped = subprocess.run(
+        [sys.executable, str(Path(sys.executable).parent / "mavlogdump.py"), str(path)],
+        capture_output=True,
+        text=True,
+        timeout=START_LIMIT_S,
+        check=True,
+    )
+    lines = [line for line in dumped.stdout.splitlines() if " {" in line]
+    assert len(lines) == len(batch)
+    assert "BAD_DATA" not in dumped.stdout
+
+
+@pytest.fixture
+def start_mavproxy(tmp_path: Path) -> Iterator[Callable[[int], MavProxy]]:
+    started: list[MavProxy] = []
+
+    def start(port: int) -> MavProxy:
+        started.append(MavProxy(port, tmp_path))
+        return started[-1]
+
+    yield start
+    for proxy in started:
+        proxy.process.kill()
+        proxy.process.communicate()
+
+
+def test_mavproxy_sees_the_recorded_vehicle(
+    tlog: Path, play: Callable[..., Playing], start_mavproxy: Callable[[int], MavProxy]
+) -> None:
+    playing = play(str(tlog), "--loop")
+    proxy = start_mavproxy(playing.port)
+    proxy.until(r"Detected vehicle 3:1")
+    found = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (\d+)", "status GLOBAL_POSITION_INT")
+    assert int(found[1]) / 1e7 == pytest.approx(LAT_DEG, abs=0.01)
+
+
+async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., Playing]) -> None:
+    playing = play(str(tlog), "--loop")
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
+        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+        telemetry = TelemetryAsync(system)
+        async with asyncio.timeout(30):
+            place = await anext(telemetry.subscribe_position())
+            home = await anext(telemetry.subscribe_home())
+    assert place.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
+    assert home.longitude_deg == pytest.approx(LON_DEG, abs=0.01)

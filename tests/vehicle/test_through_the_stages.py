@@ -1,0 +1,124 @@
+"""What a ground station changes reaches the stage that it concerns, and only that one."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
+from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId, Outgoing
+
+LEVEL = ImuRaw(
+    time_us=0,
+    node=NodeId(1, 0),
+    node_time_us=0,
+    accel_raw=(0, 0, 4096),
+    gyro_raw=(0, 0, 0),
+    mag_raw=(218, 0, 431),
+    temperature_raw=-3920,
+    accel_range_g=8,
+    gyro_range_dps=1000,
+    mag_lsb_per_gauss=1090,
+    flags=ImuFlags.MAG_NEW,
+)
+"""At rest, face up: one gravity upwards in sensor axes."""
+
+
+class Bench:
+    """A pipeline with one aircraft on the table and one ground station."""
+
+    def __init__(self) -> None:
+        settings = AircraftSettings(estimation=EstimationSettings(estimator="paper"))
+        self.pipeline = Pipeline(PipelineSettings(settings))
+        self.mav = mavlink.MAVLink(None, 255, 190)
+        self.time_us = 0
+        self.told: list[Any] = []
+
+    def run(self, seconds: float, **changes: Any) -> FusedSample:
+        """Let raw samples come at 100 Hz; the last one fused."""
+        fused = []
+        for _ in range(round(seconds * 100)):
+            self.time_us += 10_000
+            raw = replace(LEVEL, time_us=self.time_us, node_time_us=self.time_us, **changes)
+            actions = self.pipeline.take(raw, self.time_us) + self.pipeline.poll(self.time_us)
+            fused += [action for action in actions if isinstance(action, FusedSample)]
+            self.read(actions)
+        return fused[-1]
+
+    def send(self, message: Any) -> None:
+        incoming = Incoming(7, message.pack(self.mav), trusted=True)
+        self.read(self.pipeline.handle(incoming, self.time_us))
+
+    def calibrate(self, *params: float) -> None:
+        padded = [*params, *[0.0] * (7 - len(params))]
+        self.send(mavlink.MAVLink_command_long_message(1, 1, 241, 0, *padded))
+
+    def read(self, actions: list[Any]) -> None:
+        parser = mavlink.MAVLink(None)
+        frames = (action.frame for action in actions if isinstance(action, Outgoing))
+        self.told += [parser.decode(bytearray(frame)) for frame in frames]
+
+    def parameters(self) -> dict[str, float]:
+        return {m.param_id: m.param_value for m in self.told if m.get_type() == "PARAM_VALUE"}
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_gyro_bias_is_measured_and_gone(bench: Bench) -> None:
+    biased = {"gyro_raw": (33, -66, 16)}
+    before = bench.run(0.5, **biased).sample.gyro_b_radps
+    assert max(map(abs, before)) > 0.03
+    bench.calibrate(1)
+    bench.run(4.0, **biased)
+    after = bench.run(0.1, **biased).sample.gyro_b_radps
+    assert after == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert bench.parameters()["CAL_GYRO_BIAS_X"] == pytest.approx(before[0], rel=1e-6)
+
+
+def test_a_tilted_mounting_is_levelled(bench: Bench) -> None:
+    tilted = {"accel_raw": (400, -300, 4066)}
+    assert abs(bench.run(0.5, **tilted).state.q_nb[1]) > 0.01
+    bench.calibrate(0, 0, 0, 0, 2)
+    bench.run(4.0, **tilted)
+    sample = bench.run(1.0, **tilted).sample
+    assert sample.accel_b_mps2[:2] == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_an_accelerometer_bias_is_gone(bench: Bench) -> None:
+    biased = {"accel_raw": (100, -50, 4196)}
+    bench.run(0.5, **biased)
+    bench.calibrate(0, 0, 0, 0, 4)
+    bench.run(4.0, **biased)
+    found = bench.run(0.1, **biased).sample.accel_b_mps2
+    assert found == pytest.approx((0.0, 0.0, -9.80665), abs=1e-6)
+
+
+def test_a_new_weight_does_not_restart_the_estimator(bench: Bench) -> None:
+    """Turned by the gyroscope alone: a fresh estimator would forget the turn."""
+    bench.run(2.0)
+    turning = {"gyro_raw": (0, 0, -3280)}
+    before = bench.run(0.5, **turning).state.q_nb
+    name = b"PAPER_ALPHA_YAW"
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, name, 1.0, mavlink.MAV_PARAM_TYPE_REAL32))
+    after = bench.run(0.01).state.q_nb
+    assert bench.parameters()["PAPER_ALPHA_YAW"] == 1.0
+    assert after == pytest.approx(before, abs=1e-3)
+    assert bench.run(1.0).state.q_nb == pytest.approx(before, abs=1e-2), "the compass is left out"
+
+
+def test_a_new_cutoff_reaches_the_filter(bench: Bench) -> None:
+    bench.run(1.0)
+    for cutoff_hz, expected in ((0.5, False), (40.0, True)):
+        value = mavlink.MAVLink_param_set_message(
+            1, 1, b"SENS_ACC_CUTOFF", cutoff_hz, mavlink.MAV_PARAM_TYPE_REAL32
+        )
+        bench.send(value)
+        bench.run(5.0)
+        step = bench.run(0.1, accel_raw=(2048, 0, 4096)).sample
+        settled = step.accel_lowpass_b_mps2[0] > 0.9 * step.accel_b_mps2[0]
+        assert settled is expected

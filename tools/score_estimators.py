@@ -1,0 +1,263 @@
+"""Score the estimators on real and simulated flights, one set of default settings for all.
+
+    python tools/score_estimators.py --data DIR [--json FILE] [--no-peers]
+
+Every estimator runs causally. Attitude is compared with the reference where it counts (in flight,
+in motion); position at the native fix rate, with one fix a second, and in outages of 10 and 30 s
+that are cut out of the log again and again. Other people's filters (extra `bench`) run beside.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.estimation.columns import NAV_ATTITUDE_STD, NAV_LAT, NAV_LON
+from gateway.estimation.complementary.estimator import ComplementaryEstimator
+from gateway.estimation.complementary.state import ComplementarySettings
+from gateway.estimation.eskf.estimator import EskfEstimator
+from gateway.estimation.eskf.settings import EskfSettings
+from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
+from tools.peers import PEERS
+
+Run = Callable[[Flight], np.ndarray]
+Scores = dict[str, float]
+
+SEEDS = (11, 12, 13)
+OUTAGE_EVERY = 2.0
+"""An outage begins each so many of its lengths; those too close to another run another time."""
+OUTAGE_REST_S = 20.0
+THIN_S = 0.95
+REPEATS = 3
+
+TARGETS: dict[tuple[str, str], Scores] = {
+    ("arduplane_testlog2", "complementary"): {
+        "roll": 1.9, "pitch": 1.7, "yaw": 2.8, "pos_1hz": 1.07, "out10": 12.0,
+    },
+    ("arduplane_testlog2", "eskf"): {
+        "roll": 0.9, "pitch": 0.7, "yaw": 1.1, "pos_1hz": 1.07, "out10": 6.4,
+    },
+    ("car_rtk_drive0708_first_half", "eskf"): {"out10": 2.1},
+    ("px4_mocap_log008", "complementary"): {"total": 2.2},
+    ("px4_mocap_log008", "eskf"): {"total": 2.2},
+}  # fmt: skip
+"""What is to be reached; on the other flights, not to be worse than VQF."""
+
+
+def run_complementary(flight: Flight) -> np.ndarray:
+    """Run the default estimator."""
+    return ComplementaryEstimator(ComplementarySettings(), flight.reference).run(flight.log)
+
+
+def run_eskf(flight: Flight) -> np.ndarray:
+    """Run the Kalman filter."""
+    return EskfEstimator(EskfSettings(), flight.reference).run(flight.log)
+
+
+OWN: dict[str, Run] = {"paper": run_paper, "complementary": run_complementary, "eskf": run_eskf}
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square of what is known."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+
+
+def attitude_scores(flight: Flight, q_nb: np.ndarray) -> Scores:
+    """Compare attitudes in degrees: by Euler angles, and as heading and inclination."""
+    use = flight.counts & np.isfinite(flight.q_nb[:, 0]) & np.isfinite(q_nb[:, 0])
+    if not use.any():
+        return {}
+    true = Rotation.from_quat(flight.q_nb[use], scalar_first=True)
+    found = Rotation.from_quat(q_nb[use], scalar_first=True)
+    if flight.free_heading:
+        mean = np.angle(np.exp(1j * heading_rad(found * true.inv())).mean())
+        found = Rotation.from_euler("z", -mean) * found
+    off = found * true.inv()
+    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
+    angles = np.degrees(found.as_euler("ZYX") - true.as_euler("ZYX"))
+    angles = (angles + 180.0) % 360.0 - 180.0
+    return {
+        "roll": rms(angles[:, 2]),
+        "pitch": rms(angles[:, 1]),
+        "yaw": rms(angles[:, 0]),
+        "total": rms(np.degrees(off.magnitude())),
+        "heading": rms(np.degrees(heading_rad(off))),
+        "inclination": rms(np.degrees(2.0 * np.arccos(np.hypot(w, z).clip(max=1.0)))),
+    }
+
+
+def heading_rad(off: Rotation) -> np.ndarray:
+    """Split the turn about down from small rotations in NED."""
+    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
+    return (2.0 * np.arctan2(z, w) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def position_errors_m(flight: Flight, out: np.ndarray) -> np.ndarray:
+    """Horizontal distance from the reference, NaN where there is none."""
+    off = north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON]) - flight.pos_ne_m
+    return np.hypot(off[:, 0], off[:, 1])
+
+
+def outage_passes(flight: Flight, length_s: float) -> list[list[float]]:
+    """Lay out the beginnings of outages over as many passes as they need."""
+    time_s = flight.log.imu_time_us * 1e-6
+    known = time_s[flight.counts & np.isfinite(flight.pos_ne_m[:, 0])]
+    first = max(known[0], flight.log.gps_time_us[0] * 1e-6) + 10.0
+    passes: list[list[float]] = []
+    for begin in np.arange(first, known[-1] - length_s, OUTAGE_EVERY * length_s):
+        for line in passes:
+            if begin - line[-1] >= length_s + OUTAGE_REST_S:
+                line.append(begin)
+                break
+        else:
+            passes.append([begin])
+    return passes
+
+
+def outage_score(flight: Flight, run: Run, length_s: float) -> float:
+    """RMS of the position error over all samples within outages."""
+    time_s, gps_s = flight.log.imu_time_us * 1e-6, flight.log.gps_time_us * 1e-6
+    errors = []
+    for begins in outage_passes(flight, length_s):
+        lost, inside = np.zeros(len(gps_s), bool), np.zeros(len(time_s), bool)
+        for begin in begins:
+            lost |= (gps_s > begin) & (gps_s <= begin + length_s)
+            inside |= (time_s > begin) & (time_s <= begin + length_s)
+        cut = flight.with_gps(~lost)
+        errors.append(position_errors_m(flight, run(cut))[inside])
+    return rms(np.concatenate(errors)) if errors else math.nan
+
+
+def thinned(flight: Flight) -> Flight:
+    """Keep one fix a second."""
+    keep, last = np.zeros(len(flight.log.gps), bool), -math.inf
+    for i, gps_s in enumerate(flight.log.gps_time_us * 1e-6):
+        if gps_s - last >= THIN_S:
+            keep[i], last = True, gps_s
+    return flight.with_gps(keep)
+
+
+def position_scores(flight: Flight, run: Run, out: np.ndarray) -> Scores:
+    """Score the position in metres at every fix rate and in outages."""
+    if not np.isfinite(flight.pos_ne_m).any() or len(flight.log.gps) == 0:
+        return {}
+    errors = position_errors_m(flight, out)[flight.counts]
+    return {
+        "pos": rms(errors),
+        "pos_max": float(np.nanmax(errors)),
+        "pos_1hz": rms(position_errors_m(flight, run(thinned(flight)))[flight.counts]),
+        "out10": outage_score(flight, run, 10.0),
+        "out30": outage_score(flight, run, 30.0),
+    }
+
+
+def nees(flight: Flight, out: np.ndarray) -> Scores:
+    """Average the normalised squared error of a simulated flight, by kind; expected 1 each."""
+    if not flight.truth or not np.isfinite(out[-1, NAV_ATTITUDE_STD]):
+        return {}
+    true = Rotation.from_quat(flight.q_nb, scalar_first=True)
+    found = Rotation.from_quat(out[:, :4], scalar_first=True)
+    place = north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON])
+    errors = {
+        "nees_attitude": (true * found.inv()).as_rotvec(),
+        "nees_velocity": flight.truth["vel"] - out[:, 10:13],
+        "nees_position": np.column_stack(
+            [flight.pos_ne_m - place, flight.truth["down"] + out[:, 9]]
+        ),
+    }
+    stds = {"nees_attitude": 13, "nees_velocity": 16, "nees_position": 19}
+    return {
+        name: float(np.mean((error / out[:, stds[name] : stds[name] + 3])[flight.counts] ** 2))
+        for name, error in errors.items()
+    }
+
+
+def score(flight: Flight, name: str, run: Run) -> Scores:
+    """Run one estimator over one flight and score it."""
+    out = run(flight)
+    best_s = math.inf
+    for _ in range(REPEATS if name in ("complementary", "eskf") else 1):
+        begin = time.perf_counter()
+        out = run(flight)
+        best_s = min(best_s, time.perf_counter() - begin)
+    scores = attitude_scores(flight, out[:, :4])
+    if out.shape[1] > 4:
+        scores |= position_scores(flight, run, out) | nees(flight, out)
+    scores["finite"] = float(np.isfinite(out[:, :4]).all())
+    scores["samples_per_s"] = len(out) / best_s
+    return scores
+
+
+def targets_for(flight: str, name: str, board: dict[str, Scores]) -> Scores:
+    """Tell what a row is to reach."""
+    found = dict(TARGETS.get((flight, name), {}))
+    if flight.startswith("broad") and name in ("complementary", "eskf") and "vqf" in board:
+        found |= {key: board["vqf"][key] for key in ("total",)}
+    if name in ("complementary", "eskf"):
+        found["samples_per_s"] = 1e6 if name == "complementary" else 2e5
+    return found
+
+
+def show(board: dict[str, dict[str, Scores]]) -> None:
+    """Print one table; green reaches its target, red does not."""
+    columns = ["roll", "pitch", "yaw", "total", "heading", "inclination", "pos", "pos_max"]
+    columns += ["pos_1hz", "out10", "out30", "nees_attitude", "nees_velocity", "nees_position"]
+    table = Table(box=box.SIMPLE_HEAD, title="RMSE in deg and m; NEES per axis, expected 1")
+    for column in ("flight", "estimator", *columns, "samples/s"):
+        table.add_column(column, justify="left" if column in ("flight", "estimator") else "right")
+    for flight, rows in board.items():
+        for name, scores in rows.items():
+            wanted = targets_for(flight, name, rows)
+            cells = [cell(scores, column, wanted) for column in columns]
+            table.add_row(flight, name, *cells, cell(scores, "samples_per_s", wanted))
+        table.add_section()
+    Console(width=240).print(table)
+
+
+def cell(scores: Scores, column: str, wanted: Scores) -> str:
+    """Write one number, coloured by its target."""
+    value = scores.get(column, math.nan)
+    if not math.isfinite(value):
+        return ""
+    text = f"{value:,.0f}" if column == "samples_per_s" else f"{value:.2f}"
+    if column not in wanted:
+        return text
+    good = value >= wanted[column] if column == "samples_per_s" else value <= wanted[column]
+    limit = "" if column == "samples_per_s" else f" ({wanted[column]:.2f})"
+    return f"[{'green' if good else 'red'}]{text}[/]{limit}"
+
+
+def main() -> None:
+    """Read, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of *.csv.gz flights")
+    parser.add_argument("--json", type=Path, help="write all numbers here too")
+    parser.add_argument("--no-peers", action="store_true", help="run only our own")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    flights = [read_flight(path) for path in sorted(arguments.data.glob("*.csv*"))]
+    flights += [simulated_flight(seed, calibrated=seed % 2 == 1) for seed in SEEDS]
+    runs = OWN if arguments.no_peers else OWN | PEERS
+    board: dict[str, dict[str, Scores]] = {}
+    for flight in flights:
+        board[flight.name] = {name: score(flight, name, run) for name, run in runs.items()}
+        print(f"{flight.name}: done", file=sys.stderr)
+    show(board)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(board, indent=1))
+
+
+if __name__ == "__main__":
+    main()
