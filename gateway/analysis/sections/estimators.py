@@ -16,6 +16,7 @@ from gateway.analysis.summary import HOLD_OUT, withheld_error_m
 
 COLOURS: Final = {"paper": style.ORANGE, "complementary": style.BLUE, "eskf": style.PINK}
 OTHER: Final = style.GREEN
+TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
 def estimators(case: Case) -> Section | None:
