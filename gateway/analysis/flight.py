@@ -15,6 +15,7 @@ from gateway.estimation.reference import ReferenceSettings, is_usable
 from gateway.estimation.select import EstimationSettings
 from gateway.geometry.geodesy import radii_m
 from gateway.records import (
+    UNKNOWN_VEC3,
     BaroRaw,
     BaroSample,
     GpsFix,
@@ -24,8 +25,14 @@ from gateway.records import (
     NavFlags,
     NavState,
     RawRecord,
+    Vec3,
 )
-from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.calibration import (
+    IDENTITY3,
+    Correction,
+    NodeCalibration,
+    mag_from_counts,
+)
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.settings import Settings
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -34,7 +41,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-UNKNOWN3: Final = (np.nan, np.nan, np.nan)
 SETTLING_US: Final = 5_000_000
 """After the first fix; what comes before says nothing about a flight."""
 
@@ -243,12 +249,9 @@ def flight_of_records(
     Flight
     """
     chain = SensorChain(fusion.sensing, calibration)
-    bare_calibration = NodeCalibration(
-        mounting=calibration.mounting, mag_mounting=calibration.mag_mounting
-    )
-    bare_chain = SensorChain(fusion.sensing, bare_calibration)
+    turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
     samples: list[ImuSample] = []
-    bare: list[ImuSample] = []
+    bare_mag: list[Vec3] = []
     node_times: list[int] = []
     baros: list[BaroSample] = []
     fixes: list[GpsFix] = []
@@ -256,7 +259,9 @@ def flight_of_records(
         match record:
             case ImuRaw():
                 samples.append(chain.imu(record))
-                bare.append(bare_chain.imu(record))
+                counts = mag_from_counts(record.mag_raw, record.mag_lsb_per_gauss)
+                is_new = counts is not None and samples[-1].mag_b_ut is not None
+                bare_mag.append(turned.apply(counts) if counts and is_new else UNKNOWN_VEC3)
                 node_times.append(record.node_time_us)
             case ImuCalibrated():
                 samples.append(_filtered(chain, record))
@@ -265,12 +270,12 @@ def flight_of_records(
             case GpsFix():
                 fixes.append(record)
     flight = flight_of_samples(samples, baros, fixes, name=name, story=story, fusion=fusion)
-    if len(bare) < len(samples):
+    if len(bare_mag) < len(samples):
         return flight
     return replace(
         flight,
         node_time_us=np.array(node_times, np.int64),
-        mag_uncalibrated_b_ut=_mag_of(bare),
+        mag_uncalibrated_b_ut=np.array(bare_mag),
     )
 
 
@@ -344,4 +349,4 @@ def _filtered(chain: SensorChain, imu: ImuCalibrated) -> ImuSample:
 
 
 def _mag_of(samples: list[ImuSample]) -> FloatArray:
-    return np.array([s.mag_b_ut or UNKNOWN3 for s in samples], np.float64)
+    return np.array([s.mag_b_ut or UNKNOWN_VEC3 for s in samples], np.float64)

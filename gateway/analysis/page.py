@@ -1,7 +1,7 @@
 """The report as one HTML page that needs nothing else, and its figures and tables as files."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -11,6 +11,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from gateway.analysis.processes import START, copies, cores
 from gateway.analysis.style import (
     NARROW_IN,
     WIDE_IN,
@@ -101,7 +102,10 @@ class Drawn:
 
 
 def write_report(
-    report: Report, folder: Path, on_picture: Callable[[], None] = lambda: None
+    report: Report,
+    folder: Path,
+    on_picture: Callable[[], None] = lambda: None,
+    jobs: int | None = None,
 ) -> Path:
     """Write the page, its figures as SVG and PNG, and its tables as CSV.
 
@@ -111,7 +115,9 @@ def write_report(
     folder : Path
         Made if it is not there.
     on_picture : callable
-        Called after each figure, for a progress bar.
+        Called after each figure, for a progress bar; it must not be a thread's.
+    jobs : int, optional
+        Processes that draw; one a core by default.
 
     Returns
     -------
@@ -119,13 +125,14 @@ def write_report(
         The page.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    drawn: dict[str, Drawn] = {}
     for section in report.sections:
         for table in section.tables:
             table.frame.to_csv(folder / f"{table.name}.csv", index=False)
-        for picture in section.pictures:
-            drawn[picture.name] = _write_picture(picture, folder)
-            on_picture()
+    pictures = [picture for section in report.sections for picture in section.pictures]
+    drawn = {}
+    for picture in draw_all(pictures, folder, jobs or cores()):
+        drawn[picture.name] = picture
+        on_picture()
     page = folder / PAGE_NAME
     page.write_text(render_page(report, drawn), encoding="utf-8")
     return page
@@ -153,6 +160,30 @@ def prose(text: str) -> Markup:
 def count_pictures(sections: Iterable[Section]) -> int:
     """Count the figures of a report."""
     return sum(len(section.pictures) for section in sections)
+
+
+def draw_all(pictures: Sequence[Picture], folder: Path, jobs: int) -> Iterator[Drawn]:
+    """Draw pictures into files, in any order."""
+    if jobs == 1 or START != "fork":
+        yield from (_write_picture(picture, folder) for picture in pictures)
+        return
+    with copies(jobs, _begin, pictures, folder) as pool:
+        yield from pool.imap_unordered(_draw_one, range(len(pictures)))
+
+
+_work: tuple[Sequence[Picture], Path] | None = None
+"""Of a process that draws."""
+
+
+def _begin(pictures: Sequence[Picture], folder: Path) -> None:
+    global _work
+    _work = (pictures, folder)
+
+
+def _draw_one(index: int) -> Drawn:
+    assert _work is not None
+    pictures, folder = _work
+    return _write_picture(pictures[index], folder)
 
 
 def _write_picture(picture: Picture, folder: Path) -> Drawn:

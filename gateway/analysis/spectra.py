@@ -11,6 +11,9 @@ SEGMENT_S: Final = 8.0
 ALLAN_POINTS: Final = 40
 MIN_CLUSTERS: Final = 4
 """With fewer averages the deviation is a guess."""
+REST_GYRO_RADPS: Final = 0.02
+REST_ACCEL_MPS2: Final = 0.15
+"""Greatest standard deviation within a second at rest."""
 
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
@@ -94,12 +97,8 @@ def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: fl
         return slice(0, 0)
     begins, ends = edges[::2], edges[1::2]
     best = int(np.argmax(ends - begins))
-    return slice(int(begins[best]), int(ends[best]) + window - 1)
-
-
-REST_GYRO_RADPS: Final = 0.02
-REST_ACCEL_MPS2: Final = 0.3
-"""Greatest standard deviation within a second at rest."""
+    # The last window may already hold the gentle beginning of a motion.
+    return slice(int(begins[best]), int(ends[best]))
 
 
 def _spread(x: FloatArray, window: int) -> FloatArray:

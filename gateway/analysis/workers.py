@@ -1,18 +1,13 @@
-"""Trials of a sweep on all cores: one process each, which get the flight once."""
+"""Trials of a sweep on all cores: one process each, which have the flight from the start."""
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
 
+from gateway.analysis.processes import copies, cores
 from gateway.analysis.sweep import Contest, Trials, Values
 
 Scores = dict[str, float]
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
-
-START: Final = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-"""A forked process has the compiled kernels at once; the pool is made before any thread is."""
 
 _trials: Trials | None = None
 """Of this process of the pool; it has no other place for it."""
@@ -36,11 +31,11 @@ def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
     """
     trials = Trials(contest)
     trials.warm_up()
-    count = jobs or len(os.sched_getaffinity(0))
+    count = jobs or cores()
     if count == 1:
         yield lambda points: ((k, trials.run(values)) for k, values in enumerate(points))
         return
-    with multiprocessing.get_context(START).Pool(count, _begin, (trials,)) as processes:
+    with copies(count, _begin, trials) as processes:
 
         def run(points: Sequence[Values]) -> Iterator[tuple[int, Scores]]:
             return processes.imap_unordered(_run, enumerate(points), _chunk(points, count))

@@ -23,6 +23,8 @@ from gateway.cli.run import ConfigOption, load_settings, or_refuse
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
+COLUMNS: Final = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
 ]
@@ -69,17 +71,19 @@ def report(
     others = None
     if against_config is not None:
         others = fusion_of(or_refuse(lambda: load_settings(against_config)))
-    with _progress() as progress:
+    console = Console(stderr=True)
+    with Progress(*COLUMNS, console=console, transient=True, auto_refresh=False) as progress:
         task = progress.add_task("fusing", total=None)
+        progress.refresh()
         case = make_case(loaded)
         compared = make_case(other, others) if other is not loaded or others else None
-        progress.update(task, description="measuring")
         made = make_report(case, compared)
         progress.update(task, description="drawing", total=count_pictures(made.sections))
-        page = write_report(made, output, lambda: progress.advance(task))
+
+        def advance() -> None:
+            # The bar has no thread of its own: the processes that draw are copies of this one.
+            progress.advance(task)
+            progress.refresh()
+
+        page = write_report(made, output, advance)
     print(page)
-
-
-def _progress() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=True)

@@ -16,6 +16,7 @@ from gateway.analysis.summary import HOLD_OUT, withheld_error_m
 
 COLOURS: Final = {"paper": style.ORANGE, "complementary": style.BLUE, "eskf": style.PINK}
 OTHER: Final = style.GREEN
+TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
 def estimators(case: Case) -> Section | None:
@@ -23,6 +24,7 @@ def estimators(case: Case) -> Section | None:
     reference = _reference(case)
     if reference is None:
         return None
+    turns = bool(np.isfinite(reference.track.q_nb).any())
     tracks = dict(case.tracks)
     if case.flight.recorded is not None:
         tracks["recorded in flight"] = case.flight.recorded
@@ -40,10 +42,14 @@ def estimators(case: Case) -> Section | None:
             Picture(
                 "estimator_errors",
                 lambda width: _draw_errors(case, reference, width),
-                "Error of each estimator over the flight. Tilt is the part of the attitude error "
-                "about a horizontal axis. Where GPS is lost the place drifts until it is back; its "
-                "scale is logarithmic. The first seconds, in which every estimator settles, do "
-                "not count.",
+                "Error of each estimator over the flight. "
+                + (
+                    "Tilt is the part of the attitude error about a horizontal axis. "
+                    if turns
+                    else ""
+                )
+                + "Where GPS is lost the place drifts until it is back; its scale is logarithmic. "
+                "The first seconds, in which every estimator settles, do not count.",
             )
         ],
         [

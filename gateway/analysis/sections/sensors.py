@@ -16,6 +16,7 @@ from gateway.units import US_PER_S
 AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
 MIN_REST_S: Final = 5.0
 NODE_WRAP_US: Final = 1 << 32
+LONGEST_LOSS_US: Final = 60 * US_PER_S
 
 
 def noise(case: Case) -> Section:
@@ -65,8 +66,8 @@ def timing(case: Case) -> Section | None:
             Picture(
                 "timing",
                 lambda width: _draw_timing(case.flight, node, width),
-                "Interval between neighbouring samples, in milliseconds. A sample that is lost "
-                "doubles an interval; jitter spreads it.",
+                "Left: interval between neighbouring samples; a sample that is lost doubles it, "
+                "jitter spreads it. Right: samples lost in each second.",
             )
         ],
         [Table("timing", table, "Samples lost are gaps in the node's own time.", digits=3)],
@@ -83,8 +84,7 @@ def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
     """
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     nominal_us = float(np.median(interval_us))
-    missing = np.maximum(np.rint(interval_us / nominal_us) - 1.0, 0.0)
-    missing[interval_us > 60 * US_PER_S] = 0.0
+    missing = missing_samples(node_time_us)
     count = len(node_time_us)
     jitter_ms = (np.diff(flight.time_us) - interval_us) * 1e-3
     return pd.DataFrame(
@@ -99,6 +99,14 @@ def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
             }
         ]
     )
+
+
+def missing_samples(node_time_us: IntArray) -> FloatArray:
+    """Count the samples missing before each but the first, by the node's own clock."""
+    interval_us = np.diff(node_time_us) % NODE_WRAP_US
+    missing = np.maximum(np.rint(interval_us / np.median(interval_us)) - 1.0, 0.0)
+    # So long a gap is a node that was switched off.
+    return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
 
 
 def magnetometer(case: Case) -> Section | None:
@@ -261,8 +269,10 @@ def _draw_timing(flight: Flight, node_time_us: IntArray, width_in: float) -> Fig
     left.set_yscale("log")
     left.set(xlabel="interval (ms)", ylabel="samples")
     left.legend(loc="upper right")
-    style.draw(right, flight.time_s[1:], gateway_ms, style.BLUE, "gateway", lw=0.8)
-    right.set(xlabel="time (s)", ylabel="interval (ms)")
+    seconds = np.arange(int(flight.duration_s) + 2).tolist()
+    lost, _ = np.histogram(flight.time_s[1:], seconds, weights=missing_samples(node_time_us))
+    right.stairs(lost, seconds, color=style.RED, fill=True)
+    right.set(xlabel="time (s)", ylabel="lost in each second")
     return figure
 
 
