@@ -68,7 +68,8 @@ def register(app: typer.Typer) -> None:
 
 def calibrate(
     steps: Annotated[
-        list[Step] | None, typer.Argument(help="What to calibrate [default: gyro accel mag level].")
+        list[Step] | None,
+        typer.Argument(help="What to calibrate; by default gyro accel mag level."),
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,

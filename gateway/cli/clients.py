@@ -75,7 +75,7 @@ def mark(
     *,
     alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
     aircraft: Annotated[
-        int | None, typer.Option("--aircraft", help="For this one only [default: all].")
+        int | None, typer.Option("--aircraft", help="For this one only; by default all.")
     ] = None,
 ) -> None:
     """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""

@@ -60,7 +60,7 @@ def save(
     *,
     recording: Annotated[
         str | None,
-        typer.Option("--recording", help="Which one [default: the one that runs, or ran last]."),
+        typer.Option("--recording", help="Which one; by default the one that runs, or ran last."),
     ] = None,
     config: ConfigOption = None,
 ) -> None:
