@@ -69,7 +69,7 @@ def register(app: typer.Typer) -> None:
 def calibrate(
     steps: Annotated[
         list[Step] | None,
-        typer.Argument(help="What to calibrate; by default gyro accel mag level."),
+        typer.Argument(help="Which; by default gyro accel mag level."),
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
