@@ -17,7 +17,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_noise_degprs: Annotated[
         float,
         setting("Noise of the gyroscope, vibration included.", "deg/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.1
+    ] = 0.19
     gyro_roughness: Annotated[
         float,
         setting(
@@ -26,7 +26,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=10.0,
         ),
-    ] = 1.0
+    ] = 0.57
     gyro_scale: Annotated[
         float,
         setting(
@@ -38,10 +38,10 @@ class EskfSettings(Settings, frozen=True):
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.08
+    ] = 0.11
     accel_roughness: Annotated[
         float, setting("The same of the specific force.", ge=0.0, le=10.0)
-    ] = 0.5
+    ] = 0.35
     accel_scale: Annotated[
         float,
         setting("Share by which the specific force beyond gravity is wrong.", ge=0.0, le=0.2),
@@ -51,7 +51,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.007
     accel_bias_walk_mps2prs: Annotated[
         float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.0015
+    ] = 0.002
     gyro_bias_degps: Annotated[
         float, setting("Gyroscope bias at the start.", "deg/s", ge=0.01, le=20.0)
     ] = 1.0
@@ -64,13 +64,13 @@ class EskfSettings(Settings, frozen=True):
     gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 0.6
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.6
+    ] = 0.65
     gps_height_wander_m: Annotated[
         float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
     ] = 2.5
     gps_wander_s: Annotated[
         float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
-    ] = 8.0
+    ] = 10.0
     gps_velocity_mps: Annotated[
         float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
     ] = 0.2
@@ -86,7 +86,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.5,
         ),
-    ] = 0.06
+    ] = 0.08
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
     ] = 4.5
@@ -95,7 +95,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.25
     mag_wander_s: Annotated[
         float, setting("Correlation time of the compass's slow error.", "s", ge=0.5, le=3600.0)
-    ] = 20.0
+    ] = 8.0
     mag_norm_tolerance: Annotated[
         float,
         setting("Share by which the field may differ from its usual strength.", ge=0.01, le=1.0),

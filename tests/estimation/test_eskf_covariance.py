@@ -1,0 +1,125 @@
+"""The filter's hand-written matrix products against the matrices themselves."""
+
+import numpy as np
+import pytest
+
+from gateway.estimation.eskf.covariance import absorb, absorb_considering, clear, hold, propagate
+from gateway.estimation.eskf.measure import position_row, velocity_row
+from gateway.estimation.eskf.settings import EskfSettings, make_gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    MAG_BIAS,
+    POS,
+    STATES,
+    TILT,
+    VEL,
+    WANDER,
+    State,
+)
+from gateway.estimation.record import new_record
+from gateway.estimation.reference import ReferenceSettings
+
+GAINS = make_gains(EskfSettings(), ReferenceSettings())
+
+
+def cross(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+@pytest.fixture
+def state(rng: np.random.Generator) -> State:
+    s = new_record(State)
+    root = rng.normal(size=(STATES, STATES))
+    s.P[:] = root @ root.T
+    s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
+    return s
+
+
+def transition(force: np.ndarray, turn: np.ndarray, dt: float) -> np.ndarray:
+    F = np.eye(STATES)
+    F[TILT : TILT + 3, GYRO_BIAS : GYRO_BIAS + 3] = -turn
+    F[VEL : VEL + 3, TILT : TILT + 3] = -cross(force)
+    F[VEL : VEL + 3, ACCEL_BIAS : ACCEL_BIAS + 3] = -turn
+    F[POS : POS + 3, VEL : VEL + 3] = dt * np.eye(3)
+    return F
+
+
+def test_propagation_is_the_matrix_product(state: State, rng: np.random.Generator) -> None:
+    force, turn, dt = rng.normal(size=3), rng.normal(size=(3, 3)), 0.02
+    state.P[TILT + 2, TILT + 2] = 0.5
+    before = state.P.copy()
+    state.pending_s = dt
+    state.pending_force_n[:], state.pending_turn[:] = force, turn
+    propagate(state, GAINS)
+    F = transition(force, turn, dt)
+    faded = [*range(WANDER, WANDER + 3), MAG_BIAS]
+    kept = [k for k in range(STATES) if k not in faded]
+    expected = F @ before @ F.T
+    added = state.P - expected
+    block = added[np.ix_(kept, kept)]
+    np.testing.assert_allclose(block - np.diag(np.diag(block)), 0.0, atol=1e-9)
+    diagonal = np.diag(block)
+    assert (diagonal[: TILT + 2] >= 0).all()
+    assert diagonal[VEL] == pytest.approx(GAINS.accel_density * dt, rel=1e-6)
+    np.testing.assert_allclose(state.P, state.P.T, atol=1e-9)
+    assert state.pending_s == 0.0
+
+
+def test_update_is_the_kalman_update(state: State, rng: np.random.Generator) -> None:
+    before, h = state.P.copy(), rng.normal(size=STATES)
+    clear(state)
+    state.h[:] = h
+    absorb(state, 2.0, 3.0, 1e12)
+    gain = before @ h / (h @ before @ h + 3.0)
+    np.testing.assert_allclose(state.dx, gain * 2.0, atol=1e-9)
+    np.testing.assert_allclose(state.P, before - np.outer(gain, h @ before), atol=1e-8)
+
+
+def test_held_states_are_considered_but_not_changed(state: State, rng: np.random.Generator) -> None:
+    before, h = state.P.copy(), rng.normal(size=STATES)
+    clear(state)
+    state.h[:] = h
+    hold(state, ACCEL_BIAS, 3)
+    absorb_considering(state, 2.0, 3.0, 1e12)
+    held = slice(ACCEL_BIAS, ACCEL_BIAS + 3)
+    np.testing.assert_array_equal(state.dx[held], 0.0)
+    np.testing.assert_allclose(state.P[held, held], before[held, held])
+    assert np.linalg.eigvalsh(state.P).min() > -1e-8
+
+
+def test_an_outlier_moves_little_and_is_never_ignored(state: State) -> None:
+    moves = []
+    for innovation in (1.0, 10.0, 1000.0):
+        s = state.copy()
+        clear(s)
+        s.h[POS] = 1.0
+        s.P[:] = np.eye(STATES)
+        absorb(s, innovation, 1.0, 25.0)
+        moves.append(float(s.dx[POS]))
+    assert moves[0] == pytest.approx(0.5)
+    assert 0.0 < moves[2] < moves[1] < 5.1
+
+
+def test_a_late_row_is_the_present_error_carried_back(rng: np.random.Generator) -> None:
+    s = new_record(State)
+    s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
+    lag, steps = 0.3, 3000
+    dt = lag / steps
+    forces = np.array([3.0, -2.0, -9.0]) + np.outer(np.linspace(0, 1, steps), [1.0, 2.0, 0.5])
+    F, once, twice = np.eye(STATES), np.zeros(3), np.zeros(3)
+    for force in forces:
+        F = transition(force * dt, np.eye(3) * dt, dt) @ F
+        twice += once * dt + 0.5 * force * dt * dt
+        once += force * dt
+    back = np.linalg.inv(F)
+    for k in range(3):
+        velocity_row(s, k, tuple(once), lag)
+        expected = back[VEL + k].copy()
+        expected[GYRO_BIAS : GYRO_BIAS + 3] = 0.0
+        np.testing.assert_allclose(s.h, expected, atol=2e-3)
+        position_row(s, k, tuple(once), tuple(twice), lag)
+        expected = back[POS + k].copy()
+        expected[GYRO_BIAS : GYRO_BIAS + 3] = 0.0
+        expected[WANDER + k] = 1.0
+        np.testing.assert_allclose(s.h, expected, atol=2e-3)

@@ -1,0 +1,144 @@
+"""The parts that both compiled estimators are made of."""
+
+import math
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+from gateway.estimation.alignment import MatchState, collect_match
+from gateway.estimation.complementary.state import ComplementarySettings, State, make_gains
+from gateway.estimation.health import HealthState, judge_sensors
+from gateway.estimation.magfield import NEW_FIELD_S, judge_field
+from gateway.estimation.place import PlaceState, is_relocked, move_origin
+from gateway.estimation.record import FloatArray, copy_record, filled_record, new_record
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import watch_rest
+
+GAINS = make_gains(ComplementarySettings(), ReferenceSettings())
+LEVEL = (0.0, 0.0, -9.81)
+
+
+class TestRecord:
+    class Declared:
+        count: int
+        matrix: Annotated[FloatArray, (2, 2)]
+
+    def test_copies_do_not_share_memory(self) -> None:
+        record = new_record(self.Declared)
+        copy = copy_record(record)
+        record.matrix[0, 1] = 5.0
+        assert (copy.matrix[0, 1], record.matrix[0, 1]) == (0.0, 5.0)
+
+    def test_a_field_without_a_value_is_an_error(self) -> None:
+        with pytest.raises(KeyError, match="matrix"):
+            filled_record(self.Declared, {"count": 1})
+
+
+class TestRest:
+    def watch(self, gyro, accel=lambda t: LEVEL, moving: bool = False, seconds: float = 4.0) -> int:
+        state = new_record(State)
+        state.accel_lp[2] = LEVEL[2]
+        for k in range(round(seconds * 100)):
+            watch_rest(state, GAINS, gyro(k / 100), accel(k / 100), moving, 0.01)
+        return int(state.at_rest)
+
+    def test_still(self) -> None:
+        assert self.watch(lambda t: (0.01, 0.0, 0.0)) == 1
+
+    def test_too_short(self) -> None:
+        assert self.watch(lambda t: (0.0, 0.0, 0.0), seconds=1.0) == 0
+
+    def test_trembling(self) -> None:
+        assert self.watch(lambda t: (0.2 * math.sin(30 * t), 0.0, 0.0)) == 0
+
+    def test_shaking(self) -> None:
+        def shaken(t: float) -> tuple[float, float, float]:
+            return (3.0 * math.sin(30 * t), 0.0, -9.81)
+
+        assert self.watch(lambda t: (0.0, 0.0, 0.0), shaken) == 0
+
+    def test_a_smooth_turn_is_no_rest(self) -> None:
+        assert self.watch(lambda t: (0.0, 0.0, 0.2)) == 0
+
+    def test_never_in_flight(self) -> None:
+        assert self.watch(lambda t: (0.0, 0.0, 0.0), moving=True) == 0
+
+
+class TestField:
+    def feed(self, state: State, norm: float, seconds: float, rate: float = 1.0) -> float:
+        state.rate_b[2] = rate
+        for _ in range(round(seconds * 20)):
+            weight = judge_field(state, GAINS, norm, 1.1, 0.05)
+        return weight
+
+    def test_a_strange_field_is_not_believed_and_a_lasting_one_is(self) -> None:
+        state = new_record(State)
+        assert self.feed(state, 45.0, 10.0) == 1.0
+        assert state.mag_norm_ref == pytest.approx(45.0)
+        assert self.feed(state, 70.0, 2.0) == 0.0
+        assert state.mag_disturbed == 1
+        assert self.feed(state, 45.0, 2.0) == 1.0
+        assert self.feed(state, 70.0, NEW_FIELD_S + 2.0) == 1.0
+        assert state.mag_norm_ref == pytest.approx(70.0, rel=0.05)
+
+    def test_a_strange_field_at_a_standstill_stays_strange(self) -> None:
+        state = new_record(State)
+        self.feed(state, 45.0, 10.0)
+        self.feed(state, 70.0, NEW_FIELD_S + 5.0, rate=0.0)
+        assert state.mag_disturbed == 1
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 179.0, -135.0])
+def test_accelerations_tell_the_first_heading(turn_deg: float) -> None:
+    rng = np.random.default_rng(1)
+    state, turn = new_record(MatchState), math.radians(turn_deg)
+    done = False
+    for _ in range(200):
+        n, e = rng.normal(0, 2.0, 2)
+        force = (
+            n * math.cos(turn) + e * math.sin(turn),
+            -n * math.sin(turn) + e * math.cos(turn),
+            0.0,
+        )
+        done = collect_match(state, force, (n, e, 0.0), 0.2, 0.2)
+        if done:
+            break
+    assert done
+    assert math.atan2(state.match[1], state.match[0]) == pytest.approx(turn, abs=1e-6)
+
+
+def test_stuck_sensors() -> None:
+    state = new_record(HealthState)
+    rng = np.random.default_rng(1)
+    for _ in range(150):
+        verdict = judge_sensors(state, (0.3, 0.0, 0.0), tuple(rng.normal(size=3)), 0.01)
+    assert tuple(verdict) == (False, True)
+    for _ in range(150):
+        verdict = judge_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.01)
+    assert tuple(verdict) == (True, True)
+
+
+def test_rejected_fixes_are_believed_when_they_agree() -> None:
+    state = new_record(PlaceState)
+    state.reject_last[0] = -1e9
+    believed = []
+    for k in range(60):
+        state.time_s = 0.2 * k
+        believed.append(is_relocked(state, 8.0, (300.0 + k, 0.0, 0.0), (5.0, 0.0, 0.0)))
+    assert believed.index(True) == pytest.approx(8.0 / 0.2, abs=2)
+    wild = new_record(PlaceState)
+    wild.reject_last[0] = -1e9
+    for k in range(200):
+        wild.time_s = 0.2 * k
+        assert not is_relocked(wild, 8.0, (300.0 * (k % 2), 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def test_the_origin_moves_along_and_the_place_stays() -> None:
+    state = new_record(PlaceState)
+    move_origin(state, 47.0, 8.0)
+    assert (state.origin_lat, state.origin_lon) == (47.0, 8.0)
+    state.pos_n[0] = 6_000.0
+    move_origin(state, 47.0, 8.0)
+    assert state.origin_lat > 47.05
+    assert abs(state.pos_n[0]) < 1e-6
