@@ -230,16 +230,6 @@ class Hub:
 
     def deliver(self, link: Link, frame: bytes, now_us: int) -> None:
         """Take one frame that a link received, and pass it on to whom it concerns."""
-        express = link.express.get(key_of(frame))
-        if express is None:
-            self._judge(link, frame, now_us)
-            return
-        express.send(frame)
-        if self._on_foreign is not None:
-            self._on_foreign(frame)
-
-    def _judge(self, link: Link, frame: bytes, now_us: int) -> None:
-        """Find out what a frame is, and whether it has been here before."""
         origin = origin_of(frame)
         if self._vehicles.is_own(origin, now_us):
             self._looped += 1
@@ -314,11 +304,17 @@ class Hub:
             self._fanout.deliver(frame, self._table.ways_to_vehicles(link.client_id))
             return
         self._fanout.forward(frame, link.client_id, now_us)
-        if telemetry and not self._table.is_shared(origin_of(frame), now_us):
-            takers = self._fanout.takers(frame, link.client_id)
-            if takers is not None and len(link.express) < MAX_EXPRESS:
-                links = [self._links[taker] for taker in takers]
-                link.express[key_of(frame)] = Express(message_id, links)
+        if telemetry and link.is_direct and not self._table.is_shared(origin_of(frame), now_us):
+            self._open_express(link, frame)
+
+    def _open_express(self, link: Link, frame: bytes) -> None:
+        """Let the next frames of this kind take the short way, if all of them go the same one."""
+        key = key_of(frame)
+        takers = self._fanout.takers(frame, link.client_id)
+        if takers is None or key in link.express or len(link.express) >= MAX_EXPRESS:
+            return
+        links = [self._links[taker] for taker in takers]
+        link.express[key] = Express(link, message_id_of(frame), links, self._on_foreign)
 
     def _tap(self, frame: bytes) -> None:
         self._forwarded += 1

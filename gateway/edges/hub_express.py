@@ -6,6 +6,7 @@ counted on the way but once for all. Whenever anybody comes, goes or changes, al
 given up, and the next frame of each kind is judged anew.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,22 +18,34 @@ class Express:
 
     Parameters
     ----------
+    source : Link
+        Where the frames come from.
     message_id : int
         Of the frames.
     links : list of Link
         Those who take each of them.
+    tap : callable, optional
+        Sees each frame too.
     """
 
-    __slots__ = ("_bytes", "_direct", "_frames", "_message_id", "_others")
+    __slots__ = ("_bytes", "_direct", "_frames", "_message_id", "_others", "_source", "_tap")
 
-    def __init__(self, message_id: int, links: list["Link"]) -> None:
+    def __init__(
+        self,
+        source: "Link",
+        message_id: int,
+        links: list["Link"],
+        tap: Callable[[bytes], None] | None,
+    ) -> None:
+        self._source = source
         self._message_id = message_id
+        self._tap = tap
         self._direct = [link for link in links if link.is_direct]
         self._others = [link for link in links if not link.is_direct]
         self._frames = self._bytes = 0
 
     def send(self, frame: bytes) -> None:
-        """Hand a frame to every link."""
+        """Count a frame as received and hand it to every link."""
         self._frames += 1
         self._bytes += len(frame)
         for link in self._direct:
@@ -42,11 +55,15 @@ class Express:
                 link.recover_uncounted(frame, error)
         for link in self._others:
             link.transmit(frame, self._message_id)
+        if self._tap is not None:
+            self._tap(frame)
 
     def settle(self) -> int:
-        """Add what was sent to the links' own counters; return how many frames that were."""
+        """Add what passed to the links' own counters; return how many frames that were."""
         frames, size = self._frames, self._bytes
         self._frames = self._bytes = 0
+        self._source.counters.received += frames
+        self._source.counters.bytes_received += size
         for link in self._direct:
             link.counters.sent += frames
             link.counters.bytes_sent += size

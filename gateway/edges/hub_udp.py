@@ -115,16 +115,23 @@ class DatagramLink(Link):
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Take one datagram that this peer sent."""
+        if self.state != "open":
+            self.revive()
+        if not is_frame(data):
+            self.receive(split_datagram(data), len(data), now_us)
+            return
+        self.heard_us = now_us
+        if express := self.express.get(data[5:10]):
+            express.send(data)
+            return
+        self.counters.received += 1
+        self.counters.bytes_received += len(data)
+        self.context.deliver(self, data, now_us)
+
+    def revive(self) -> None:
+        """Note that the peer is there after all."""
         self.state = "open"
         self.refused_us = None
-        if is_frame(data):
-            counters = self.counters
-            counters.received += 1
-            counters.bytes_received += len(data)
-            self.heard_us = now_us
-            self.context.deliver(self, data, now_us)
-        else:
-            self.receive(split_datagram(data), len(data), now_us)
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
         """Judge a failed send that will be counted as sent all the same."""

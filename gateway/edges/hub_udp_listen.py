@@ -41,10 +41,10 @@ class UdpPeer(DatagramLink):
     def __init__(self, context: HubContext, client_id: int, listener: Endpoint, peer: str) -> None:
         super().__init__(context, client_id, listener, remote=peer, name=peer)
 
-    def accept(self, data: bytes, now_us: int) -> None:
-        """Take one datagram of the client, which is alive then."""
+    def revive(self) -> None:
+        """Note that the client is there after all."""
         self._end_hold()
-        super().accept(data, now_us)
+        super().revive()
 
     def tick(self, now_us: int) -> None:
         """Call trouble off that was not repeated; try a client again that refused."""
