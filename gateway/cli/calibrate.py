@@ -192,7 +192,7 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
         table = open_rows(path, Wishes(current=PipelineSettings(settings.default_aircraft)))
         raws = [
             row.raw
-            for row in table.rows
+            for row in table.plain_rows
             if row.raw is not None and row.raw.node.vehicle_id == vehicle
         ]
     if not raws:
