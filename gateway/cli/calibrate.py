@@ -20,7 +20,6 @@ from gateway.cli.run import ConfigOption, read_aircraft, read_settings
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock
 from gateway.edges.serial_link import SerialLink, SerialSettings
-from gateway.flightlog.row import TableRow
 from gateway.pipeline import PipelineSettings
 from gateway.records import ImuRaw
 from gateway.sensing.calibration import NodeCalibration
@@ -68,8 +67,7 @@ def register(app: typer.Typer) -> None:
 
 def calibrate(
     steps: Annotated[
-        list[Step] | None,
-        typer.Argument(help="Which; by default gyro accel mag level."),
+        list[Step] | None, typer.Argument(help="Which; by default gyro accel mag level.")
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
@@ -194,10 +192,8 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
         table = open_rows(path, Wishes(current=PipelineSettings(settings.default_aircraft)))
         raws = [
             row.raw
-            for row in table.rows
-            if isinstance(row, TableRow)
-            and row.raw is not None
-            and row.raw.node.vehicle_id == vehicle
+            for row in table.plain_rows
+            if row.raw is not None and row.raw.node.vehicle_id == vehicle
         ]
     if not raws:
         refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")
