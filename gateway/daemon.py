@@ -19,7 +19,7 @@ from gateway.edges.recorder import Recorder
 from gateway.edges.serial_link import SerialLink
 from gateway.edges.service import ServiceNotifier, set_realtime_priority
 from gateway.flightlog.table import TableHeader
-from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
+from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
 from gateway.records import (
     BaroRaw,
     ClientInterval,
@@ -101,11 +101,11 @@ class Daemon:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
         set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
+        self._recorder.start()
         self._metrics.listen(self._settings.hub.metrics_port)
         self._serial.start()
         if self._receiver is not None:
             self._receiver.start()
-        self._recorder.start()
         self._opening = asyncio.get_running_loop().create_task(self._open_control())
         self._poll()
         self._notifier.ready()
@@ -230,6 +230,8 @@ class Daemon:
                     (self._recorder.record if action.start else self._recorder.stop)()
                 case FusedSample() | BaroRaw() | GpsFix():
                     self._recorder.flight(action)
+                case SettingsChanged():
+                    self._recorder.settings_changed(action.vehicle_id)
 
     def _save(self, vehicle_id: int) -> None:
         """Write an aircraft's settings to its file, and tell how that went."""

@@ -58,9 +58,16 @@ from gateway.wire.link import Link
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
-Action = (
-    Outgoing | ClientInterval | RecordingRequest | SaveSettings | FusedSample | BaroRaw | GpsFix
-)
+
+@dataclass(frozen=True, slots=True)
+class SettingsChanged:
+    """What comes from here on was fused with other settings."""
+
+    vehicle_id: int
+
+
+Recorded = FusedSample | BaroRaw | GpsFix | SettingsChanged
+Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | Recorded
 """Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
 
 ABSORB: Final = {
@@ -123,10 +130,10 @@ class Aircraft:
             case BaroRaw():
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
-                return [*self.perform(self.vehicle.on_baro(baro, now_us), now_us), record]
+                return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
             case GpsFix():
                 self._estimator.update_gps(record)
-                return [*self.perform(self.vehicle.on_gps(record, now_us), now_us), record]
+                return self._recorded(record, self.vehicle.on_gps(record, now_us), now_us)
             case NodeStatus():
                 return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
 
@@ -144,8 +151,16 @@ class Aircraft:
         state = self._estimator.update_imu(sample)
         self.state = state if self._correct is None else self._correct(state)
         fused = FusedSample(self.vehicle_id, raw, sample, self.state)
-        # Frames first: nothing that is recorded may delay what is shown.
-        return [*self.perform(self.vehicle.on_state(self.state, sample, now_us), now_us), fused]
+        return self._recorded(fused, self.vehicle.on_state(self.state, sample, now_us), now_us)
+
+    def _recorded(
+        self, record: FusedSample | BaroRaw | GpsFix, wanted: Iterable[VehicleAction], now_us: int
+    ) -> list[Action]:
+        """Put what is recorded behind the frames, which it may not delay, but before a change."""
+        actions = self.perform(wanted, now_us)
+        changed = [action for action in actions if isinstance(action, SettingsChanged)]
+        others = [action for action in actions if not isinstance(action, SettingsChanged)]
+        return [*others, record, *changed]
 
     def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
         """Carry out what the vehicle asks of the other stages; hand the rest on.
@@ -163,23 +178,33 @@ class Aircraft:
         actions: list[Action] = []
         for action in wanted:
             if isinstance(action, SettingsChange):
-                self._change(action.section, action.settings)
+                actions += self._change(action.section, action.settings)
             elif isinstance(action, CalibrationMeasured):
                 calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
-                self._change("calibration", calibration)
+                actions += self._change("calibration", calibration)
                 told = self.vehicle.take_settings("calibration", calibration, now_us)
                 actions += self.perform(told, now_us)
             else:
                 actions.append(action)
         return actions
 
-    def _change(self, section: str, settings: Settings) -> None:
+    def change(self, settings: AircraftSettings) -> None:
+        """Take over what differs between these settings and those that hold."""
+        for section in ("sensing", "calibration", "estimation"):
+            wanted = getattr(settings, section)
+            if wanted != getattr(self.settings, section):
+                self._change(section, wanted)
+
+    def _change(self, section: str, settings: Settings) -> list[Action]:
         """Rebuild the stage whose settings changed; the others go on undisturbed."""
         self.settings = msgspec.structs.replace(self.settings, **{section: settings})
         if section in ("sensing", "calibration"):
             self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
         elif section == "estimation":
             self._estimator = _succeed(self._estimator, make_estimator(self.settings.estimation))
+        else:
+            return []
+        return [SettingsChanged(self.vehicle_id)]
 
 
 def _succeed(old: Estimator, new: Estimator) -> Estimator:
@@ -223,6 +248,11 @@ class Pipeline:
         if aircraft is None:
             aircraft = self.aircraft[vehicle_id] = Aircraft(vehicle_id, self._settings)
         return aircraft.take(record, now_us)
+
+    def change(self, vehicle_id: int, settings: AircraftSettings) -> None:
+        """Let an aircraft go on with other settings, as it did when it was recorded."""
+        if vehicle_id in self.aircraft:
+            self.aircraft[vehicle_id].change(settings)
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""

@@ -25,18 +25,21 @@ class Replay:
     ----------
     pipeline : Pipeline
         Fresh, with the settings to fuse with.
+    follow : bool
+        Whether to change settings where they were changed in flight.
     """
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    def __init__(self, pipeline: Pipeline, *, follow: bool = True) -> None:
         self._pipeline = pipeline
+        self._follow = follow
         self._now_us: int | None = None
 
-    def take(self, row: TableRow) -> Iterator[tuple[int, Action]]:
-        """Take one row.
+    def take(self, row: TableRow | TableHeader) -> Iterator[tuple[int, Action]]:
+        """Take one row, or a change of settings.
 
         Parameters
         ----------
-        row : TableRow
+        row : TableRow or TableHeader
             The next of the file.
 
         Yields
@@ -44,6 +47,10 @@ class Replay:
         tuple of int and Action
             Time on the recorded gateway clock, and what the pipeline decided.
         """
+        if isinstance(row, TableHeader):
+            if self._follow:
+                self._pipeline.change(row.vehicle_id, settings_of(row))
+            return
         for record in records_of(row):
             yield from self._wait(record.time_us)
             now_us = self._now_us if self._now_us is not None else record.time_us

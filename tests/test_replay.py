@@ -9,8 +9,8 @@ import pytest
 
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
-from gateway.flightlog.table import TableHeader, TableReader, encode_head
-from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
+from gateway.flightlog.table import TableHeader, TableReader, encode_head, encode_header
+from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
 from gateway.records import (
     BaroRaw,
     FusedSample,
@@ -26,6 +26,7 @@ from gateway.records import (
 from gateway.replay import InterpolatedPosition, Replay, header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
+from gateway.vehicle.actions import SettingsChange
 from gateway.vehicle.settings import VehicleSettings
 
 IMU_US = 16_000
@@ -127,6 +128,43 @@ def test_a_table_fused_again_gives_the_recorded_states_to_the_last_bit(
     assert repr([row.state for row in rows if row.state]) == repr(states)
     assert repr(fuse_again(settings_of(header), rows)) == repr(states)
     assert math.isfinite(states[-1].lat_deg)
+
+
+def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) -> None:
+    settings = make_settings("paper")
+    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
+    text, states = encode_head(header_for(settings, 1)), []
+    changes = {
+        400: SettingsChange(1, "estimation", make_settings("complementary").estimation, ""),
+        800: SettingsChange(1, "calibration", NodeCalibration(), ""),
+        1200: SettingsChange(1, "vehicle", VehicleSettings(), ""),
+    }
+    records = make_flight(rng, 30)
+    for number, record in enumerate(records):
+        actions = pipeline.take(record, record.time_us)
+        if number in changes:
+            aircraft = pipeline.aircraft[1]
+            actions += aircraft.perform([changes[number]], record.time_us)
+        for action in actions:
+            if isinstance(action, SettingsChanged):
+                text += "".join(map(row_to_line, rows.flush()))
+                text += encode_header(header_for(pipeline.aircraft[1].settings, 1))
+            elif isinstance(action, FusedSample | BaroRaw | GpsFix):
+                text += "".join(map(row_to_line, rows.add(action)))
+            if isinstance(action, FusedSample):
+                states.append(action.state)
+    reader = TableReader()
+    events = reader.feed(text.encode(), final=True)
+    assert sum(isinstance(event, TableHeader) for event in events) == 2
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    again = [
+        action.state
+        for event in events
+        if isinstance(event, TableRow | TableHeader)
+        for _, action in replay.take(event)
+        if isinstance(action, FusedSample)
+    ]
+    assert repr(again) == repr(states)
 
 
 def test_other_settings_give_another_flight(rng: np.random.Generator) -> None:

@@ -3,8 +3,12 @@
 
 #include <string.h>
 
-void payload_queue_push(PayloadQueue *queue, const void *bytes, uint8_t size) {
+void payload_queue_push(PayloadQueue *queue, const void *bytes, uint8_t size, bool front_in_use) {
     if (queue->count == PAYLOAD_QUEUE_SIZE) {
+        if (front_in_use) {
+            const uint8_t second = static_cast<uint8_t>((queue->first + 1) % PAYLOAD_QUEUE_SIZE);
+            queue->payloads[second] = queue->payloads[queue->first];
+        }
         payload_queue_pop(queue);
         ++queue->dropped;
     }

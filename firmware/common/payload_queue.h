@@ -21,7 +21,8 @@ struct PayloadQueue {
     Payload payloads[PAYLOAD_QUEUE_SIZE];
 };
 
-void payload_queue_push(PayloadQueue *queue, const void *bytes, uint8_t size);
+// `front_in_use`: the radio is sending the front one, so the next oldest goes in its place.
+void payload_queue_push(PayloadQueue *queue, const void *bytes, uint8_t size, bool front_in_use);
 
 // The oldest payload, or null.
 const Payload *payload_queue_front(const PayloadQueue *queue);

@@ -5,6 +5,7 @@
 #include <avr/io.h>
 #include <util/atomic.h>
 
+#include "hal/events.h"
 #include "settings.h"
 
 namespace {
@@ -22,7 +23,7 @@ ISR(TIMER1_OVF_vect) { clock_overflows = clock_overflows + 1; }
 
 ISR(TIMER1_COMPA_vect) {
     OCR1A = static_cast<uint16_t>(OCR1A + TICKS_PER_MS);
-    GPIOR0 |= 1 << 0;  // EVENT_TICK
+    GPIOR0 |= EVENT_TICK;
 }
 
 void clock_start() {

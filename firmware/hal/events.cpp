@@ -6,7 +6,7 @@
 #include <avr/sleep.h>
 
 // GPIOR0 holds the events: bits there are set by a single instruction, so interrupts need no lock.
-uint8_t events_wait() {
+void events_wait() {
     cli();
     while (GPIOR0 == 0) {
         set_sleep_mode(SLEEP_MODE_IDLE);
@@ -16,8 +16,6 @@ uint8_t events_wait() {
         sleep_disable();
         cli();
     }
-    const uint8_t events = GPIOR0;
     GPIOR0 = 0;
     sei();
-    return events;
 }

@@ -12,5 +12,6 @@ enum Event : uint8_t {
     EVENT_UART = 1 << 4,   // a byte came in
 };
 
-// Sleeps until at least one event; returns all since the last call.
-uint8_t events_wait();
+// Sleeps until at least one event since the last call. What happened is asked of the drivers, by
+// state and not by event: so an event that a set-up swallowed is never missed.
+void events_wait();

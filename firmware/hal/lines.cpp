@@ -6,6 +6,7 @@
 #include <util/atomic.h>
 
 #include "hal/clock.h"
+#include "hal/events.h"
 
 namespace {
 
@@ -17,12 +18,12 @@ volatile uint32_t radio_us;
 
 ISR(INT0_vect) {
     imu_us = clock_us_in_interrupt();
-    GPIOR0 |= 1 << 1;  // EVENT_IMU
+    GPIOR0 |= EVENT_IMU;
 }
 
 ISR(INT1_vect) {
     radio_us = clock_us_in_interrupt();
-    GPIOR0 |= 1 << 2;  // EVENT_RADIO
+    GPIOR0 |= EVENT_RADIO;
 }
 
 void lines_start_imu() {

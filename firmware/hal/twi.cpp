@@ -42,7 +42,7 @@ uint16_t errors;
 void finish(TwiState end) {
     TWCR = 1 << TWINT | 1 << TWEN | 1 << TWSTO;
     state = end;
-    GPIOR0 |= 1 << 3;  // EVENT_TWI
+    GPIOR0 |= EVENT_TWI;
 }
 
 void want_next_byte() {

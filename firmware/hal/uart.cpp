@@ -5,6 +5,7 @@
 #include <avr/io.h>
 #include <util/atomic.h>
 
+#include "hal/events.h"
 #include "settings.h"
 
 namespace {
@@ -50,7 +51,7 @@ ISR(USART_RX_vect) {
     }
     rx_ring[rx_end] = byte;
     rx_end = next;
-    GPIOR0 |= 1 << 4;  // EVENT_UART
+    GPIOR0 |= EVENT_UART;
 }
 
 void uart_start(uint32_t baud, uint8_t *ring, uint16_t size) {

@@ -78,10 +78,25 @@ TEST(queue_keeps_order_and_drops_the_oldest) {
     CHECK(payload_queue_front(&queue) == nullptr);
     payload_queue_pop(&queue);
     for (uint8_t i = 0; i < PAYLOAD_QUEUE_SIZE + 3; ++i) {
-        payload_queue_push(&queue, &i, 1);
+        payload_queue_push(&queue, &i, 1, false);
     }
     CHECK(queue.dropped == 3);
     for (uint8_t i = 3; i < PAYLOAD_QUEUE_SIZE + 3; ++i) {
+        CHECK(payload_queue_front(&queue)->bytes[0] == i);
+        payload_queue_pop(&queue);
+    }
+    CHECK(payload_queue_front(&queue) == nullptr);
+}
+
+TEST(queue_keeps_the_payload_that_is_being_sent) {
+    PayloadQueue queue = {};
+    for (uint8_t i = 0; i < PAYLOAD_QUEUE_SIZE + 3; ++i) {
+        payload_queue_push(&queue, &i, 1, true);
+    }
+    CHECK(queue.dropped == 3);
+    CHECK(payload_queue_front(&queue)->bytes[0] == 0);
+    payload_queue_pop(&queue);
+    for (uint8_t i = 4; i < PAYLOAD_QUEUE_SIZE + 3; ++i) {
         CHECK(payload_queue_front(&queue)->bytes[0] == i);
         payload_queue_pop(&queue);
     }

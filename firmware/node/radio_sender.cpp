@@ -11,9 +11,9 @@
 
 namespace {
 
-enum State : uint8_t { ABSENT, IDLE, SENDING };
+enum State : uint8_t { ABSENT, IDLE, SENDING, PAUSING };
 
-// One retry by the chip alone, then a new pause: 24 attempts in all.
+// One retry by the chip alone, then a new round: 24 attempts in all.
 constexpr uint8_t RETRIES = 1;
 constexpr uint8_t ROUNDS = 12;
 // Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
@@ -23,6 +23,8 @@ constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 7 : RADIO_KBPS == 1000 ? 3 : 
 constexpr uint8_t PAUSE_FIRST = 2;
 constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 5;
 static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
+
+constexpr uint16_t ROUND_STEP_US = RADIO_KBPS == 250 ? 2000 : 1000;
 
 constexpr uint32_t LOST_US = 50000;
 constexpr uint32_t SET_UP_EVERY_US = 500000;
@@ -71,14 +73,24 @@ void follow(RadioSender *sender, uint32_t now_us) {
         nrf24_stop_sending();
         sender->state = IDLE;
     } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
+        // The more rounds have failed, the more nodes there may be that want the air.
+        const uint8_t steps = static_cast<uint8_t>((sender->random >> 8) % (sender->rounds / 2 + 1U));
         ++sender->rounds;
-        sender->since_us = now_us;
-        nrf24_send_again(draw_pause(sender), RETRIES);
+        sender->since_us = now_us + steps * ROUND_STEP_US;
+        sender->state = PAUSING;
     } else {
         count_lost(sender);
         if (!nrf24_configured()) {
             sender->state = ABSENT;
         }
+    }
+}
+
+void resume(RadioSender *sender, uint32_t now_us) {
+    if (clock_passed(now_us, sender->since_us)) {
+        sender->state = SENDING;
+        sender->since_us = now_us;
+        nrf24_send_again(draw_pause(sender), RETRIES);
     }
 }
 
@@ -98,13 +110,17 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
                                node_time_us};
     memcpy(payload, &header, sizeof header);
     const uint16_t dropped = sender->queue.dropped;
-    payload_queue_push(&sender->queue, payload, size);
+    const bool sending = sender->state == SENDING || sender->state == PAUSING;
+    payload_queue_push(&sender->queue, payload, size, sending);
     sender->failed = static_cast<uint16_t>(sender->failed + (sender->queue.dropped - dropped));
 }
 
 void radio_sender_poll(RadioSender *sender, uint32_t now_us) {
     if (sender->state == SENDING) {
         follow(sender, now_us);
+    }
+    if (sender->state == PAUSING) {
+        resume(sender, now_us);
     }
     if (sender->state == ABSENT && clock_passed(now_us, sender->since_us + SET_UP_EVERY_US)) {
         set_up(sender);

@@ -6,13 +6,14 @@
 // | ABSENT  | 0.5 s passed             | set the chip up                       | IDLE    |
 // | IDLE    | a payload waits          | put it on the air                     | SENDING |
 // | SENDING | sent                     | forget it                             | IDLE    |
-// | SENDING | given up, rounds left    | new random pause, again               | SENDING |
+// | SENDING | given up, rounds left    | draw some milliseconds to wait        | PAUSING |
+// | PAUSING | they have passed         | draw the chip's pause, again          | SENDING |
 // | SENDING | given up, no round left  | count it, forget it                   | IDLE    |
 // | SENDING | the same, set-up lost    | the same                              | ABSENT  |
 // | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
 //
 // Two nodes whose packets collided would collide again if both paused for the same time; so every
-// round of retries draws its pause anew.
+// round of retries waits for a while drawn anew, longer ones the more rounds have failed.
 #pragma once
 
 #include <stdint.h>

@@ -67,9 +67,24 @@ class Run:
     processor_s: float = 0.0
 
 
-def measure(loss: float, seconds: float) -> Run:
+@dataclass(frozen=True)
+class Programs:
+    """What to measure."""
+
+    settings: str = ""
+    mhz: int = 16
+
+    @property
+    def frequency_hz(self) -> int:
+        """The boards' clock."""
+        return self.mhz * 1_000_000
+
+
+def measure(programs: Programs, loss: float, seconds: float) -> Run:
     """Fly with one loss on the air."""
-    tracker = Tracker(Setup(seed=1, loss=loss, build=build()))
+    folder = build(programs.settings, programs.frequency_hz)
+    setup = Setup(seed=1, loss=loss, build=folder, frequency_hz=programs.frequency_hz)
+    tracker = Tracker(setup)
     tracker.run_for(STARTED_S)
     run = Run(loss)
     air = tracker.setup.air
@@ -141,10 +156,12 @@ def _latency_ms(frame: RadioFrame, end_ps: int, sampled_ps: list[int]) -> float:
     return (end_ps - sampled_ps[at]) / PS_PER_S * 1e3
 
 
-def program_table(run: Run) -> list[str]:
+def program_table(programs: Programs, run: Run) -> list[str]:
     """Build the table of sizes and loads."""
+    options = (f"SETTINGS={programs.settings}", f"F_CPU={programs.frequency_hz}UL")
     with tempfile.TemporaryDirectory() as folder:
-        sizes = {n: (int(f), int(r)) for n, f, r in _SIZES.findall(make("all", f"BUILD={folder}"))}
+        said = make("all", f"BUILD={folder}", *options)
+    sizes = {name: (int(flash), int(ram)) for name, flash, ram in _SIZES.findall(said)}
     rows = [
         "| program | flash | static RAM | CPU | cycles, mean | worst 1 ms | longest loop |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -155,10 +172,11 @@ def program_table(run: Run) -> list[str]:
         share = load.awake_cycles / load.cycles
         mean = load.awake_cycles / run.events[name]
         loop = f"{load.loop_max_us} us" if load.loop_max_us else ""
+        worst = f"{load.worst_slice} of {programs.mhz * 1000}"
         rows.append(
             f"| {name} | {flash} B, {100 * flash / FLASH_BYTES:.0f} % "
             f"| {ram} B, {100 * ram / RAM_BYTES:.0f} % | {100 * share:.0f} % "
-            f"| {mean:.0f} a {SAMPLES[name]} | {load.worst_slice} of 16000 | {loop} |"
+            f"| {mean:.0f} a {SAMPLES[name]} | {worst} | {loop} |"
         )
     return rows
 
@@ -183,12 +201,15 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure the firmware on the simulated bench.")
     parser.add_argument("--seconds", type=float, default=60.0, help="simulated time for each loss")
-    seconds = parser.parse_args().seconds
-    runs = [measure(loss, seconds) for loss in LOSSES]
+    parser.add_argument("--settings", default="", help='such as "-DRADIO_KBPS=250"')
+    parser.add_argument("--mhz", type=int, choices=(8, 16), default=16)
+    options = parser.parse_args()
+    programs, seconds = Programs(options.settings, options.mhz), options.seconds
+    runs = [measure(programs, loss, seconds) for loss in LOSSES]
     speed = seconds * len(runs) / sum(run.processor_s for run in runs)
     air = f"{runs[0].sent} packets with acknowledgements, {runs[0].collisions} of them collided"
     last = f"At 0 % loss: {air}. Simulated {speed:.1f} times as fast as true time on one core."
-    lines = [*program_table(runs[0]), "", *loss_table(runs), "", last, ""]
+    lines = [*program_table(programs, runs[0]), "", *loss_table(runs), "", last, ""]
     sys.stdout.write("\n".join(lines))
 
 

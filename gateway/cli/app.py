@@ -9,7 +9,20 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import clients, convert, demo, info, play, record, report, run, setup, sweep
+from gateway.cli import (
+    calibrate,
+    clients,
+    convert,
+    demo,
+    fuse,
+    info,
+    play,
+    record,
+    report,
+    run,
+    setup,
+    sweep,
+)
 
 app = typer.Typer(
     name="mavgate",
@@ -24,6 +37,8 @@ demo.register(app)
 record.register(app)
 play.register(app)
 convert.register(app)
+fuse.register(app)
+calibrate.register(app)
 info.register(app)
 clients.register(app)
 setup.register(app)

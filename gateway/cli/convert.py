@@ -9,7 +9,7 @@ from rich.console import Console
 
 from gateway.cli import flights
 from gateway.cli.errors import refuse
-from gateway.cli.flights import Table, Wishes
+from gateway.cli.flights import Line, Table, Wishes
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -28,8 +28,8 @@ from gateway.cli.run import ConfigOption, read_aircraft, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.row import TableRow, row_to_line
-from gateway.flightlog.table import encode_head
+from gateway.flightlog.row import row_to_line
+from gateway.flightlog.table import TableHeader, encode_head, encode_header
 from gateway.flightlog.tlog import TlogRecord, encode_record
 from gateway.pipeline import PipelineSettings
 
@@ -130,7 +130,10 @@ def _table_text(table: Table) -> Iterator[bytes]:
     yield encode_head(table.header).encode()
     lines: list[str] = []
     for row in table.rows:
-        lines.append(row_to_line(row))
+        if isinstance(row, TableHeader):
+            lines.append(encode_header(row))
+        else:
+            lines.append(row_to_line(row))
         if len(lines) == LINES:
             yield "".join(lines).encode()
             lines.clear()
@@ -148,11 +151,14 @@ def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecor
             yield record
 
 
-def _rows_within(table: Table, limits: Limits) -> Iterator[TableRow]:
+def _rows_within(table: Table, limits: Limits) -> Iterator[Line]:
     begin, end = limits
     zero_us = table.header.unix_us_at_zero or 0
     first_us: int | None = None
     for row in table.rows:
+        if isinstance(row, TableHeader):
+            yield row
+            continue
         time_us = zero_us + row.time_us
         first_us = time_us if first_us is None else first_us
         if end is not None and time_us > place_in(end, first_us):

@@ -51,6 +51,9 @@ SettingsChoice = Literal["recorded", "current"]
 Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 
 
+Line = TableRow | TableHeader
+
+
 class FlightError(Exception):
     """A file that does not hold what a command needs; the text says what and where."""
 
@@ -76,7 +79,13 @@ class Table:
     """Rows with the head that belongs to them."""
 
     header: TableHeader
-    rows: Iterator[TableRow]
+    rows: Iterator[Line]
+    """A header among them tells of settings that were changed in flight."""
+
+    @property
+    def plain_rows(self) -> Iterator[TableRow]:
+        """The rows alone."""
+        return (row for row in self.rows if isinstance(row, TableRow))
 
 
 def open_rows(path: Path, wishes: Wishes) -> Table:
@@ -117,7 +126,8 @@ def fuse(table: Table, wishes: Wishes, fixes: Iterable[GpsFix] = ()) -> Replay:
         latency_s = aircraft.estimation.reference.gps_latency_s
         correct = InterpolatedPosition(fixes, latency_s)
     zero_us = table.header.unix_us_at_zero or 0
-    return Replay(Pipeline(PipelineSettings(aircraft, {}, zero_us, correct)))
+    pipeline = Pipeline(PipelineSettings(aircraft, {}, zero_us, correct))
+    return Replay(pipeline, follow=wishes.choice == "recorded")
 
 
 def aircraft_of(table: Table, wishes: Wishes) -> AircraftSettings:
@@ -136,13 +146,16 @@ def aircraft_of(table: Table, wishes: Wishes) -> AircraftSettings:
 def fixes_of(path: Path, wishes: Wishes) -> list[GpsFix]:
     """List all fixes of a flight; a few per second, so hours of them fit the memory."""
     quiet = replace(wishes, progress=None)
-    return [row.gps for row in open_rows(path, quiet).rows if row.gps is not None]
+    return [row.gps for row in open_rows(path, quiet).plain_rows if row.gps is not None]
 
 
-def fused_rows(table: Table, replay: Replay) -> Iterator[TableRow]:
+def fused_rows(table: Table, replay: Replay) -> Iterator[Line]:
     """Fuse a table and yield its rows with the new states."""
     builder = RowBuilder()
     for row in table.rows:
+        if isinstance(row, TableHeader):
+            yield from builder.flush()
+            yield row
         for _, action in replay.take(row):
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 yield from builder.add(action)
@@ -174,7 +187,7 @@ def joined_rows(tables: list[Table]) -> Table:
     """
     first = tables[0].header
 
-    def rows() -> Iterator[TableRow]:
+    def rows() -> Iterator[Line]:
         for table in tables:
             header = table.header
             follows = header.session == first.session or not header.cold_start
@@ -187,8 +200,10 @@ def joined_rows(tables: list[Table]) -> Table:
     return Table(first, rows())
 
 
-def shifted(row: TableRow, shift_us: int) -> TableRow:
+def shifted(row: Line, shift_us: int) -> Line:
     """Move a row and all its records in time."""
+    if isinstance(row, TableHeader):
+        return row
     return TableRow(
         row.time_us + shift_us,
         _moved(row.baro, shift_us),
@@ -202,7 +217,7 @@ def shifted(row: TableRow, shift_us: int) -> TableRow:
 def points_of_rows(table: Table) -> Iterator[TrackPoint]:
     """Yield the fused positions of a table; its fixes where it has no states."""
     zero_us = table.header.unix_us_at_zero or 0
-    for row in table.rows:
+    for row in table.plain_rows:
         state, fix = row.state, row.gps
         if state is not None and NavFlags.POSITION_VALID in state.flags:
             time_us = zero_us + row.time_us
@@ -246,9 +261,9 @@ def _open_table(path: Path, wishes: Wishes) -> Table:
     if first is None:
         raise FlightError(f"{path}: holds no row")
 
-    def rows() -> Iterator[TableRow]:
+    def rows() -> Iterator[Line]:
         yield first
-        yield from (event for event in events if isinstance(event, TableRow))
+        yield from (event for event in events if isinstance(event, TableRow | TableHeader))
 
     return Table(reader.header or TableHeader(), rows())
 

@@ -23,7 +23,15 @@ from gateway.edges.flight_files import (
 )
 from gateway.flightlog.row import TableRow, row_to_line
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
-from gateway.flightlog.table import TableFault, TableMark, TableReader, encode_head, encode_mark
+from gateway.flightlog.table import (
+    TableFault,
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_head,
+    encode_header,
+    encode_mark,
+)
 from gateway.flightlog.tlog import encode_record
 from gateway.units import US_PER_S
 
@@ -135,6 +143,8 @@ def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
         match event:
             case TableRow():
                 yield row_to_line(event).encode()
+            case TableHeader():
+                yield encode_header(event).encode()
             case TableMark():
                 yield encode_mark(event).encode()
             case TableFault():

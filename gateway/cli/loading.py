@@ -71,13 +71,15 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         story = STORIES[kind_of(path)]
         try:
             flight = flight_of_rows(
-                table.rows, aircraft.calibration, fusion, name=path.name, story=story
+                table.plain_rows, aircraft.calibration, fusion, name=path.name, story=story
             )
         except ValueError as error:
             raise FlightError(str(error)) from error
         if loading.reference is None:
             return flight
-        return judged_by(flight, open_rows(loading.reference, wishes).rows, loading.reference.name)
+        return judged_by(
+            flight, open_rows(loading.reference, wishes).plain_rows, loading.reference.name
+        )
 
 
 def _wishes(loading: Loading, advance: Callable[[int], None]) -> Wishes:

@@ -282,6 +282,7 @@ class Hub:
         self._fanout.remove(link.client_id)
         self._forget_express()
         self._table.forget(link.client_id)
+        self._vehicles.forget(link.client_id)
         if self._links.pop(link.client_id, None):
             log.info("client %s has gone: %s", link.client_id, link.remote)
             if self._on_gone is not None:

@@ -6,8 +6,9 @@ immutable bytes and hands back a result; nothing is shared, so there is nothing 
 is at work the event loop gathers the next bytes, up to a bound.
 
 Every `flush_s` the gathered bytes go to the kernel, which survives the death of the gateway; every
-`sync_s` the kernel is made to put them on the disk, which survives the loss of power. A sync at
-each flush would wear cards out and lets none of them keep up.
+`sync_s` the kernel is made to put them on the disk, which survives the loss of power. By default
+both are half a second, so that either costs less than a second; a card that is worn by this may be
+synced less often.
 """
 
 import asyncio
@@ -17,10 +18,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 from gateway.edges.part_files import DiskState, PartFiles, free_bytes_near, reason_of
 from gateway.edges.recordings import RecordingError, rename_recording, restamp_recording
+from gateway.flightlog.part import PENDING_LIMIT, TLOG, Part, table_ending
 from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
 from gateway.flightlog.session import (
     Announce,
@@ -32,17 +34,13 @@ from gateway.flightlog.session import (
     SessionAction,
     SessionState,
 )
-from gateway.flightlog.stamps import CivilClock, Stamper
-from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_mark
+from gateway.flightlog.stamps import CivilClock
+from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_header, encode_mark
 from gateway.flightlog.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, GpsFix
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
-
-PENDING_LIMIT: Final = 16 << 20
-"""Bytes that wait for a slow disk: minutes of telemetry. More is given up, not piled up."""
-TLOG: Final = ".tlog"
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -59,28 +57,6 @@ class RecorderStatus:
     free_bytes: int
     reason: str
     folder: str
-
-
-class _Part:
-    """What the loop gathers for the part that is being written."""
-
-    def __init__(self, session: str, number: int, offset_us: int) -> None:
-        self.session = session
-        self.number = number
-        self.stamper = Stamper(offset_us)
-        self.tables: set[int] = set()
-        """Aircraft whose table has its head."""
-        self.pending: dict[str, bytearray] = {}
-        self.size = 0
-
-    def add(self, ending: str, data: bytes) -> None:
-        if self.size < PENDING_LIMIT:
-            self.pending.setdefault(ending, bytearray()).extend(data)
-        self.size += len(data)
-
-    def take(self) -> dict[str, bytes]:
-        pending, self.pending, self.size = self.pending, {}, 0
-        return {ending: bytes(data) for ending, data in pending.items()}
 
 
 class Recorder:
@@ -117,7 +93,7 @@ class Recorder:
         self._civil = CivilClock()
         self._rows: dict[int, RowBuilder] = {}
         self._seen: set[int] = set()
-        self._part: _Part | None = None
+        self._part: Part | None = None
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
@@ -129,7 +105,14 @@ class Recorder:
         """Where the recordings are."""
 
     def start(self) -> None:
-        """Begin to work; needs a running event loop."""
+        """Begin to work; needs a running event loop.
+
+        A recording that is wanted already is opened at once: nothing runs yet that could be held
+        up, and a table is worth most from the estimator's first sample on.
+        """
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        if self._session.wanted:
+            self._open_at_once()
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     def close(self) -> None:
@@ -174,7 +157,7 @@ class Recorder:
         if self._part is not None:
             line = encode_mark(TableMark(self._clock(), text)).encode()
             for vehicle_id in self._part.tables:
-                self._part.add(_table(vehicle_id), line)
+                self._part.add(table_ending(vehicle_id), line)
         self._announce(False, f"Mark: {text}")
 
     async def save(self, name: str) -> None:
@@ -229,32 +212,37 @@ class Recorder:
             self._write_rows(self._part, vehicle_id, rows.add(record))
         self._seen.add(vehicle_id)
 
-    def _write_rows(self, part: _Part, vehicle_id: int, rows: list[TableRow]) -> None:
-        ending = _table(vehicle_id)
+    def settings_changed(self, vehicle_id: int) -> None:
+        """Note that what comes is fused with other settings, which a new head tells."""
+        if self._part is not None and vehicle_id in self._part.tables:
+            self._write_rows(self._part, vehicle_id, self._rows[vehicle_id].flush())
+            head = encode_header(self._head(vehicle_id, self._part))
+            self._part.add(table_ending(vehicle_id), head.encode())
+
+    def _write_rows(self, part: Part, vehicle_id: int, rows: list[TableRow]) -> None:
+        ending = table_ending(vehicle_id)
         if vehicle_id not in part.tables:
             part.tables.add(vehicle_id)
-            part.add(ending, self._head(vehicle_id, part).encode())
+            part.add(ending, encode_head(self._head(vehicle_id, part)).encode())
         for row in rows:
             part.add(ending, row_to_line(row).encode())
 
-    def _flush_rows(self, part: _Part) -> None:
+    def _flush_rows(self, part: Part) -> None:
         for vehicle_id, rows in self._rows.items():
             self._write_rows(part, vehicle_id, rows.flush())
         self._rows.clear()
 
-    def _head(self, vehicle_id: int, part: _Part) -> str:
+    def _head(self, vehicle_id: int, part: Part) -> TableHeader:
         known = self._header_of(vehicle_id)
-        return encode_head(
-            TableHeader(
-                mavgate_version=known.mavgate_version,
-                vehicle_id=vehicle_id,
-                session=part.session,
-                part=part.number,
-                cold_start=vehicle_id not in self._seen,
-                unix_us_at_zero=part.stamper.offset_us,
-                settings=known.settings,
-                calibration=known.calibration,
-            )
+        return TableHeader(
+            mavgate_version=known.mavgate_version,
+            vehicle_id=vehicle_id,
+            session=part.session,
+            part=part.number,
+            cold_start=vehicle_id not in self._seen,
+            unix_us_at_zero=part.stamper.offset_us,
+            settings=known.settings,
+            calibration=known.calibration,
         )
 
     async def _run(self) -> None:
@@ -306,7 +294,7 @@ class Recorder:
         self._part = None if any(isinstance(a, ClosePart) for a in actions) else self._part
         if opening is not None:
             offset_us = self._civil.offset_us or 0
-            self._part = _Part(opening.session, opening.part, offset_us)
+            self._part = Part(opening.session, opening.part, offset_us)
         following: list[SessionAction] = []
         for action in actions:
             match action:
@@ -317,9 +305,28 @@ class Recorder:
                 case OpenPart():
                     following += await self._open_part(action)
                 case Announce():
-                    (log.warning if action.is_trouble else log.info)("%s", action.text)
-                    self._announce(action.is_trouble, action.text)
+                    self._say(action)
         return following
+
+    def _say(self, action: Announce) -> None:
+        (log.warning if action.is_trouble else log.info)("%s", action.text)
+        self._announce(action.is_trouble, action.text)
+
+    def _open_at_once(self) -> None:
+        now_us, offset_us = self._clock(), self._civil.offset_us or 0
+        try:
+            self._disk = DiskState(0, free_bytes_near(self.folder))
+            actions = self._session.poll(now_us, now_us + offset_us, 0, self._disk.free_bytes)
+            for action in actions:
+                if isinstance(action, OpenPart):
+                    files = PartFiles(self.folder, action.session, action.part)
+                    self._part = Part(action.session, action.part, offset_us)
+                    actions = self._adopt(files)
+        except OSError as error:
+            actions = self._session.failed(reason_of(error), now_us)
+        for action in actions:
+            if isinstance(action, Announce):
+                self._say(action)
 
     async def _open_part(self, action: OpenPart) -> list[SessionAction]:
         try:
@@ -327,13 +334,16 @@ class Recorder:
         except OSError as error:
             self._part = None
             return self._session.failed(reason_of(error), self._clock())
+        return self._adopt(files)
+
+    def _adopt(self, files: PartFiles) -> list[SessionAction]:
         self._files = files
         self._session.name = files.session
         if self._part is not None:
             self._part.session = files.session
         return self._session.opened(self._clock())
 
-    async def _close_part(self, part: _Part | None, *, has_next: bool) -> None:
+    async def _close_part(self, part: Part | None, *, has_next: bool) -> None:
         files, self._files = self._files, None
         if part is None or files is None:
             return
@@ -346,7 +356,7 @@ class Recorder:
         with contextlib.suppress(OSError):
             await self._on_disk(files.close)
 
-    async def _rename(self, action: Rename, closed: _Part | None) -> None:
+    async def _rename(self, action: Rename, closed: Part | None) -> None:
         """Name a session by its true time, and shift its time stamps to it."""
         try:
             if closed is not None:
@@ -373,7 +383,3 @@ def _rename_open(folder: Path, name: str, to_name: str, files: PartFiles | None)
     rename_recording(folder, name, to_name)
     if files is not None:
         files.session = to_name
-
-
-def _table(vehicle_id: int) -> str:
-    return f"_v{vehicle_id}.csv"

@@ -68,8 +68,14 @@ class RecordingSettings(Settings, frozen=True):
     ] = 0.5
     sync_s: Annotated[
         float,
-        setting("What is lost at most when the power fails.", "s", ge=0.1, le=60),
-    ] = 1.0
+        setting(
+            "How often the disk itself must hold all; longer spares a card, but a loss of power "
+            "costs more.",
+            "s",
+            ge=0.05,
+            le=60,
+        ),
+    ] = 0.5
 
 
 class SessionState(StrEnum):

@@ -5,9 +5,11 @@
     time_us,node_id,…
     12000,0,…
     # mark: {"time_us": 12345, "text": "…"}
+    # header: {…}
 
-Lines that begin with `#` hold JSON; spreadsheets and pandas (`comment="#"`) step over them. An
-empty cell means not known, or nothing new.
+A second header tells that the rows behind it were fused with other settings. Lines that begin with
+`#` hold JSON; spreadsheets and pandas (`comment="#"`) step over them. An empty cell means not
+known, or nothing new.
 """
 
 from dataclasses import dataclass
@@ -61,13 +63,18 @@ class TableFault:
     reason: str
 
 
-TableEvent = TableRow | TableMark | TableFault
+TableEvent = TableRow | TableMark | TableFault | TableHeader
+"""A header here is one behind rows: the settings were changed."""
 
 
 def encode_head(header: TableHeader) -> str:
     """Write everything that stands before the first row."""
-    json = msgspec.json.encode(header).decode()
-    return f"{FORMAT_LINE}\n{HEADER_PREFIX}{json}\n{','.join(COLUMNS)}\n"
+    return f"{FORMAT_LINE}\n{encode_header(header)}{','.join(COLUMNS)}\n"
+
+
+def encode_header(header: TableHeader) -> str:
+    """Write a header as a line of its own."""
+    return f"{HEADER_PREFIX}{msgspec.json.encode(header).decode()}\n"
 
 
 def encode_mark(mark: TableMark) -> str:
@@ -104,7 +111,7 @@ class TableReader:
 
         Returns
         -------
-        list of TableRow, TableMark or TableFault
+        list of TableRow, TableMark, TableFault or TableHeader
             In the order of the file.
         """
         *lines, rest = (self._rest + data).split(b"\n")
@@ -134,11 +141,14 @@ class TableReader:
         except (ValueError, msgspec.DecodeError) as error:
             return TableFault(self.lines, size, str(error))
 
-    def _take_comment(self, text: str) -> TableMark | None:
+    def _take_comment(self, text: str) -> TableMark | TableHeader | None:
         if text.startswith(MARK_PREFIX):
             return msgspec.json.decode(text.removeprefix(MARK_PREFIX), type=TableMark)
-        if text.startswith(HEADER_PREFIX) and self.header is None:
-            self.header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
+        if text.startswith(HEADER_PREFIX):
+            header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
+            if self.header is not None:
+                return header
+            self.header = header
         return None
 
     def _take_cells(self, cells: list[str]) -> TableRow | None:

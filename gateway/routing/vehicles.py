@@ -36,7 +36,10 @@ class OwnVehicles:
         origin = origin_of(frame)
         is_new = not self.is_own(origin, now_us)
         self._seen_us[origin] = now_us
-        self._frames.setdefault(origin, {})[message_id] = frame
+        if is_new:
+            # What an earlier playback said of this system holds no more.
+            self._frames[origin] = {}
+        self._frames[origin][message_id] = frame
         return is_new
 
     def is_own(self, origin: Origin, now_us: int) -> bool:
@@ -52,6 +55,14 @@ class OwnVehicles:
         """Let a newcomer be greeted by every vehicle."""
         for origin in self._frames:
             self._newcomers.setdefault(origin, []).append(client_id)
+
+    def forget(self, client_id: int) -> None:
+        """Do not greet a client that has gone."""
+        for origin, waiting in list(self._newcomers.items()):
+            if client_id in waiting:
+                waiting.remove(client_id)
+            if not waiting:
+                del self._newcomers[origin]
 
     def greet(self, frame: bytes) -> tuple[list[int], list[tuple[bytes, int]]]:
         """Return who waits for the sender of a frame, and what to tell them before it.

@@ -52,6 +52,16 @@ class NodeCalibration(Settings, frozen=True):
     mag_soft_iron: Annotated[
         Matrix3, setting("Rows of the matrix that turns the measured ellipsoid into a sphere.")
     ] = IDENTITY3
+    gyro_residual_radps: Annotated[
+        float,
+        setting("What the last calibration left: deviation at rest.", "rad/s", ge=0.0, le=10.0),
+    ] = 0.0
+    accel_residual_mps2: Annotated[
+        float, setting("What it left of the poses' differences.", "m/s2", ge=0.0, le=100.0)
+    ] = 0.0
+    mag_residual_ut: Annotated[
+        float, setting("What it left of the field's differences.", "uT", ge=0.0, le=1000.0)
+    ] = 0.0
 
 
 def transform(matrix: Matrix3, v: Vec3) -> Vec3:

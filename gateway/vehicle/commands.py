@@ -201,9 +201,8 @@ class CommandService:
             return DENIED, []
         if not self._knows(message_id):
             return UNSUPPORTED, []
-        client_id = command.request.client_id
         try:
-            return ACCEPTED, self._intervals.set_interval(client_id, message_id, wish)
+            return ACCEPTED, self._intervals.set_interval(command.request, message_id, wish)
         except ValueError:
             return DENIED, []
 

@@ -1,7 +1,8 @@
 """Rates that single clients wish for: each client's own, and nobody else's.
 
 A wish for fewer messages thins what goes to all, at the hub. A wish for more gets the client a
-stream of its own, beside the common one, which the hub then keeps from it.
+stream of its own, beside the common one, which the hub then keeps from it. That costs the gateway
+work, so only clients that may change things get it.
 """
 
 from collections.abc import Iterable
@@ -17,6 +18,8 @@ from gateway.vehicle.telemetry import STATE_MESSAGES, Telemetry
 MAX_FAST_STREAMS: Final = 64
 """Each costs an encoding of its own."""
 MIN_INTERVAL_US: Final = 1000
+MIN_TIMED_INTERVAL_US: Final = 20_000
+"""Of messages that no sample carries: faster they would only repeat themselves."""
 MAX_WISHES: Final = 1024
 """Clients come and go; the oldest wishes are forgotten first."""
 KEEPS_CLIENTS_US: Final = 1_000_000
@@ -87,12 +90,13 @@ class IntervalService:
             answers += self._take(request.client_id, message_id, DEFAULT if faster else wanted_us)
         return answers
 
-    def set_interval(self, client_id: int, message_id: int, interval_us: float) -> list[Answer]:
+    def set_interval(self, request: Request, message_id: int, interval_us: float) -> list[Answer]:
         """Take one client's wish.
 
         Parameters
         ----------
-        client_id : int
+        request : Request
+            Who wishes it.
         message_id : int
         interval_us : float
             As in MAV_CMD_SET_MESSAGE_INTERVAL: 0 for the settings' rate, -1 for none.
@@ -118,8 +122,11 @@ class IntervalService:
         if wish < 0:
             wish = NONE
         elif wish != DEFAULT:
-            wish = max(MIN_INTERVAL_US, wish)
-        return self._take(client_id, message_id, wish)
+            carried = message_id in STATE_MESSAGES
+            wish = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, wish)
+        if _is_faster(wish, stream.interval_us) and not request.may_change:
+            raise ValueError("more than the settings' rate is not for every client")
+        return self._take(request.client_id, message_id, wish)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
         """Tell how often a client gets a message, as MESSAGE_INTERVAL says it.
@@ -165,8 +172,7 @@ class IntervalService:
             if len(self._wishes) >= MAX_WISHES:
                 self._wishes.pop(next(iter(self._wishes)))
             self._wishes[key] = wish
-        faster = wish > 0 and (common_us == OFF or wish < common_us)
-        if faster and len(self._fast) < MAX_FAST_STREAMS:
+        if _is_faster(wish, common_us) and len(self._fast) < MAX_FAST_STREAMS:
             self._fast[key] = Stream(wish)
             wish = NONE
         return [ClientInterval(client_id, self._system_id, message_id, wish)]
@@ -180,3 +186,7 @@ class IntervalService:
                 if message is not None:
                     found.append(Reply(message, client_id))
         return found
+
+
+def _is_faster(wish_us: int, common_us: int) -> bool:
+    return wish_us > 0 and (common_us == OFF or wish_us < common_us)

@@ -14,6 +14,7 @@ from gateway.records import NAN, NavState
 from gateway.vehicle import fields
 from gateway.vehicle.home import Place
 from gateway.vehicle.mission_items import Item
+from gateway.vehicle.place import is_on_earth
 
 
 class Mark:
@@ -24,7 +25,15 @@ class Mark:
         self._from_items: int | None = None
 
     def put(self, place: Place | None) -> None:
-        """Mark a place, or none."""
+        """Mark a place, or none.
+
+        Raises
+        ------
+        ValueError
+            If it is no place on earth; its height may be NaN.
+        """
+        if place is not None and not is_on_earth(place.lat_deg, place.lon_deg):
+            raise ValueError(f"no place on earth: {place.lat_deg}, {place.lon_deg}")
         self.place, self._from_items = place, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
@@ -60,12 +69,14 @@ class Mark:
             Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
             None without a mark or a position.
         """
-        if self.place is None or not math.isfinite(state.lat_deg + state.lon_deg):
+        if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
         distance_m, bearing_deg = vincenty.vdist(
             state.lat_deg, state.lon_deg, self.place.lat_deg, self.place.lon_deg
         )
-        return float(distance_m), math.radians(float(bearing_deg))
+        way = (float(distance_m), math.radians(float(bearing_deg)))
+        # The iteration need not converge between opposite ends of the earth.
+        return way if math.isfinite(sum(way)) else None
 
     def nav_controller_output(self, state: NavState | None) -> Any:
         """Encode the way to the mark; None while there is nothing to tell.

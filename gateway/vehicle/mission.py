@@ -14,7 +14,7 @@ An upload, seen from here:
 | upload | MISSION_COUNT, same client      | begin anew                        | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK (cancelled)         |                                   | idle   |
-| upload | 250 ms without the item         | REQUEST_INT again, at most 5 times | upload |
+| upload | 250 ms without the item         | REQUEST_INT again, five times     | upload |
 | upload | 250 ms more                     | ACK cancelled                     | idle   |
 | idle   | the last item once more         | ACK accepted again                | idle   |
 

@@ -2,14 +2,21 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NAN
 from gateway.vehicle.actions import Answer, Reply
-from gateway.vehicle.commands import ACCEPTED, DENIED, NOT_NOW, Command, CommandService, Outcome
-from gateway.vehicle.commands import whole as whole_number
+from gateway.vehicle.commands import (
+    ACCEPTED,
+    DENIED,
+    NOT_NOW,
+    Command,
+    CommandService,
+    Outcome,
+    whole,
+)
 from gateway.vehicle.events import INFO, Told
 from gateway.vehicle.home import Home, Place
 from gateway.vehicle.mark import Mark
@@ -21,7 +28,7 @@ from gateway.vehicle.telemetry import Telemetry
 
 Say = Callable[[Told, int], list[Any]]
 
-USE_CURRENT: int = 1
+USE_CURRENT: Final = 1
 """First parameter of MAV_CMD_DO_SET_HOME."""
 
 
@@ -81,7 +88,7 @@ class PlaceService:
         return Place(command.lat_deg, command.lon_deg, height)
 
     def _set_home(self, command: Command, now_us: int) -> Outcome:
-        if whole_number(command.params[0]) == USE_CURRENT:
+        if whole(command.params[0]) == USE_CURRENT:
             state = self._telemetry.state
             if state is None or not has_position(state):
                 return NOT_NOW, []
@@ -96,7 +103,7 @@ class PlaceService:
         return ACCEPTED, [Reply(message) for message in (*told, *said)]
 
     def _set_roi(self, command: Command, now_us: int) -> Outcome:
-        mode = whole_number(command.params[0])
+        mode = whole(command.params[0])
         if mode == mavlink.MAV_ROI_NONE:
             return self._clear_roi(command, now_us)
         if mode != mavlink.MAV_ROI_LOCATION:
@@ -111,5 +118,5 @@ class PlaceService:
         return ACCEPTED, self.put_mark(None, now_us)
 
     def _set_mission_current(self, command: Command, now_us: int) -> Outcome:
-        answers = self.missions.set_current(whole_number(command.params[0]), now_us)
+        answers = self.missions.set_current(whole(command.params[0]), now_us)
         return (DENIED, []) if answers is None else (ACCEPTED, answers)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -44,7 +44,7 @@ from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry import Telemetry
 from gateway.vehicle.timing import TimingService
 
-OWN_SECTION = "vehicle"
+OWN_SECTION: Final = "vehicle"
 
 
 class Service(Protocol):
@@ -255,7 +255,13 @@ class Vehicle:
         self.health.recording = recording
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
-        """Mark a place (its height may be NaN), or clear the mark."""
+        """Mark a place (its height may be NaN), or clear the mark.
+
+        Raises
+        ------
+        ValueError
+            If it is no place on earth.
+        """
         return self._finish(self.places.put_mark(place, now_us), now_us)
 
     def say(self, text: Told, now_us: int) -> list[Action]:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from gateway.edges.part_files import PartFiles
-from gateway.edges.recorder import PENDING_LIMIT, Recorder
+from gateway.edges.recorder import Recorder
 from gateway.edges.recordings import RecordingError, list_recordings
+from gateway.flightlog.part import PENDING_LIMIT
 from gateway.flightlog.row import TableRow
 from gateway.flightlog.session import RETRY_US, RecordingSettings
 from gateway.flightlog.table import TableHeader, TableMark, TableReader
@@ -19,7 +20,7 @@ from gateway.flightlog.tlog import TlogRecord, TlogScanner
 from gateway.records import FusedSample
 from tests.conftest import ManualClock
 from tests.flightlog.frames import make_frames
-from tests.flightlog.samples import make_flight
+from tests.flightlog.samples import make_baro, make_flight, make_fused
 
 pytestmark = pytest.mark.io
 
@@ -117,6 +118,21 @@ async def test_a_flight_is_in_the_table_with_its_head(
     wanted = [r.imu if isinstance(r, FusedSample) else r for r in flight]
     assert repr(flat) == repr(wanted)
     assert [e.text for e in events if isinstance(e, TableMark)] == ["over the wood"]
+
+
+async def test_changed_settings_make_a_new_head_behind_what_came_before(
+    bench: Bench, rng: np.random.Generator
+) -> None:
+    await bench.turn()
+    bench.recorder.settings_changed(3)
+    for record in (make_fused(rng, 1000), make_baro(rng, 1500)):
+        bench.recorder.flight(record)
+    bench.recorder.settings_changed(3)
+    bench.recorder.flight(make_fused(rng, 2000))
+    bench.recorder.close()
+    data = (bench.recorder.folder / f"{NAME}_01_v3.csv").read_bytes()
+    events = TableReader().feed(data, final=True)
+    assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
 
 
 async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.Generator) -> None:
@@ -279,8 +295,31 @@ async def test_what_was_flushed_is_on_the_disk_without_closing(bench: Bench) -> 
     assert frames_of(bench.recorder.folder) == FRAMES[:7]
 
 
-async def test_it_runs_by_itself(bench: Bench) -> None:
+async def test_what_is_wanted_from_the_start_misses_nothing(bench: Bench) -> None:
     bench.recorder.start()
+    assert bench.recorder.recording
+    bench.send(FRAMES)
+    bench.recorder.close()
+    assert frames_of(bench.recorder.folder) == FRAMES
+
+
+async def test_a_start_on_a_bad_disk_is_told_and_mended(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.recorder.folder.write_text("a file where the folder should be")
+    bench.recorder.start()
+    assert bench.troubles == ["Recording stopped: File exists"]
+    bench.recorder.folder.unlink()
+    await bench.turn(RETRY_US / 1e6)
+    assert bench.recorder.recording
+
+
+async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
+    bench = Bench(tmp_path, clock, mode="manual")
+    bench.recorder.start()
+    await bench.recorder.settle()
+    assert not bench.recorder.recording
+    bench.recorder.record()
     await bench.recorder.settle()
     assert bench.recorder.recording
     bench.send(FRAMES)

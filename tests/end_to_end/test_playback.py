@@ -11,7 +11,9 @@ import pytest
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
+from typer.testing import CliRunner
 
+from gateway.cli.app import app
 from gateway.edges.control_socket import request
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, free_udp_ports
@@ -139,7 +141,7 @@ def test_a_recorded_vehicle_answers_a_ground_station(
     assert seen["PARAM_VALUE"].get_srcSystem() == 3
 
 
-def test_mavlogdump_reads_our_tlogs(
+def test_mavlogdump_reads_a_live_recording_and_it_fuses_to_the_last_bit(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
     config = """
@@ -165,6 +167,11 @@ folder = "FOLDER"
     lines = [line for line in dumped.stdout.splitlines() if " {" in line]
     assert len(lines) == len(batch)
     assert "BAD_DATA" not in dumped.stdout
+    (table,) = tmp_path.glob("*_v1.csv")
+    again = tmp_path / "again.csv"
+    done = CliRunner().invoke(app, ["convert", str(table), "--fuse", "-o", str(again)])
+    assert done.exit_code == 0, done.output
+    assert again.read_bytes() == table.read_bytes()
 
 
 @pytest.fixture

@@ -48,6 +48,28 @@ def test_greeting_leads_up_to_the_next_frame() -> None:
     assert not vehicles.has_newcomers
 
 
+def test_a_newcomer_that_left_is_not_waited_for() -> None:
+    vehicles = OwnVehicles()
+    vehicles.note(heartbeat(1, 0), 0, 0)
+    vehicles.await_greeting(7)
+    vehicles.await_greeting(8)
+    vehicles.forget(7)
+    assert vehicles.greet(heartbeat(1, 1))[0] == [8]
+    vehicles.await_greeting(7)
+    vehicles.forget(7)
+    assert not vehicles.has_newcomers
+
+
+def test_a_system_that_returns_starts_afresh() -> None:
+    vehicles = OwnVehicles()
+    vehicles.note(heartbeat(1, 0), 0, 0)
+    vehicles.note(home(1, 1), 242, 0)
+    assert vehicles.note(heartbeat(1, 2), 0, OWN_FRESH_US + 1)
+    assert not vehicles.note(heartbeat(1, 3), 0, OWN_FRESH_US + 2)
+    vehicles.await_greeting(7)
+    assert [message_id for _, message_id in vehicles.greet(heartbeat(1, 4))[1]] == [0]
+
+
 def test_nobody_waits_where_there_is_no_vehicle() -> None:
     vehicles = OwnVehicles()
     vehicles.await_greeting(7)

@@ -106,6 +106,21 @@ def test_odd_parameters_do_no_harm(station: GroundStation, number: int, bad: flo
     assert len(results(found)) == 1
 
 
+@pytest.mark.parametrize("place", [(90.1, 0.0), (0.0, 180.1), (math.nan, 8.0)])
+def test_a_mark_that_is_nowhere_is_a_fault_of_the_caller(
+    vehicle: Vehicle, place: tuple[float, float]
+) -> None:
+    with pytest.raises(ValueError, match="no place on earth"):
+        vehicle.put_mark(Place(*place, 0.0), 0)
+
+
+def test_a_mark_on_the_other_side_of_the_earth(station: GroundStation) -> None:
+    state = station.vehicle.telemetry.state
+    opposite = Place(-state.lat_deg, state.lon_deg + 180.0, 0.0)
+    station.vehicle.put_mark(opposite, 0)
+    assert results(station.request(62)) in ([ACCEPTED], [NOT_NOW])
+
+
 def test_the_mark_of_the_command_line(station: GroundStation) -> None:
     found = station.receive(station.vehicle.put_mark(Place(47.0, 8.0, math.nan), 0))
     assert [m.text for m in found] == ["Marked 47.000000, 8.000000"]

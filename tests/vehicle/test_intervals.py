@@ -56,6 +56,18 @@ def test_a_faster_rate_of_a_timed_message(station: GroundStation) -> None:
     assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(20 + 2, abs=2)
 
 
+def test_a_faster_rate_is_not_for_every_client(station: GroundStation) -> None:
+    station.trusted = False
+    assert station.command(SET, QUATERNION, 10_000)[0].result == DENIED
+    assert station.command(SET, QUATERNION, 100_000)[0].result == ACCEPTED
+    assert station.wishes == [ClientInterval(7, 1, QUATERNION, 100_000)]
+
+
+def test_messages_that_no_sample_carries_are_bounded(station: GroundStation) -> None:
+    station.command(SET, HOME, 1)
+    assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(100 + 2, abs=4)
+
+
 def test_a_client_that_goes_takes_its_wishes_along(station: GroundStation) -> None:
     station.command(SET, QUATERNION, 10_000)
     station.vehicle.forget_client(7)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.estimation.select import EstimationSettings
+from gateway.estimation.select import EstimationSettings, EstimatorName
 from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId, Outgoing
 
@@ -29,8 +29,8 @@ LEVEL = ImuRaw(
 class Bench:
     """A pipeline with one aircraft on the table and one ground station."""
 
-    def __init__(self) -> None:
-        settings = AircraftSettings(estimation=EstimationSettings(estimator="paper"))
+    def __init__(self, estimator: EstimatorName = "paper") -> None:
+        settings = AircraftSettings(estimation=EstimationSettings(estimator=estimator))
         self.pipeline = Pipeline(PipelineSettings(settings))
         self.mav = mavlink.MAVLink(None, 255, 190)
         self.time_us = 0
@@ -50,6 +50,10 @@ class Bench:
     def send(self, message: Any) -> None:
         incoming = Incoming(7, message.pack(self.mav), trusted=True)
         self.read(self.pipeline.handle(incoming, self.time_us))
+
+    def set(self, name: str, value: float) -> None:
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        self.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
 
     def calibrate(self, *params: float) -> None:
         padded = [*params, *[0.0] * (7 - len(params))]
@@ -103,21 +107,37 @@ def test_a_new_weight_does_not_restart_the_estimator(bench: Bench) -> None:
     bench.run(2.0)
     turning = {"gyro_raw": (0, 0, -3280)}
     before = bench.run(0.5, **turning).state.q_nb
-    name = b"PAPER_ALPHA_YAW"
-    bench.send(mavlink.MAVLink_param_set_message(1, 1, name, 1.0, mavlink.MAV_PARAM_TYPE_REAL32))
+    bench.set("PAPER_ALPHA_YAW", 1.0)
     after = bench.run(0.01).state.q_nb
     assert bench.parameters()["PAPER_ALPHA_YAW"] == 1.0
     assert after == pytest.approx(before, abs=1e-3)
     assert bench.run(1.0).state.q_nb == pytest.approx(before, abs=1e-2), "the compass is left out"
 
 
+@pytest.mark.parametrize(
+    ("estimator", "name", "value"),
+    [("complementary", "CF_TAU_HDG", 3.0), ("eskf", "REF_GPS_LATENCY", 0.2)],
+)
+def test_every_estimator_goes_on_when_retuned(estimator: str, name: str, value: float) -> None:
+    bench = Bench(estimator)
+    before = bench.run(5.0).state
+    bench.set(name, value)
+    after = bench.run(0.01).state
+    assert bench.parameters()[name] == pytest.approx(value)
+    assert after.q_nb == pytest.approx(before.q_nb, abs=1e-3)
+    assert after.flags == before.flags
+
+
+def test_another_estimator_begins_anew(bench: Bench) -> None:
+    for choice in (1.0, 2.0, 0.0, 1.0):
+        bench.set("EST_ESTIMATOR", choice)
+        assert abs(bench.run(3.0).state.q_nb[1]) < 1e-3
+
+
 def test_a_new_cutoff_reaches_the_filter(bench: Bench) -> None:
     bench.run(1.0)
     for cutoff_hz, expected in ((0.5, False), (40.0, True)):
-        value = mavlink.MAVLink_param_set_message(
-            1, 1, b"SENS_ACC_CUTOFF", cutoff_hz, mavlink.MAV_PARAM_TYPE_REAL32
-        )
-        bench.send(value)
+        bench.set("SENS_ACC_CUTOFF", cutoff_hz)
         bench.run(5.0)
         step = bench.run(0.1, accel_raw=(2048, 0, 4096)).sample
         settled = step.accel_lowpass_b_mps2[0] > 0.9 * step.accel_b_mps2[0]

@@ -1,0 +1,116 @@
+"""The steps of a calibration: what to measure, and how it changes the node's calibration.
+
+Each step takes the samples that a person's poses made and the calibration so far, and gives the
+calibration with its own part replaced. A log runs through the same steps.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.records import Vec3
+from gateway.sensing.calibration import Correction, Matrix3, NodeCalibration
+from gateway.sensing.recalibration import absorb_tilt
+from gateway.sensing.solvers import (
+    NodeSamples,
+    distinct_poses,
+    solve_accelerometer,
+    solve_magnetometer,
+    solve_mounting,
+    solve_rest,
+    still_windows,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
+    """Take the mean rate at rest as the gyroscope's bias."""
+    fit = solve_rest(_still(samples, samples.gyro))
+    return msgspec.structs.replace(
+        calibration, gyro_bias_radps=fit.mean, gyro_residual_radps=fit.residual
+    )
+
+
+def calibrate_accelerometer(
+    samples: Sequence[NodeSamples], calibration: NodeCalibration
+) -> NodeCalibration:
+    """Fit the accelerometer to the poses that the samples hold, each part one or more of them."""
+    poses = [distinct_poses(s.accel, _windows(s)) for s in samples]
+    fit = solve_accelerometer(_distinct(np.vstack([np.empty((0, 3)), *poses])))
+    return msgspec.structs.replace(
+        calibration,
+        accel_bias_mps2=fit.bias,
+        accel_matrix=fit.matrix,
+        accel_residual_mps2=fit.residual,
+    )
+
+
+def calibrate_magnetometer(
+    samples: NodeSamples, calibration: NodeCalibration, strength_ut: float | None = None
+) -> NodeCalibration:
+    """Fit hard and soft iron to a field that was seen from all sides."""
+    fit = solve_magnetometer(samples.mag, strength_ut)
+    return msgspec.structs.replace(
+        calibration,
+        mag_hard_iron_ut=fit.bias,
+        mag_soft_iron=fit.matrix,
+        mag_residual_ut=fit.residual,
+    )
+
+
+def calibrate_mounting(
+    level: NodeSamples, nose_up: NodeSamples, calibration: NodeCalibration
+) -> NodeCalibration:
+    """Find the mounting from a level and a nose-up pose; the magnetometer turns along."""
+    mounting = solve_mounting(_force(level, calibration), _force(nose_up, calibration))
+    # Both chips are on one board: how they stand to each other stays.
+    between = np.linalg.solve(np.array(calibration.mounting), np.array(calibration.mag_mounting))
+    return msgspec.structs.replace(
+        calibration, mounting=mounting, mag_mounting=_matrix(np.array(mounting) @ between)
+    )
+
+
+def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
+    """Turn the mounting by the small tilt that a level aircraft seems to have."""
+    x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
+    roll, pitch = np.arctan2(-y, -z), np.arctan2(x, np.hypot(y, z))
+    return absorb_tilt(calibration, (float(roll), float(pitch), 0.0))
+
+
+def seen_poses(samples: Sequence[NodeSamples]) -> int:
+    """Count the poses that were held so far, to tell the person what is still to do."""
+    means = [distinct_poses(s.accel, _windows(s)) for s in samples]
+    return len(_distinct(np.vstack([np.empty((0, 3)), *means])))
+
+
+def is_still(samples: NodeSamples) -> bool:
+    """Tell whether the node lay still for at least a moment."""
+    return bool(_windows(samples))
+
+
+def _windows(samples: NodeSamples) -> list[slice]:
+    return still_windows(samples.time_s, samples.accel, samples.gyro)
+
+
+def _still(samples: NodeSamples, values: FloatArray) -> FloatArray:
+    parts = [values[window] for window in _windows(samples)]
+    return np.vstack([np.empty((0, 3)), *parts])
+
+
+def _distinct(poses: FloatArray) -> FloatArray:
+    return distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))])
+
+
+def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:
+    """Mean specific force at rest, bias and scale taken out, in sensor axes."""
+    mean = solve_rest(_still(samples, samples.accel)).mean
+    identity: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return Correction(identity, calibration.accel_matrix, calibration.accel_bias_mps2).apply(mean)
+
+
+def _matrix(m: FloatArray) -> Matrix3:
+    a, b, c = ((float(r[0]), float(r[1]), float(r[2])) for r in m)
+    return (a, b, c)

@@ -1,0 +1,120 @@
+"""Values that cannot be, in every record: all frames stay well-formed, and unknown is unknown."""
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import NavFlags
+from gateway.vehicle import messages
+from gateway.vehicle.health import Health
+from gateway.vehicle.home import Place
+from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.vehicle import Vehicle
+from tests.vehicle.samples import (
+    BARO,
+    FIX,
+    NO_FIX,
+    NOTHING,
+    SAMPLE,
+    STATE,
+    decode,
+    link,
+    report,
+    status,
+)
+
+FLOATS = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, 1e300, -1e300, 3.5e38, -7.0, 90.0]
+INTEGERS = [0, 1, 255, 256, 65_535, 65_536, 2**31, 2**32, -1, -(2**31) - 1, 2**40]
+
+
+def scrambled(record: Any, rng: np.random.Generator) -> Any:
+    """Put odd numbers into a record, its times excepted."""
+    changes: dict[str, Any] = {}
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if field.name in ("time_us", "node") or rng.random() < 0.5:
+            continue
+        if isinstance(value, tuple) and value and isinstance(value[0], float):
+            changes[field.name] = tuple(FLOATS[n] for n in rng.integers(0, len(FLOATS), len(value)))
+        elif isinstance(value, float):
+            changes[field.name] = FLOATS[rng.integers(len(FLOATS))]
+        elif type(value) is int:
+            changes[field.name] = INTEGERS[rng.integers(len(INTEGERS))]
+        elif is_dataclass(value):
+            changes[field.name] = scrambled(value, rng)
+        elif isinstance(value, NavFlags):
+            changes[field.name] = NavFlags(int(rng.integers(1 << 14)))
+    return replace(record, **changes)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_record_stops_the_telemetry(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vehicle = Vehicle(VehicleSettings(home_satellites=4), 1)
+    frames = vehicle.put_mark(Place(47.0, -8.0, math.nan), 0)
+    for n in range(400):
+        time_us = n * 20_000
+
+        def odd(record: Any, time_us: int = time_us) -> Any:
+            return scrambled(replace(record, time_us=time_us), rng)
+
+        frames += vehicle.on_state(odd(STATE), odd(SAMPLE), time_us)
+        frames += vehicle.on_gps(odd(FIX), time_us)
+        frames += vehicle.on_baro(odd(BARO), time_us)
+        frames += vehicle.on_node_status(odd(status()), time_us)
+        links = [scrambled(link(last_time_us=time_us), rng)]
+        frames += vehicle.on_link(report(*links, time_us=time_us), time_us)
+        frames += vehicle.poll(time_us)
+    found = {m.get_type() for m in decode(frames)}
+    assert {"ATTITUDE_QUATERNION", "GPS_RAW_INT", "SYS_STATUS", "HEARTBEAT"} <= found
+
+
+def invalid_marks(message: str) -> dict[str, str]:
+    """Read the marks for unknown values out of the definition itself."""
+    folder = Path(mavlink.__file__).parent
+    for file in ("common.xml", "standard.xml", "minimal.xml"):
+        for element in ET.parse(folder / file).getroot().iter("message"):
+            if element.get("name") == message:
+                return {
+                    str(field.get("name")): str(field.get("invalid"))
+                    for field in element.iter("field")
+                    if field.get("invalid")
+                }
+    raise AssertionError(f"no {message} in the definitions")
+
+
+NUMBERS = {"UINT8_MAX": 255, "UINT16_MAX": 65_535, "INT16_MAX": 32_767}
+
+UNKNOWN = {
+    "GPS_RAW_INT": lambda: messages.gps_raw_int(NO_FIX),
+    "GLOBAL_POSITION_INT": lambda: messages.global_position_int(
+        replace(STATE, flags=NavFlags(0)), 0.0
+    ),
+    "SYS_STATUS": lambda: Health(1, 2.0).sys_status(0),
+    "RADIO_STATUS": lambda: Health(1, 2.0).radio_status(),
+    "SCALED_PRESSURE": lambda: messages.scaled_pressure(BARO),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_is_not_known_is_sent_as_the_definition_says(name: str) -> None:
+    message = UNKNOWN[name]()
+    marks = invalid_marks(name)
+    assert marks
+    for field, mark in marks.items():
+        if name == "GPS_RAW_INT" and field == "satellites_visible":
+            continue
+        expected = NUMBERS[mark] if mark in NUMBERS else int(mark)
+        assert getattr(message, field) == expected, field
+
+
+def test_nothing_known_leaves_no_plausible_zero() -> None:
+    hud = messages.vfr_hud(NOTHING)
+    assert all(math.isnan(value) for value in (hud.airspeed, hud.groundspeed, hud.alt, hud.climb))
+    assert not messages.has_position(NOTHING)
