@@ -11,7 +11,7 @@ import msgspec
 from gateway.config import ConfigError, GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
-from gateway.edges.control_verbs import HubVerbs, RecorderVerbs
+from gateway.edges.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
 from gateway.edges.hub import Hub
 from gateway.edges.metrics import MetricsServer
 from gateway.edges.pty_port import PtyPort
@@ -34,6 +34,7 @@ from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SaveSettings
 from gateway.vehicle.events import NOTICE, WARNING, Told
+from gateway.vehicle.home import Place
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,7 @@ class Daemon:
         self._heard: bytes | None = None
         self._control = ControlServer(socket_path("run"))
         RecorderVerbs(self._recorder).register(self._control)
+        AircraftVerbs(self._mark).register(self._control)
         HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(self._control)
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
@@ -169,6 +171,9 @@ class Daemon:
             return self.reload()
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
+
+    def _mark(self, place: Place | None, vehicle_id: int | None) -> None:
+        self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
 
     def _on_open(self, port: str) -> None:
         self._pipeline.connect(port)

@@ -52,6 +52,7 @@ from gateway.vehicle.actions import (
     SettingsChange,
 )
 from gateway.vehicle.events import Told
+from gateway.vehicle.home import Place
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
@@ -282,6 +283,23 @@ class Pipeline:
         actions: list[Action] = []
         for aircraft in self.aircraft.values():
             actions += aircraft.perform(aircraft.vehicle.say(told, now_us), now_us)
+        return actions
+
+    def mark(self, place: Place | None, vehicle_id: int | None, now_us: int) -> list[Action]:
+        """Mark a place for one aircraft, or for all, or clear the mark.
+
+        Raises
+        ------
+        ValueError
+            If the place is not on earth, or nothing has been heard of the aircraft.
+        """
+        wanted = [a for a in self.aircraft.values() if vehicle_id in (None, a.vehicle_id)]
+        if not wanted:
+            heard = ", ".join(str(known) for known in sorted(self.aircraft)) or "none yet"
+            raise ValueError(f"no such aircraft; heard so far: {heard}")
+        actions: list[Action] = []
+        for aircraft in wanted:
+            actions += aircraft.perform(aircraft.vehicle.put_mark(place, now_us), now_us)
         return actions
 
     @property

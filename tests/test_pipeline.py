@@ -10,6 +10,7 @@ from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, NodeId, Outgoing
 from gateway.sensing.calibration import NodeCalibration
+from gateway.vehicle.home import Place
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
@@ -128,6 +129,27 @@ def test_loss_of_the_receiver_is_told(pipeline: Pipeline) -> None:
     ]
     assert sum("/dev/ttyUSB0" in text for text in texts) == 1
     assert not pipeline.report.connected
+
+
+def test_a_mark_shows_distance_and_bearing(pipeline: Pipeline) -> None:
+    tracker = Tracker()
+    pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
+    pipeline.feed(tracker.frame(0, LEVEL), 0)
+    pipeline.mark(Place(-7.7656 + 0.001, 110.3728, math.nan), 1, 1_000)
+    actions = [a for t in range(10_000, 3_000_000, 10_000) for a in pipeline.poll(t)]
+    actions += pipeline.feed(tracker.frame(3_000_000, LEVEL), 3_000_000)
+    message = named(actions, "NAV_CONTROLLER_OUTPUT")[-1]
+    assert message.wp_dist == pytest.approx(111, abs=2)
+    assert message.target_bearing == 0
+
+
+@pytest.mark.parametrize(("lat_deg", "vehicle_id"), [(91.0, 1), (0.0, 7)])
+def test_marks_that_cannot_be_are_refused(
+    pipeline: Pipeline, lat_deg: float, vehicle_id: int
+) -> None:
+    pipeline.feed(Tracker().frame(0, LEVEL), 0)
+    with pytest.raises(ValueError, match=r"earth|heard so far: 1|nowhere|91"):
+        pipeline.mark(Place(lat_deg, 0.0, 0.0), vehicle_id, 0)
 
 
 def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> None:

@@ -1,4 +1,4 @@
-"""`mavgate status`, `mavgate clients …`, `mavgate reload`: a gateway that runs, and its clients."""
+"""`mavgate status`, `clients …`, `mark`, `reload`: a gateway that runs, and its clients."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final
@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command(rich_help_panel=PANEL)(status)
     app.add_typer(group, name="clients", rich_help_panel=PANEL)
+    app.command(rich_help_panel=PANEL)(mark)
     app.command(rich_help_panel=PANEL)(reload)
 
 
@@ -64,6 +65,22 @@ def add(
 def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -> None:
     """Remove a client, a source or a listening port."""
     _show_endpoints(ask("clients.remove", {"name": name}))
+
+
+def mark(
+    lat_deg: Annotated[
+        float | None, typer.Argument(help="Latitude; write `mavgate mark -- -7.8 110.4` if south.")
+    ] = None,
+    lon_deg: Annotated[float | None, typer.Argument(help="Longitude.")] = None,
+    *,
+    alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
+    aircraft: Annotated[
+        int | None, typer.Option("--aircraft", help="For this one only; by default all.")
+    ] = None,
+) -> None:
+    """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""
+    place = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
+    print(ask("mark", place))
 
 
 def reload() -> None:

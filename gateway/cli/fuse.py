@@ -44,6 +44,7 @@ from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName, make_estimator
 from gateway.flightlog.foreign import Column, ColumnMap
+from gateway.flightlog.row import TableRow
 from gateway.pipeline import AircraftSettings, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
@@ -120,7 +121,9 @@ def fuse_log(
             aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
         )
         try:
-            records = (record for row in table.rows for record in records_of(row))
+            # One tuning for the whole log: changes that were made in flight are left out.
+            rows = (row for row in table.rows if isinstance(row, TableRow))
+            records = (record for row in rows for record in records_of(row))
             time_us, states = fuse(records, aircraft)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error

@@ -65,7 +65,7 @@ def recover(
     file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output [default: NAME.recovered.EXT].")
+        Path | None, typer.Option("--out", "-o", help="Output; by default NAME.recovered.EXT.")
     ] = None,
     force: ForceOption = False,
 ) -> None:

@@ -20,7 +20,7 @@ FlightArgument = Annotated[
     Path | None,
     typer.Argument(
         help="A recording: our CSV, another program's CSV with --columns, or a tlog "
-        "[default: the built-in simulated flight].",
+        "; by default the built-in simulated flight.",
         show_default=False,
     ),
 ]

@@ -1,4 +1,4 @@
-"""`mavgate record …` and `mavgate mark`: orders to the recorder of a gateway that runs."""
+"""`mavgate record …`: orders to the recorder of a gateway that runs."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,7 +30,6 @@ group = typer.Typer(help="Start, stop, name, list and delete recordings.", no_ar
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.add_typer(group, name="record", rich_help_panel=PANEL)
-    app.command("mark", rich_help_panel=PANEL)(mark)
 
 
 @group.command()
@@ -61,7 +60,7 @@ def save(
     *,
     recording: Annotated[
         str | None,
-        typer.Option("--recording", help="Which one [default: the one that runs, or ran last]."),
+        typer.Option("--recording", help="Which one; by default the one that runs, or ran last."),
     ] = None,
     config: ConfigOption = None,
 ) -> None:
@@ -107,9 +106,10 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
         _list(found)
 
 
-def mark(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
+@group.command()
+def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
     """Put a remark at this moment into the recording, and tell the ground stations."""
-    ask("mark", {"text": text})
+    ask("record.note", {"text": text})
 
 
 def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:

@@ -1,5 +1,6 @@
-"""The verbs of the control socket for the recorder and the player; see docs/control.md."""
+"""The verbs of the control socket; see docs/control.md."""
 
+import math
 from collections.abc import Callable
 
 import msgspec
@@ -20,6 +21,7 @@ from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
 from gateway.flightlog.session import SessionState
 from gateway.routing.clients import ClientStats
 from gateway.status import Snapshot
+from gateway.vehicle.home import Place
 
 
 class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -32,6 +34,16 @@ class Url(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An endpoint, as the settings write it."""
 
     url: str
+
+
+class Mark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A place to mark; without latitude and longitude the mark is cleared."""
+
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    alt_amsl_m: float | None = None
+    vehicle_id: int | None = None
+    """The one aircraft that it is for; all without it."""
 
 
 class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -65,7 +77,7 @@ class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RecorderVerbs:
-    """`record.*` and `mark`.
+    """`record.*`.
 
     Parameters
     ----------
@@ -84,7 +96,7 @@ class RecorderVerbs:
         server.register("record.save", Named, self._save)
         server.register("record.delete", Named, self._delete)
         server.register("record.list", NoParams, self._list)
-        server.register("mark", Text, self._mark)
+        server.register("record.note", Text, self._note)
 
     async def _start(self, _: NoParams) -> RecorderStatus:
         self._recorder.record()
@@ -119,9 +131,39 @@ class RecorderVerbs:
     def _list(self, _: NoParams) -> list[Recording]:
         return list_recordings(self._recorder.folder)
 
-    def _mark(self, params: Text) -> RecorderStatus:
+    def _note(self, params: Text) -> RecorderStatus:
         self._recorder.mark(params.text)
         return self._recorder.status()
+
+
+class AircraftVerbs:
+    """`mark`.
+
+    Parameters
+    ----------
+    mark : callable
+        Marks a place for one aircraft or all, or clears the mark; raises ValueError.
+    """
+
+    def __init__(self, mark: Callable[[Place | None, int | None], None]) -> None:
+        self._mark = mark
+
+    def register(self, server: ControlServer) -> None:
+        """Offer the verb on a socket."""
+        server.register("mark", Mark, self._put)
+
+    def _put(self, params: Mark) -> str:
+        place = None
+        if params.lat_deg is not None and params.lon_deg is not None:
+            alt_amsl_m = math.nan if params.alt_amsl_m is None else params.alt_amsl_m
+            place = Place(params.lat_deg, params.lon_deg, alt_amsl_m)
+        elif (params.lat_deg, params.lon_deg) != (None, None):
+            raise ControlError("a mark needs both latitude and longitude")
+        try:
+            self._mark(place, params.vehicle_id)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return "mark cleared" if place is None else "marked"
 
 
 class HubVerbs:

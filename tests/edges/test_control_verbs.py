@@ -9,7 +9,8 @@ import msgspec
 import pytest
 
 from gateway.edges.control_socket import ControlServer
-from gateway.edges.control_verbs import PlayerVerbs, RecorderVerbs
+from gateway.edges.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
+from gateway.vehicle.home import Place
 from tests.conftest import ManualClock
 from tests.edges.test_player import Played
 from tests.edges.test_recorder import Bench
@@ -38,7 +39,7 @@ async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) 
     started = (await ask(server, "record.start"))["result"]
     assert (started["state"], started["part"]) == ("recording", 1)
     bench.send(make_frames(9))
-    assert (await ask(server, "mark", text="here"))["ok"]
+    assert (await ask(server, "record.note", text="here"))["ok"]
     await bench.recorder.settle()
     saved = await ask(server, "record.save", name="first")
     assert saved["result"]["name"] == "first"
@@ -54,6 +55,29 @@ async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) 
     assert (await ask(server, "record.list"))["result"] == []
     assert not (await ask(server, "record.delete", name="first"))["ok"]
     assert bench.announced[1] == (False, "Mark: here")
+
+
+async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
+    marked: list[tuple[Place | None, int | None]] = []
+
+    def mark(place: Place | None, vehicle_id: int | None) -> None:
+        if vehicle_id == 9:
+            raise ValueError("no such aircraft; heard so far: 1")
+        marked.append((place, vehicle_id))
+
+    server = ControlServer(tmp_path / "s")
+    AircraftVerbs(mark).register(server)
+    assert (await ask(server, "mark", lat_deg=-7.5, lon_deg=110.0, alt_amsl_m=90.0))["ok"]
+    assert (await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=3))["ok"]
+    assert (await ask(server, "mark"))["result"] == "mark cleared"
+    assert not (await ask(server, "mark", lat_deg=1.0))["ok"]
+    refused = await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=9)
+    assert refused["error"] == "no such aircraft; heard so far: 1"
+    assert marked[0] == (Place(-7.5, 110.0, 90.0), None)
+    assert marked[1][0] is not None
+    assert math.isnan(marked[1][0].alt_amsl_m)
+    assert marked[1][1] == 3
+    assert marked[2] == (None, None)
 
 
 async def test_a_player_is_steered(clock: ManualClock, tmp_path: Path) -> None:
