@@ -68,7 +68,7 @@ def simulated_flight(
         ideal_calibration(aircraft.errors),
         name="simulated flight",
         story=SIMULATED_STORY,
-        fusion=_with_latency(fusion or FusionSettings(), settings.gps_latency_s),
+        fusion=with_latency(fusion or FusionSettings(), settings.gps_latency_s),
     )
     return replace(flight, reference=_truth_of(aircraft.trajectory, flight))
 
@@ -98,7 +98,8 @@ def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
     return Reference(track, is_exact=True, story=TRUTH_STORY)
 
 
-def _with_latency(fusion: FusionSettings, latency_s: float) -> FusionSettings:
+def with_latency(fusion: FusionSettings, latency_s: float) -> FusionSettings:
+    """Set how old the GPS fixes are at their arrival."""
     estimation: EstimationSettings = fusion.estimation
     reference: ReferenceSettings = msgspec.structs.replace(
         estimation.reference, gps_latency_s=latency_s

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from gateway.analysis.sources import with_latency
 from gateway.cli.errors import refuse
 from gateway.cli.loading import (
     FlightArgument,
@@ -71,6 +72,8 @@ def report(
     others = None
     if against_config is not None:
         others = fusion_of(or_refuse(lambda: load_settings(against_config)))
+        if flight is None:
+            others = with_latency(others, loaded.latency_s)
     console = Console(stderr=True)
     with Progress(*COLUMNS, console=console, transient=True, auto_refresh=False) as progress:
         task = progress.add_task("fusing", total=None)

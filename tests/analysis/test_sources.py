@@ -109,3 +109,12 @@ def test_the_nearest_row_is_taken_if_it_is_near() -> None:
     found = at_times(track, np.array([10_000, 60_000, 200_000, 399_000, 500_000]))
     assert found.lat_deg == pytest.approx([1.0, 2.0, np.nan, 3.0, np.nan], nan_ok=True)
     assert found.vel_n_mps[3].tolist() == [3.0, 3.0, 3.0]
+
+
+def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> None:
+    flight = short_flight()
+    bare = replace(
+        flight.with_fixes([]), mag_b_ut=np.full_like(flight.mag_b_ut, np.nan), reference=None
+    )
+    titles = [section.title for section in make_report(make_case(bare)).sections]
+    assert titles == ["Acceleration filters", "Noise", "Timing and loss"]

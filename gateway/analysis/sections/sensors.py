@@ -15,6 +15,7 @@ from gateway.units import US_PER_S
 
 AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
 MIN_REST_S: Final = 5.0
+MAX_DOTS: Final = 800
 NODE_WRAP_US: Final = 1 << 32
 LONGEST_LOSS_US: Final = 60 * US_PER_S
 
@@ -280,7 +281,7 @@ def _draw_sphere(before: FloatArray, after: FloatArray, width_in: float) -> Figu
     figure, axes = style.panels(width_in, 1, 3.5, columns=2, share_x=False)
     radius = float(np.linalg.norm(after, axis=1).mean())
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
-    step = max(1, len(before) // 1500)
+    step = max(1, len(before) // MAX_DOTS)
     for panel, (i, j) in zip(axes, ((0, 1), (0, 2)), strict=True):
         panel.plot(
             before[::step, i], before[::step, j], ".", color=style.ORANGE, ms=2, label="before"
