@@ -20,6 +20,7 @@ from gateway.cli.run import ConfigOption, read_aircraft, read_settings
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock
 from gateway.edges.serial_link import SerialLink, SerialSettings
+from gateway.flightlog.row import TableRow
 from gateway.pipeline import PipelineSettings
 from gateway.records import ImuRaw
 from gateway.sensing.calibration import NodeCalibration
@@ -193,7 +194,9 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
         raws = [
             row.raw
             for row in table.rows
-            if row.raw is not None and row.raw.node.vehicle_id == vehicle
+            if isinstance(row, TableRow)
+            and row.raw is not None
+            and row.raw.node.vehicle_id == vehicle
         ]
     if not raws:
         refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")

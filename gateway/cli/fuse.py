@@ -120,7 +120,7 @@ def fuse_log(
             aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
         )
         try:
-            records = (record for row in table.rows for record in records_of(row))
+            records = (record for row in table.plain_rows for record in records_of(row))
             time_us, states = fuse(records, aircraft)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
