@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from gateway.estimation.columns import NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
+from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
 from gateway.estimation.record import FloatArray, IntArray, copy_record, new_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
@@ -46,6 +46,19 @@ class Kernels(Generic[State, Gains]):
     """`(state, gains, *arrays of a SampleLog, output)`."""
 
 
+def _direct(function: Callable[..., None]) -> Callable[..., None]:
+    """Find the machine code behind a dispatcher that has compiled for one signature.
+
+    The dispatcher looks the type of every argument up on every call, which for records of many
+    fields takes longer than the work. The caller must keep to the types of the first call.
+    """
+    overloads = getattr(function, "overloads", {})
+    if len(overloads) != 1:
+        return function
+    code: Callable[..., None] = next(iter(overloads.values())).entry_point
+    return code
+
+
 class KernelEstimator(Generic[State, Gains]):
     """An estimator made of compiled kernels over one record of state.
 
@@ -69,6 +82,12 @@ class KernelEstimator(Generic[State, Gains]):
         self._row = np.empty(NAV_COLUMNS)
         self._state = new_record(kernels.declaration)
         kernels.start(self._state, gains)
+        # A first call on a scrap state compiles, or loads, what `_direct` then finds.
+        scrap = copy_record(self._state)
+        kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
+        kernels.tell(scrap, self._row)
+        self._imu = _direct(kernels.imu)
+        self._tell = _direct(kernels.tell)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -83,6 +102,8 @@ class KernelEstimator(Generic[State, Gains]):
 
     @state.setter
     def state(self, state: State) -> None:
+        if getattr(state, "dtype", None) != getattr(self._state, "dtype", None):
+            raise TypeError(f"not a state of this estimator: {type(state)}")
         self._state = copy_record(state)
 
     def update_imu(self, sample: ImuSample) -> NavState:
@@ -98,8 +119,8 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._kernels.imu(self._state, self._gains, sample.time_us, *imu_row(sample))
-        self._kernels.tell(self._state, self._row)
+        self._imu(self._state, self._gains, sample.time_us, *imu_row(sample))
+        self._tell(self._state, self._row)
         return nav_state(sample.time_us, self._row)
 
     def update_baro(self, sample: BaroSample) -> None:
