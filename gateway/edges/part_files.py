@@ -98,20 +98,24 @@ class PartFiles:
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
 
     def close(self) -> None:
-        """Close all files; what the disk holds stays whatever happens."""
+        """Close all files; what the disk holds stays whatever happens, but none stays empty."""
         files, self._files = self._files, {}
-        for file in files.values():
+        for ending, file in files.items():
             try:
                 os.fdatasync(file)
             finally:
                 os.close(file)
+                if not self._sizes[ending]:
+                    self._path(ending).unlink(missing_ok=True)
 
     def _open(self, ending: str) -> None:
-        path = self._folder / (part_stem(self.session, self._part) + ending)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
-        self._files[ending] = os.open(path, flags, RIGHTS)
+        self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
         self._sizes[ending] = 0
         sync_folder(self._folder)
+
+    def _path(self, ending: str) -> Path:
+        return self._folder / (part_stem(self.session, self._part) + ending)
 
     def _append(self, ending: str, data: bytes) -> None:
         view = memoryview(data)

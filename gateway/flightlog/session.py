@@ -30,6 +30,8 @@ from gateway.units import US_PER_S
 RETRY_US: Final = 5 * US_PER_S
 RESUME_FACTOR: Final = 1.25
 """Free space must exceed the floor by this before recording resumes, or it would flap."""
+RESUME_LEAST_MB: Final = 1.0
+"""And this in any case: some ten seconds of recording."""
 MAX_NAME: Final = 100
 PART_DIGITS: Final = 2
 
@@ -277,12 +279,13 @@ class Session:
         if not self.wanted:
             self.state, self.reason = SessionState.IDLE, ""
             return [Announce(is_trouble=False, text=f"Recording {self.name} ended")]
-        if now_us < self._retry_us or self._is_short(free_bytes, RESUME_FACTOR):
+        enough_mb = max(self._settings.free_floor_mb * RESUME_FACTOR, RESUME_LEAST_MB)
+        if now_us < self._retry_us or free_bytes < enough_mb * 1e6:
             return []
         return self._open_next()
 
-    def _is_short(self, free_bytes: int, factor: float = 1.0) -> bool:
-        return free_bytes < self._settings.free_floor_mb * 1e6 * factor
+    def _is_short(self, free_bytes: int) -> bool:
+        return free_bytes < self._settings.free_floor_mb * 1e6
 
     def _stop_short(self, now_us: int) -> list[SessionAction]:
         return self.failed(f"less than {self._settings.free_floor_mb:g} MB free", now_us)

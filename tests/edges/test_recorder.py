@@ -327,6 +327,22 @@ async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
+def test_a_file_that_got_nothing_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = PartFiles(tmp_path, "a", 1)
+
+    def refuse(*args: object) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", refuse)
+        with pytest.raises(OSError, match="full"):
+            files.write({".tlog": b"x"}, sync=False)
+    files.close()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
     first = PartFiles(tmp_path, "a", 2)
     first.write({".tlog": b"x"}, sync=False)

@@ -152,3 +152,10 @@ def test_nothing_is_opened_on_a_disk_that_is_full_already() -> None:
     assert isinstance(announcement, Announce)
     assert announcement.is_trouble
     assert poll(session, RETRY_US) == [OpenPart(NAME, 1)]
+
+
+def test_a_full_disk_needs_some_room_even_without_a_floor() -> None:
+    session = recording(RecordingSettings(mode="always", free_floor_mb=0))
+    session.failed("disk is full", 0)
+    assert poll(session, RETRY_US, free=900_000) == []
+    assert poll(session, RETRY_US, free=1_100_000) == [OpenPart(NAME, 2)]
