@@ -135,9 +135,12 @@ def check_table(data: bytes) -> None:
 
 
 def cut_everywhere(folder: Path) -> tuple[int, int]:
-    """Cut what a killed recorder left after every byte of its first `CUT_BYTES`."""
-    (tlog,) = (path.read_bytes()[:CUT_BYTES] for path in folder.glob("*.tlog"))
-    (table,) = (path.read_bytes()[:CUT_BYTES] for path in folder.glob("*.csv"))
+    """Cut the longest of what the killed recorders left after every byte of its first ones."""
+    longest = [
+        max(folder.rglob(pattern), key=lambda path: path.stat().st_size)
+        for pattern in ("*.tlog", "*.csv")
+    ]
+    tlog, table = (path.read_bytes()[:CUT_BYTES] for path in longest)
     for size in range(len(tlog)):
         check_tlog(tlog[:size])
     for size in range(len(table)):
@@ -159,7 +162,7 @@ def main() -> None:
         for number, life_s in enumerate(lives_s.tolist()):
             folder = Path(name) / str(number)
             lost_s.append(kill_one(folder, life_s))
-        tlog_cuts, table_cuts = cut_everywhere(folder)
+        tlog_cuts, table_cuts = cut_everywhere(Path(name))
     print(f"{args.kills} kills: every recording opens, only the cut end is damaged")
     print(f"lost: mean {np.mean(lost_s):.3f} s, most {max(lost_s):.3f} s")
     print(f"cut at every byte: {tlog_cuts} prefixes of a tlog, {table_cuts} of a table, all open")
