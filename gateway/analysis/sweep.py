@@ -169,7 +169,7 @@ def make_contest(
     hold_out : int
         Every so many-th fix is withheld from the fusion; 0 for none.
     interval_s : float
-        Fuse only a fix in so many seconds; those between are withheld too.
+        Where it is not 0, fuse only a fix in so many seconds, and withhold all others.
 
     Returns
     -------
@@ -185,9 +185,12 @@ def make_contest(
         raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
     if named:
         fusion = with_value(fusion, "estimation.estimator", named.pop())
-    keep = thin(flight, interval_s) if interval_s else np.ones(len(flight.fixes), np.bool_)
-    if hold_out:
-        keep &= withhold(flight, hold_out)
+    keep = np.ones(len(flight.fixes), np.bool_)
+    if interval_s:
+        # Not both: a comb through another comb leaves gaps, or nothing.
+        keep = thin(flight, interval_s)
+    elif hold_out:
+        keep = withhold(flight, hold_out)
     return Contest(flight, fusion, tuple(keys), make_judge(flight, keep))
 
 

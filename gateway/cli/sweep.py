@@ -42,7 +42,10 @@ def sweep(
         int, typer.Option(help="Withhold every so many-th fix; 0 for none.", min=0)
     ] = 5,
     gps_interval: Annotated[
-        float, typer.Option(help="Fuse one fix in so many seconds; 0 for all.", min=0.0)
+        float,
+        typer.Option(
+            help="Fuse one fix in so many seconds, and let all others judge; 0 for all.", min=0.0
+        ),
     ] = 0.0,
     jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
     output: Annotated[

@@ -89,13 +89,14 @@ def test_two_estimators_at_once_are_refused() -> None:
         make_contest(short_flight(), short_case().fusion, keys)
 
 
-def test_withheld_fixes_are_not_fused() -> None:
+@pytest.mark.parametrize(("interval_s", "share"), [(0.0, 0.8), (1.0, 0.2)])
+def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
     flight = short_flight()
-    contest = make_contest(flight, short_case().fusion, [ALPHA], hold_out=4, interval_s=1.0)
+    contest = make_contest(flight, short_case().fusion, [ALPHA], hold_out=5, interval_s=interval_s)
     fused, held = fixes_of(contest.judge.fused), contest.judge.held
     assert len(fused) + len(held) == len(fixes_of(flight))
     assert not set(fused.arrival_us.tolist()) & set(held.arrival_us.tolist())
-    assert len(fused) < 0.2 * len(held) + 15
+    assert len(fused) / len(fixes_of(flight)) == pytest.approx(share, abs=0.03)
 
 
 def test_a_grid_is_every_point() -> None:
