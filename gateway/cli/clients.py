@@ -123,15 +123,13 @@ def _nodes(nodes: Sequence[Record]) -> Table:
 
 def _clients(clients: Sequence[Record], now_us: int) -> Table:
     table = _table(
-        "client", "state", "systems", "sent", "dropped", "waiting", "received", "heard s ago",
-        "trip ms",
-    )  # fmt: skip
+        "client", "state", "sent", "dropped", "waiting", "received", "heard s", "trip ms"
+    )
     for client in clients:
         heard_us, trip_us = client["heard_us"], client["round_trip_us"]
         table.add_row(
-            client["name"],
+            " ".join([client["name"], *(f"{s}.{c}" for s, c in client["systems"])]),
             client["state"],
-            ", ".join(f"{system}.{component}" for system, component in client["systems"]),
             *(str(client[key]) for key in ("sent", "dropped", "queued", "received")),
             UNKNOWN if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.1f}",
             UNKNOWN if trip_us is None else f"{trip_us / US_PER_MS:.1f}",
@@ -140,9 +138,10 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
+    # Narrow padding: the table of clients fits a terminal of 80 columns.
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right")
+        table.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     return table
 
 

@@ -16,7 +16,7 @@ from gateway.flightlog.tlog import TlogScanner, encode_record
 
 SUFFIXES: Final = (".tlog", ".csv")
 RESTAMP_LIMIT: Final = 16 << 20
-"""Larger files keep the times they were written with; `mavgate recover` can shift those."""
+"""Larger files keep the times they were written with: rewriting them would hold up the disk."""
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 
