@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.edges.control_socket import request
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
+from gateway.simulator.settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, free_udp_ports
 from tests.end_to_end.test_demo import MavProxy
 from tests.flightlog.frames import START_US, make_tlog
@@ -210,3 +211,40 @@ async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., 
             home = await anext(telemetry.subscribe_home())
     assert place.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
     assert home.longitude_deg == pytest.approx(LON_DEG, abs=0.01)
+
+
+async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
+    start_gateway: Callable[..., Gateway],
+    start_mavproxy: Callable[[int], MavProxy],
+    play: Callable[..., Playing],
+    tmp_path: Path,
+) -> None:
+    gateway = start_gateway("demo")
+    recorder = start_mavproxy(gateway.port)
+    recorder.until(r"GLOBAL_POSITION_INT \{time_boot_ms : \d{5}", "status GLOBAL_POSITION_INT")
+    # Told to end, it writes what it still holds; the closed input wakes its keyboard thread.
+    recorder.process.terminate()
+    recorder.process.communicate(timeout=START_LIMIT_S)
+    gateway.stop()
+    playing = play(str(tmp_path / "mav.tlog"), "--loop")
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
+        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+        async with asyncio.timeout(30):
+            place = await anext(TelemetryAsync(system).subscribe_position())
+    home = SimulatorSettings()
+    assert place.latitude_deg == pytest.approx(home.home_lat_deg, abs=0.001)
+    playing.process.terminate()
+    playing.process.wait(10)
+    viewing = play(str(tmp_path / "mav.tlog"), "--loop")
+    folder = tmp_path / "viewer"
+    folder.mkdir()
+    viewer = MavProxy(viewing.port, folder)
+    try:
+        viewer.until(r"Detected vehicle 1:1")
+        found = viewer.until(r"GLOBAL_POSITION_INT \{.*?lat : (-\d+)", "status GLOBAL_POSITION_INT")
+    finally:
+        viewer.process.kill()
+        viewer.process.communicate()
+    assert int(found[1]) / 1e7 == pytest.approx(home.home_lat_deg, abs=0.001)
