@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -25,7 +25,6 @@ from gateway.sensing.chain import SensingSettings
 from gateway.settings import Settings, fields_of
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
-METRICS: Final[tuple[Metric, ...]] = get_args(Metric)
 COLUMN_OF: Final[dict[Metric, str]] = {
     "held": "held_m",
     "interpolated": "interpolated_m",

@@ -94,11 +94,13 @@ def calibrate(
     chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
     old = aircraft.calibration
     if log is not None:
-        new = _from_log(chosen, _read_log(log, settings, vehicle), old, field_ut)
+        samples = _read_log(log, settings, vehicle)
+        new = _each(chosen, lambda step, known: _log_step(step, samples, known, field_ut), old)
     else:
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
-        new = _live(chosen, _capture_from(serial, vehicle), old, field_ut)
+        capture = _capture_from(serial, vehicle)
+        new = _each(chosen, lambda step, known: _live_step(step, capture, known, field_ut), old)
     _show(old, new)
     if new == old or dry_run:
         return
@@ -107,13 +109,15 @@ def calibrate(
         console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
 
 
-def _live(
-    steps: list[Step], capture: Capture, calibration: NodeCalibration, field_ut: float | None
+def _each(
+    steps: list[Step],
+    solve: Callable[[Step, NodeCalibration], NodeCalibration],
+    calibration: NodeCalibration,
 ) -> NodeCalibration:
-    """Guide through the steps; a step that fails is said and the others go on."""
+    """Go through the steps; one that fails is said and the others go on."""
     for step in steps:
         try:
-            calibration = _live_step(step, capture, calibration, field_ut)
+            calibration = solve(step, calibration)
             console.print(f"[green]{step}: done[/]")
         except CalibrationError as error:
             console.print(f"[red]{step}: {error}[/]")
@@ -158,19 +162,6 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
             console.print("It moved; once more.")
         held.append(samples)
     return held
-
-
-def _from_log(
-    steps: list[Step], samples: NodeSamples, calibration: NodeCalibration, field_ut: float | None
-) -> NodeCalibration:
-    """Solve the steps that a recording's samples allow."""
-    for step in steps:
-        try:
-            calibration = _log_step(step, samples, calibration, field_ut)
-            console.print(f"[green]{step}: done[/]")
-        except CalibrationError as error:
-            console.print(f"[red]{step}: {error}[/]")
-    return calibration
 
 
 def _log_step(

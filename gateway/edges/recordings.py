@@ -14,7 +14,6 @@ from typing import Final
 from gateway.flightlog.session import check_name, part_stem
 from gateway.flightlog.tlog import TlogScanner, encode_record
 
-SUFFIXES: Final = (".tlog", ".csv")
 RESTAMP_LIMIT: Final = 16 << 20
 """Larger files keep the times they were written with: rewriting them would hold up the disk."""
 

@@ -23,7 +23,6 @@ STRIDE: Final = 256
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
 MAX_DAMAGE_RUNS: Final = 1000
 """Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
-MAX_TIME_US: Final = (1 << 56) - 1
 
 _EXTRA: Final = crc_extra_table()
 

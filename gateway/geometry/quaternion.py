@@ -41,12 +41,6 @@ def multiply(p: Quat, q: Quat) -> Quat:
 
 
 @compiled
-def conjugate(q: Quat) -> Quat:
-    """Invert a unit rotation."""
-    return (q[0], -q[1], -q[2], -q[3])
-
-
-@compiled
 def normalise(q: Quat) -> Quat:
     """Scale to unit norm; the zero quaternion becomes the identity."""
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])

@@ -22,7 +22,6 @@ Delays = tuple[float, float, float, float, float, float]
 """The two delay elements of each axis, in transposed direct form II."""
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
-ZERO_DELAYS: Final[Delays] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def design_lowpass(

@@ -21,6 +21,7 @@ from gateway.records import (
     NavState,
     Vec3,
 )
+from gateway.units import PA_PER_HPA
 from gateway.vehicle import fields
 from gateway.vehicle.home import Home, is_3d
 
@@ -28,7 +29,6 @@ MIN_COURSE_SPEED_MPS: Final = 0.5
 """Below this the direction of a GPS velocity is its noise."""
 
 UT_PER_GAUSS: Final = 100.0
-PA_PER_HPA: Final = 100.0
 MM: Final = 1e3
 CM: Final = 1e2
 DEGE5: Final = 1e5

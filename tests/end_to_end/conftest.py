@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.processes import CONFIG, Client, Gateway
+from tests.end_to_end.processes import CONFIG, Client, Gateway, MavProxy
 
 
 @pytest.fixture
@@ -34,3 +34,17 @@ def connect() -> Iterator[Callable[..., Client]]:
     yield make
     for client in clients:
         client.sock.close()
+
+
+@pytest.fixture
+def start_mavproxy(tmp_path: Path) -> Iterator[Callable[[int], MavProxy]]:
+    started: list[MavProxy] = []
+
+    def start(port: int) -> MavProxy:
+        started.append(MavProxy(port, tmp_path))
+        return started[-1]
+
+    yield start
+    for proxy in started:
+        proxy.process.kill()
+        proxy.process.communicate()

@@ -1,10 +1,13 @@
 """The gateway as its users start it: a process of its own, and a bare client of it."""
 
 import os
+import re
+import select
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -83,3 +86,40 @@ class Client:
 
     def send(self, message: mavlink.MAVLink_message, port: int) -> None:
         self.sock.sendto(message.pack(self.mavlink), ("127.0.0.1", port))
+
+
+class MavProxy:
+    """MAVProxy without its windows, driven as by keyboard."""
+
+    def __init__(self, port: int, folder: Path) -> None:
+        self.output = ""
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                str(Path(sys.executable).parent / "mavproxy.py"),
+                f"--master=udpin:127.0.0.1:{port}",
+                f"--state-basedir={folder}",
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            cwd=folder,
+        )
+
+    def type(self, command: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{command}\n".encode())
+        self.process.stdin.flush()
+
+    def until(self, pattern: str, asking: str = "") -> re.Match[str]:
+        """Read until the output holds a pattern; ask for it by a command every second."""
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + START_LIMIT_S
+        while (found := re.search(pattern, self.output)) is None:
+            assert time.monotonic() < deadline, f"no {pattern!r} in:\n{self.output}"
+            if asking:
+                self.type(asking)
+            ready, _, _ = select.select([self.process.stdout], [], [], 1.0)
+            if ready:
+                self.output += os.read(self.process.stdout.fileno(), 65_536).decode()
+        return found

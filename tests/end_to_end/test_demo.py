@@ -2,14 +2,7 @@
 
 import asyncio
 import math
-import os
-import re
-import select
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
@@ -17,7 +10,7 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 
 HOME = SimulatorSettings()
 NEAR_DEG = 0.001
@@ -79,57 +72,6 @@ async def test_mavsdk_sees_vehicle_attitude_and_position(
     assert place.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=20.0)
     assert abs(attitude.roll_deg) < 10.0
     assert abs(speeds.climb_rate_m_s) < 3.0
-
-
-class MavProxy:
-    """MAVProxy without its windows, driven as by keyboard."""
-
-    def __init__(self, port: int, folder: Path) -> None:
-        self.output = ""
-        self.process = subprocess.Popen(
-            [
-                sys.executable,
-                str(Path(sys.executable).parent / "mavproxy.py"),
-                f"--master=udpin:127.0.0.1:{port}",
-                f"--state-basedir={folder}",
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            cwd=folder,
-        )
-
-    def type(self, command: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{command}\n".encode())
-        self.process.stdin.flush()
-
-    def until(self, pattern: str, asking: str = "") -> re.Match[str]:
-        """Read until the output holds a pattern; ask for it by a command every second."""
-        assert self.process.stdout is not None
-        deadline = time.monotonic() + START_LIMIT_S
-        while (found := re.search(pattern, self.output)) is None:
-            assert time.monotonic() < deadline, f"no {pattern!r} in:\n{self.output}"
-            if asking:
-                self.type(asking)
-            ready, _, _ = select.select([self.process.stdout], [], [], 1.0)
-            if ready:
-                self.output += os.read(self.process.stdout.fileno(), 65_536).decode()
-        return found
-
-
-@pytest.fixture
-def start_mavproxy(tmp_path: Path) -> Iterator[Callable[[int], MavProxy]]:
-    started: list[MavProxy] = []
-
-    def start(port: int) -> MavProxy:
-        started.append(MavProxy(port, tmp_path))
-        return started[-1]
-
-    yield start
-    for proxy in started:
-        proxy.process.kill()
-        proxy.process.communicate()
 
 
 def test_mavproxy_sees_vehicle_attitude_and_position(

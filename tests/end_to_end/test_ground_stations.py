@@ -24,9 +24,8 @@ from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Gateway
+from tests.end_to_end.processes import START_LIMIT_S, Gateway, MavProxy
 from tests.end_to_end.station import Station
-from tests.end_to_end.test_demo import MavProxy
 from tests.vehicle.test_start_up import qgroundcontrol
 
 HOME = SimulatorSettings()

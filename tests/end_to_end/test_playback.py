@@ -17,8 +17,7 @@ from gateway.cli.app import app
 from gateway.edges.control_socket import request
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
 from gateway.simulator.settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, free_udp_ports
-from tests.end_to_end.test_demo import MavProxy
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, free_udp_ports
 from tests.flightlog.frames import START_US, make_tlog
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -173,20 +172,6 @@ folder = "FOLDER"
     done = CliRunner().invoke(app, ["convert", str(table), "--fuse", "-o", str(again)])
     assert done.exit_code == 0, done.output
     assert again.read_bytes() == table.read_bytes()
-
-
-@pytest.fixture
-def start_mavproxy(tmp_path: Path) -> Iterator[Callable[[int], MavProxy]]:
-    started: list[MavProxy] = []
-
-    def start(port: int) -> MavProxy:
-        started.append(MavProxy(port, tmp_path))
-        return started[-1]
-
-    yield start
-    for proxy in started:
-        proxy.process.kill()
-        proxy.process.communicate()
 
 
 def test_mavproxy_sees_the_recorded_vehicle(

@@ -1,6 +1,5 @@
 """Place: the track on a map, GPS before and after interpolation, latitude and longitude."""
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -127,13 +126,6 @@ def _graticule(axes: Axes, frame: LocalFrame) -> None:
     top.spines["top"].set_visible(True)
     right.set_ylabel("latitude (deg)", color=style.MUTED, fontsize=7.0)
     top.set_xlabel("longitude (deg)", color=style.MUTED, fontsize=7.0)
-
-
-def _degrees_and_metres(
-    origin_deg: float, per_deg: float
-) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
-    """Convert metres from the origin into degrees, and back."""
-    return (lambda m: origin_deg + m / per_deg, lambda deg: (deg - origin_deg) * per_deg)
 
 
 def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> None:
