@@ -22,6 +22,9 @@ FIRST_FIELD_S: Final = 5.0
 TURNING_RADPS: Final = 0.35
 STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
+LIKE_NORM_SHARE: Final = 0.04
+LIKE_DIP_RAD: Final = 0.035
+"""A field this much stronger or steeper than usual counts half."""
 
 
 class FieldGains:
@@ -92,6 +95,29 @@ def judge_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float
         s.mag_reject_s += dt
         return 0.0
     return REJECT_SHARE
+
+
+@compiled
+def likeness(s: FieldState, norm: float, dip: float) -> float:
+    """Weigh a field by how alike it is to the usual one: what bends the one bends the other.
+
+    Parameters
+    ----------
+    s : FieldState
+        Tells the usual field.
+    norm, dip : float
+        Strength in uT and dip in rad of the newest field.
+
+    Returns
+    -------
+    float
+        1 for the usual field itself or while none is known, less the less alike.
+    """
+    if s.mag_norm_ref == 0.0:
+        return 1.0
+    stronger = (norm / s.mag_norm_ref - 1.0) / LIKE_NORM_SHARE
+    steeper = (dip - s.mag_dip_ref) / LIKE_DIP_RAD
+    return 1.0 / (1.0 + stronger * stronger + steeper * steeper)
 
 
 @compiled

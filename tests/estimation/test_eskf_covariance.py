@@ -1,14 +1,25 @@
 """The filter's hand-written matrix products against the matrices themselves."""
 
+import math
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from gateway.estimation.eskf.covariance import absorb, absorb_considering, clear, hold, propagate
-from gateway.estimation.eskf.measure import position_row, velocity_row
+from gateway.estimation.eskf.covariance import (
+    absorb,
+    absorb_considering,
+    clear,
+    hold,
+    inject,
+    propagate,
+)
+from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
 from gateway.estimation.eskf.settings import EskfSettings, make_gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     GYRO_BIAS,
+    GYRO_SCALE,
     MAG_BIAS,
     POS,
     STATES,
@@ -36,8 +47,12 @@ def state(rng: np.random.Generator) -> State:
     return s
 
 
-def transition(force: np.ndarray, turn: np.ndarray, dt: float) -> np.ndarray:
+def transition(
+    force: np.ndarray, turn: np.ndarray, dt: float, scaled: np.ndarray | None = None
+) -> np.ndarray:
     F = np.eye(STATES)
+    if scaled is not None:
+        F[TILT : TILT + 3, GYRO_SCALE : GYRO_SCALE + 3] = -scaled
     F[TILT : TILT + 3, GYRO_BIAS : GYRO_BIAS + 3] = -turn
     F[VEL : VEL + 3, TILT : TILT + 3] = -cross(force)
     F[VEL : VEL + 3, ACCEL_BIAS : ACCEL_BIAS + 3] = -turn
@@ -47,14 +62,15 @@ def transition(force: np.ndarray, turn: np.ndarray, dt: float) -> np.ndarray:
 
 def test_propagation_is_the_matrix_product(state: State, rng: np.random.Generator) -> None:
     force, turn, dt = rng.normal(size=3), rng.normal(size=(3, 3)), 0.02
+    scaled = rng.normal(size=(3, 3))
     state.P[TILT + 2, TILT + 2] = 0.5
     before = state.P.copy()
     state.pending_s = dt
     state.pending_force_n[:], state.pending_turn[:] = force, turn
+    state.pending_scaled[:] = scaled
     propagate(state, GAINS)
-    F = transition(force, turn, dt)
-    faded = [*range(WANDER, WANDER + 3), MAG_BIAS]
-    kept = [k for k in range(STATES) if k not in faded]
+    F = transition(force, turn, dt, scaled)
+    kept = [k for k in range(STATES) if not WANDER <= k < WANDER + 3]
     expected = F @ before @ F.T
     added = state.P - expected
     block = added[np.ix_(kept, kept)]
@@ -123,3 +139,31 @@ def test_a_late_row_is_the_present_error_carried_back(rng: np.random.Generator) 
         expected[GYRO_BIAS : GYRO_BIAS + 3] = 0.0
         expected[WANDER + k] = 1.0
         np.testing.assert_allclose(s.h, expected, atol=2e-3)
+
+
+def test_the_compass_row_tells_what_iron_does_to_the_heading(rng: np.random.Generator) -> None:
+    s = new_record(State)
+    q = rng.normal(size=4)
+    s.q_nb[:] = q / np.linalg.norm(q)
+    attitude = Rotation.from_quat(s.q_nb, scalar_first=True)
+    field_n = np.array([20.0, 6.0, 40.0])
+
+    def heading(field: np.ndarray) -> float:
+        return -math.atan2(field[1], field[0])
+
+    clear(s)
+    compass_row(s, tuple(field_n))
+    for k in range(3):
+        # What is measured is the iron that the estimate lacks, turned to NED.
+        bent = field_n + attitude.apply(1e-6 * np.eye(3)[k])
+        slope = (heading(bent) - heading(field_n)) / 1e-6
+        assert s.h[MAG_BIAS + k] == pytest.approx(slope, rel=1e-4)
+
+
+def test_a_slow_error_of_the_fixes_has_an_end() -> None:
+    s = new_record(State)
+    s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
+    s.wander_var[:] = [1.0, 4.0, 9.0]
+    s.dx[WANDER : WANDER + 3] = [100.0, -100.0, 1.0]
+    inject(s)
+    np.testing.assert_allclose(s.wander_n, [3.0, -6.0, 1.0])

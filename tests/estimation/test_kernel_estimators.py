@@ -259,6 +259,26 @@ class TestNonsense:
         assert NavFlags.GPS_REJECTED not in state.flags
 
 
+def test_a_contradicting_fix_widens_what_is_told_only_when_repeated() -> None:
+    """The Kalman filter's place and lasting other fixes may both be wrong: it says so."""
+
+    def stds(offsets: dict[int, float]) -> dict[int, float]:
+        items: Items = []
+        for sample in still(0, 12.0):
+            t = sample.time_us
+            if t % 200_000 == 0 and t > 1_000_000:
+                items.append(fix(t, north_m=offsets.get(t, 0.0)))
+            items.append(sample)
+        states = feed(EskfEstimator(EskfSettings(), ReferenceSettings()), items)
+        return {s.time_us: s.pos_std_m[0] for s in states}
+
+    once = stds({8_000_000: 300.0})
+    assert max(std for t, std in once.items() if t > 7_000_000) < 3.0
+    lasting = stds(dict.fromkeys(range(8000000, 10000000, 200000), 300.0))
+    assert lasting[9_000_000] == pytest.approx(300.0, rel=0.05)
+    assert lasting[11_990_000] < 3.0
+
+
 def test_outage_is_told(estimator: KernelEstimator) -> None:
     feed(estimator, [*still(0, 3.0), fix(3_000_000)])
     states = feed(estimator, still(3_000_000, 5.0))

@@ -9,7 +9,7 @@ import pytest
 from gateway.estimation.alignment import MatchState, collect_match
 from gateway.estimation.complementary.state import ComplementarySettings, State, make_gains
 from gateway.estimation.health import HealthState, judge_sensors
-from gateway.estimation.magfield import NEW_FIELD_S, judge_field
+from gateway.estimation.magfield import LIKE_DIP_RAD, NEW_FIELD_S, judge_field, likeness
 from gateway.estimation.place import PlaceState, is_relocked, move_origin
 from gateway.estimation.record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.reference import ReferenceSettings
@@ -87,6 +87,14 @@ class TestField:
         self.feed(state, 45.0, 10.0)
         self.feed(state, 70.0, NEW_FIELD_S + 5.0, rate=0.0)
         assert state.mag_disturbed == 1
+
+    def test_a_field_counts_by_its_likeness_to_the_usual_one(self) -> None:
+        state = new_record(State)
+        assert likeness(state, 45.0, 1.1) == 1.0
+        self.feed(state, 45.0, 10.0)
+        assert likeness(state, 45.0, 1.1) == pytest.approx(1.0)
+        assert likeness(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(0.5)
+        assert likeness(state, 52.0, 1.1) < 0.1
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 179.0, -135.0])

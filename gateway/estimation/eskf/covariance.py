@@ -1,6 +1,6 @@
 """Propagation and scalar updates of the covariance.
 
-The transition matrix is the identity and four 3x3 blocks, so its products are written out row by
+The transition matrix is the identity and five 3x3 blocks, so its products are written out row by
 row. A measurement of three numbers is three scalar updates: no matrix is ever inverted.
 
 References
@@ -18,6 +18,7 @@ from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
+    GYRO_SCALE,
     MAG_BIAS,
     POS,
     STATES,
@@ -30,7 +31,9 @@ from gateway.estimation.record import FloatArray, as_quat, put_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
 SCALE_S: Final = 1.0
-"""A turn keeps its axis in the body for about this time, and its error its sign."""
+"""An acceleration keeps its axis in the body for about this time, and its error its sign."""
+MAX_WANDER_SIGMA: Final = 3.0
+"""What the fixes are off beyond this is no slow error of theirs but the filter's."""
 MAX_TILT_VAR: Final = 3.0
 """A heading of which nothing is known; more would only break the linearisation."""
 
@@ -40,63 +43,50 @@ def propagate(s: State, p: Gains) -> None:
     """Carry the covariance over the pending time: `F P F^T + Q`.
 
     With `R` the integral of `R_nb`, `f` that of the specific force in NED and `dt` the time:
-    `tilt' = tilt - R gyro_bias`, `vel' = vel + tilt x f - R accel_bias`, `pos' = pos + vel dt`.
+    `tilt' = tilt - R gyro_bias - R diag(gyro) gyro_scale`,
+    `vel' = vel + tilt x f - R accel_bias`, `pos' = pos + vel dt`.
     """
     dt = s.pending_s
     if dt <= 0.0:
         return
-    transit(s)
-    turned = p.gyro_scale_sq * SCALE_S * s.pending_rate_sq + p.gyro_roughness_sq * s.rough_gyro
+    transit(s, s.P)
+    transit(s, s.P.T)
+    turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
-    s.pending_rate_sq = s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
+    s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
+    kept = math.exp(-dt / p.gps_wander_s)
     for k in range(3):
         s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
         s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
-        steady = p.gps_wander_var if k < 2 else p.gps_height_wander_var
-        fade(s.P, WANDER + k, math.exp(-dt / p.gps_wander_s), steady)
-    fade(s.P, MAG_BIAS, math.exp(-dt / p.mag_wander_s), p.mag_wander_var)
+        s.P[MAG_BIAS + k, MAG_BIAS + k] += p.mag_bias_density * dt
+        fade(s.P, WANDER + k, kept, s.wander_var[k])
+        s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
     s.P[TILT + 2, TILT + 2] = min(s.P[TILT + 2, TILT + 2], MAX_TILT_VAR)
-    for k in range(3):
-        kept = math.exp(-dt / p.gps_wander_s)
-        s.wander_n[k] *= kept
-    s.mag_bias_rad *= math.exp(-dt / p.mag_wander_s)
     s.pending_s = 0.0
     s.pending_force_n[:] = 0.0
     s.pending_turn[:, :] = 0.0
+    s.pending_scaled[:, :] = 0.0
 
 
 @compiled
-def transit(s: State) -> None:
-    """Multiply by the transition matrix from the left, then by its transpose from the right."""
-    P, R, dt = s.P, s.pending_turn, s.pending_s
+def transit(s: State, P: FloatArray) -> None:
+    """Multiply `P` by the transition matrix from the left; given `P^T`, `P` from the right."""
+    R, W, dt = s.pending_turn, s.pending_scaled, s.pending_s
     f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
     for j in range(STATES):
+        t0, t1, t2 = P[TILT, j], P[TILT + 1, j], P[TILT + 2, j]
         for k in range(3):
             P[POS + k, j] += dt * P[VEL + k, j]
-        t0, t1, t2 = P[TILT, j], P[TILT + 1, j], P[TILT + 2, j]
-        a0, a1, a2 = P[ACCEL_BIAS, j], P[ACCEL_BIAS + 1, j], P[ACCEL_BIAS + 2, j]
-        g0, g1, g2 = P[GYRO_BIAS, j], P[GYRO_BIAS + 1, j], P[GYRO_BIAS + 2, j]
-        P[VEL, j] += t1 * f2 - t2 * f1 - R[0, 0] * a0 - R[0, 1] * a1 - R[0, 2] * a2
-        P[VEL + 1, j] += t2 * f0 - t0 * f2 - R[1, 0] * a0 - R[1, 1] * a1 - R[1, 2] * a2
-        P[VEL + 2, j] += t0 * f1 - t1 * f0 - R[2, 0] * a0 - R[2, 1] * a1 - R[2, 2] * a2
-        P[TILT, j] = t0 - R[0, 0] * g0 - R[0, 1] * g1 - R[0, 2] * g2
-        P[TILT + 1, j] = t1 - R[1, 0] * g0 - R[1, 1] * g1 - R[1, 2] * g2
-        P[TILT + 2, j] = t2 - R[2, 0] * g0 - R[2, 1] * g1 - R[2, 2] * g2
-    for i in range(STATES):
-        for k in range(3):
-            P[i, POS + k] += dt * P[i, VEL + k]
-        t0, t1, t2 = P[i, TILT], P[i, TILT + 1], P[i, TILT + 2]
-        a0, a1, a2 = P[i, ACCEL_BIAS], P[i, ACCEL_BIAS + 1], P[i, ACCEL_BIAS + 2]
-        g0, g1, g2 = P[i, GYRO_BIAS], P[i, GYRO_BIAS + 1], P[i, GYRO_BIAS + 2]
-        P[i, VEL] += t1 * f2 - t2 * f1 - R[0, 0] * a0 - R[0, 1] * a1 - R[0, 2] * a2
-        P[i, VEL + 1] += t2 * f0 - t0 * f2 - R[1, 0] * a0 - R[1, 1] * a1 - R[1, 2] * a2
-        P[i, VEL + 2] += t0 * f1 - t1 * f0 - R[2, 0] * a0 - R[2, 1] * a1 - R[2, 2] * a2
-        P[i, TILT] = t0 - R[0, 0] * g0 - R[0, 1] * g1 - R[0, 2] * g2
-        P[i, TILT + 1] = t1 - R[1, 0] * g0 - R[1, 1] * g1 - R[1, 2] * g2
-        P[i, TILT + 2] = t2 - R[2, 0] * g0 - R[2, 1] * g1 - R[2, 2] * g2
+        P[VEL, j] += t1 * f2 - t2 * f1
+        P[VEL + 1, j] += t2 * f0 - t0 * f2
+        P[VEL + 2, j] += t0 * f1 - t1 * f0
+        for i in range(3):
+            for k in range(3):
+                P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
+                P[TILT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
 
 
 @compiled
@@ -222,7 +212,9 @@ def inject(s: State) -> None:
         s.pos_n[k] += d[POS + k]
         s.gyro_bias_b[k] += d[GYRO_BIAS + k]
         s.accel_bias_b[k] += d[ACCEL_BIAS + k]
-        s.wander_n[k] += d[WANDER + k]
-    s.mag_bias_rad += d[MAG_BIAS]
+        s.gyro_scale_b[k] += d[GYRO_SCALE + k]
+        most = MAX_WANDER_SIGMA * math.sqrt(s.wander_var[k])
+        s.wander_n[k] = max(min(s.wander_n[k] + d[WANDER + k], most), -most)
+        s.mag_bias_b[k] += d[MAG_BIAS + k]
     s.baro_bias_m += d[BARO_BIAS]
     d[:] = 0.0

@@ -23,7 +23,7 @@ KERNELS: Final[Kernels[State, Gains]] = Kernels(
 
 
 class EskfEstimator(KernelEstimator[State, Gains]):
-    """Causal error-state Kalman filter of 20 states; see the modules of this package.
+    """Causal error-state Kalman filter of 25 states; see the modules of this package.
 
     Parameters
     ----------

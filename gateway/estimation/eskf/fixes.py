@@ -7,7 +7,12 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment import collect_match
 from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.eskf.covariance import propagate
-from gateway.estimation.eskf.measure import absorb_fix, is_near, lag_integrals
+from gateway.estimation.eskf.measure import (
+    absorb_fix,
+    lag_integrals,
+    learn_wander,
+    place_distance_sq,
+)
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.start import (
     relock_at,
@@ -32,6 +37,8 @@ from gateway.records import Vec3
 MIN_BASELINE_S: Final = 0.15
 MAX_BASELINE_S: Final = 2.5
 """Interval of two fixes whose velocities tell an acceleration."""
+STEP_NOISE_MPS: Final = 0.2
+"""Noise of the step from one velocity to the next, in which slow errors cancel."""
 ZERO: Final = (0.0, 0.0, 0.0)
 
 
@@ -53,6 +60,7 @@ def take_gps(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     if s.started == 0 or row[GPS_USABLE] == 0.0:
         return
     learn_declination(s, row[GPS_DECLINATION])
+    learn_wander(s, p, row)
     then = s.then
     wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
     valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, then)
@@ -62,7 +70,7 @@ def take_gps(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     told_velocity = is_sound(vel, 1000.0)
     if s.heading_known == 0:
         if told_velocity:
-            match_heading(s, p, valid_s, vel, (then[3], then[4], then[5]))
+            match_heading(s, valid_s, vel, (then[3], then[4], then[5]))
         if s.heading_known == 0:
             show_fix(s, pos, vel)
             return
@@ -86,12 +94,22 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
         pos[2] - past_pos[2] - w[2],
     )
     off_vel = (vel[0] - past_vel[0], vel[1] - past_vel[1], vel[2] - past_vel[2])
-    if is_near(s, p, row, off_pos, once, twice, lag):
+    unlikely = place_distance_sq(s, p, row, off_pos, once, twice, lag) > p.gate_sq
+    off_m = math.hypot(off_pos[0], off_pos[1])
+    note_contradiction(s, off_m if unlikely else 0.0)
+    if not unlikely or off_m < p.gate_m:
         absorb_fix(s, p, row, off_pos, off_vel, once, twice, lag)
         accept(s, vel)
     elif is_relocked(s, p.gps_relock_s, pos, vel):
         relock_at(s, p, pos, vel if is_sound(vel, 1000.0) else ZERO, lag)
         accept(s, vel)
+
+
+@compiled
+def note_contradiction(s: State, off_m: float) -> None:
+    """Note how far off the fixes are: two in a row, for one alone may be nonsense."""
+    s.contradiction_m = min(off_m, s.off_last_m)
+    s.off_last_m = off_m
 
 
 @compiled
@@ -113,7 +131,7 @@ def show_fix(s: State, pos: Vec3, vel: Vec3) -> None:
 
 
 @compiled
-def match_heading(s: State, p: Gains, valid_s: float, vel: Vec3, integral: Vec3) -> None:
+def match_heading(s: State, valid_s: float, vel: Vec3, integral: Vec3) -> None:
     """Collect the match of GPS and inertial accelerations; it may give the first heading."""
     dt = valid_s - s.fix_valid_s
     if dt < MIN_BASELINE_S:
@@ -125,7 +143,7 @@ def match_heading(s: State, p: Gains, valid_s: float, vel: Vec3, integral: Vec3)
         return
     accel = ((vel[0] - old[0]) / dt, (vel[1] - old[1]) / dt, (vel[2] - old[2]) / dt)
     mean = ((integral[0] - force[0]) / dt, (integral[1] - force[1]) / dt, 0.0)
-    if collect_match(s, mean, accel, dt, math.sqrt(p.gps_velocity_var)):
+    if collect_match(s, mean, accel, dt, STEP_NOISE_MPS):
         start_heading_by_match(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])
 
 

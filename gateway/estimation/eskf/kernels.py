@@ -27,7 +27,7 @@ from gateway.estimation.eskf.state import State
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.health import HOLD_S, judge_sensors
 from gateway.estimation.history import remember
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field, likeness
 from gateway.estimation.place import (
     BARO_STALE_S,
 )
@@ -164,7 +164,12 @@ def integrate(s: State, gyro: Vec3, accel: Vec3, dt: float) -> None:
         Time step, s.
     """
     b, c = s.gyro_bias_b, s.accel_bias_b
-    rate = (gyro[0] - b[0], gyro[1] - b[1], gyro[2] - b[2])
+    e = s.gyro_scale_b
+    rate = (
+        gyro[0] - b[0] - e[0] * gyro[0],
+        gyro[1] - b[1] - e[1] * gyro[1],
+        gyro[2] - b[2] - e[2] * gyro[2],
+    )
     put(s.rate_b, rate)
     # The force of the interval acts, on average, at the attitude half way through it.
     half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
@@ -173,13 +178,16 @@ def integrate(s: State, gyro: Vec3, accel: Vec3, dt: float) -> None:
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
     f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
     s.pending_s += dt
-    s.pending_rate_sq += (rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]) * dt
     for k in range(3):
         force = x[k] * f0 + y[k] * f1 + z[k] * f2
         s.pending_force_n[k] += force * dt
         s.pending_turn[k, 0] += x[k] * dt
         s.pending_turn[k, 1] += y[k] * dt
         s.pending_turn[k, 2] += z[k] * dt
+        if s.aided == 1:
+            s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
+            s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
+            s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
         s.integrals[3 + k] += a * dt
@@ -219,17 +227,20 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
         Calibrated field in body FRD, uT.
     """
     dt = s.time_s - s.mag_s
+    b = s.mag_bias_b
+    mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
     field = rotate(as_quat(s.q_nb), mag_b)
     level = math.hypot(field[0], field[1])
     norm = math.hypot(level, field[2])
     if norm < MIN_FIELD_UT or level < 0.05 * norm or dt <= 0.0:
         return
     s.mag_s = s.time_s
-    weight = judge_field(s, p, norm, math.asin(field[2] / norm), min(dt, STALE_MAG_S))
+    dip = math.asin(field[2] / norm)
+    weight = judge_field(s, p, norm, dip, min(dt, STALE_MAG_S)) * likeness(s, norm, dip)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:
-        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]))
+        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]), mag_b)
         s.heading_true = 1 if known else 0
     elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
         since = min(s.time_s - s.mag_used_s, STALE_MAG_S)

@@ -38,16 +38,18 @@ from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-ACC_SHARE: Final = 0.25
+NOISE_SHARE: Final = 0.2
 """Of the accuracy that a receiver tells, the share that is noise from one fix to the next."""
-SPEED_ACC_SHARE: Final = 0.7
+WANDER_SHARE: Final = (0.7, 0.7, 0.9)
+"""The share, north, east and down, that is its slow error; the horizontal accuracy is radial."""
+SPEED_SHARE: Final = (0.4, 0.4, 0.8)
 REST_VELOCITY_VAR: Final = 0.2**2
 REST_RATE_VAR: Final = 0.002**2
 UNAIDED_CORRELATION_S: Final = 1.0
 """The true speed that is taken for noise changes in about this time."""
-COMPASS_CORRELATION_S: Final = 1.0
-"""The errors of iron and current change with the attitude, so in about this time."""
-VELOCITY_CORRELATION_S: Final = 1.0
+COMPASS_CORRELATION_S: Final = 0.6
+"""The errors of soft iron and current change with the attitude, so in about this time."""
+VELOCITY_CORRELATION_S: Final = 0.25
 """Errors of successive GPS velocities are alike for about this time: faster fixes tell no more."""
 VELOCITY_GATE_SQ: Final = 9.0
 """A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
@@ -123,11 +125,18 @@ def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
 
 
 @compiled
-def larger(variance: float, accuracy: float, share: float) -> float:
-    """Raise a variance to what the receiver says of its own accuracy."""
-    if not math.isfinite(accuracy):
-        return variance
-    return max(variance, (share * accuracy) ** 2)
+def told(variance: float, accuracy: float, share: float) -> float:
+    """Take the receiver's word for its accuracy, where it gives one, before our own guess."""
+    return (share * accuracy) ** 2 if accuracy > 0.0 else variance
+
+
+@compiled
+def learn_wander(s: State, p: Gains, row: FloatArray) -> None:
+    """Take the size of the GPS position's slow error from a fix's own accuracies."""
+    for k in range(3):
+        usual = p.gps_wander_var if k < 2 else p.gps_height_wander_var
+        acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+        s.wander_var[k] = told(usual, acc, WANDER_SHARE[k])
 
 
 @compiled
@@ -143,17 +152,23 @@ def lateness(s: State, p: Gains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
 
 
 @compiled
-def is_near(
+def place_distance_sq(
     s: State, p: Gains, row: FloatArray, off_pos: Vec3, once: Vec3, twice: Vec3, lag: float
-) -> bool:
-    """Judge the horizontal place of a fix before any of its numbers is used."""
+) -> float:
+    """Tell how unlikely the horizontal place of a fix is, before any of its numbers is used.
+
+    Returns
+    -------
+    float
+        The larger normalised innovation squared of north and east.
+    """
     worst = 0.0
-    variance = larger(p.gps_position_var, row[GPS_H_ACC], ACC_SHARE)
+    variance = told(p.gps_position_var, row[GPS_H_ACC], NOISE_SHARE)
     late, _ = lateness(s, p, once, lag)
     for k in range(2):
         position_row(s, k, once, twice, lag)
         worst = max(worst, distance_sq(s, off_pos[k], variance + late[k]))
-    return bool(worst < p.gate_sq or math.hypot(off_pos[0], off_pos[1]) < p.gate_m)
+    return worst
 
 
 @compiled
@@ -191,11 +206,11 @@ def absorb_fix(
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             noise = p.gps_velocity_var if k < 2 else p.gps_climb_var
-            noise = repeated * larger(noise, row[GPS_SPEED_ACC], SPEED_ACC_SHARE) + late_vel[k]
+            noise = repeated * told(noise, row[GPS_SPEED_ACC], SPEED_SHARE[k]) + late_vel[k]
             absorb(s, off_vel[k], noise, VELOCITY_GATE_SQ)
         position_row(s, k, once, twice, lag)
         noise = p.gps_position_var if k < 2 else p.gps_height_var
-        absorb(s, off_pos[k], larger(noise, acc, ACC_SHARE) + late_pos[k], p.gate_sq)
+        absorb(s, off_pos[k], told(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq)
     inject(s)
 
 
@@ -208,7 +223,10 @@ def compass_row(s: State, field_n: Vec3) -> None:
     s.h[TILT] = -down * north / level_sq
     s.h[TILT + 1] = -down * east / level_sq
     s.h[TILT + 2] = 1.0
-    s.h[MAG_BIAS] = 1.0
+    q = as_quat(s.q_nb)
+    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
+    for k in range(3):
+        s.h[MAG_BIAS + k] = (east * axes[k][0] - north * axes[k][1]) / level_sq
 
 
 @compiled
@@ -220,12 +238,11 @@ def absorb_compass(
     repeated = max(1.0, COMPASS_CORRELATION_S / dt)
     measured = declination - math.atan2(field_n[1], field_n[0])
     compass_row(s, field_n)
-    # The field's dip multiplies its errors: let them turn the heading, never tilt the horizon.
-    hold(s, TILT, 2)
-    hold(s, ACCEL_BIAS, 3)
-    absorb_considering(
-        s, wrap_pi(measured) - s.mag_bias_rad, repeated * p.mag_var / weight, p.gate_sq
-    )
+    if s.aided == 0:
+        # The horizon rests on the accelerometer alone then: keep the field's dip out of it.
+        hold(s, TILT, 2)
+        hold(s, ACCEL_BIAS, 3)
+    absorb_considering(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
     inject(s)
 
 

@@ -76,6 +76,8 @@ def tell(s: State, row: FloatArray) -> None:
         row[NAV_VEL : NAV_VEL + 3] = s.vel_n
         put_std(row, NAV_VEL_STD, s, VEL)
         put_std(row, NAV_POS_STD, s, POS)
+        for k in range(2):
+            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
     elif s.time_s - s.fix_s < FRESH_GPS_S:
         row[NAV_VEL : NAV_VEL + 3] = s.fix_vel
 

@@ -17,7 +17,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_noise_degprs: Annotated[
         float,
         setting("Noise of the gyroscope, vibration included.", "deg/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.19
+    ] = 0.12
     gyro_roughness: Annotated[
         float,
         setting(
@@ -26,57 +26,57 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=10.0,
         ),
-    ] = 0.57
+    ] = 0.9
     gyro_scale: Annotated[
         float,
         setting(
-            "Share by which the angular rate is wrong in turns: scale and misalignment.",
+            "Share by which each axis of the gyroscope may be off scale; flying in circles tells.",
             ge=0.0,
             le=0.1,
         ),
-    ] = 0.0005
+    ] = 0.05
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.11
+    ] = 0.12
     accel_roughness: Annotated[
         float, setting("The same of the specific force.", ge=0.0, le=10.0)
-    ] = 0.35
+    ] = 0.8
     accel_scale: Annotated[
         float,
         setting("Share by which the specific force beyond gravity is wrong.", ge=0.0, le=0.2),
-    ] = 0.01
+    ] = 0.008
     gyro_bias_walk_degpsprs: Annotated[
         float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.007
+    ] = 0.0045
     accel_bias_walk_mps2prs: Annotated[
         float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.002
+    ] = 0.0025
     gyro_bias_degps: Annotated[
         float, setting("Gyroscope bias at the start.", "deg/s", ge=0.01, le=20.0)
-    ] = 1.0
+    ] = 0.6
     accel_bias_mps2: Annotated[
         float, setting("Accelerometer bias at the start.", "m/s2", ge=0.001, le=2.0)
-    ] = 0.03
+    ] = 0.025
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.6
-    gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 0.6
+    ] = 1.0
+    gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 1.2
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.65
+    ] = 0.8
     gps_height_wander_m: Annotated[
         float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
     ] = 2.5
     gps_wander_s: Annotated[
         float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
-    ] = 10.0
+    ] = 30.0
     gps_velocity_mps: Annotated[
         float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
-    ] = 0.2
+    ] = 0.4
     gps_climb_mps: Annotated[
         float, setting("The same of its vertical velocity.", "m/s", ge=0.01, le=10.0)
-    ] = 0.1
+    ] = 0.3
     gps_jitter_s: Annotated[
         float,
         setting(
@@ -90,12 +90,12 @@ class EskfSettings(Settings, frozen=True):
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
     ] = 4.5
-    mag_wander_deg: Annotated[
-        float, setting("Slow error of the compass.", "deg", ge=0.01, le=45.0)
-    ] = 0.25
-    mag_wander_s: Annotated[
-        float, setting("Correlation time of the compass's slow error.", "s", ge=0.5, le=3600.0)
-    ] = 8.0
+    mag_bias_ut: Annotated[
+        float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
+    ] = 0.1
+    mag_bias_walk_utprs: Annotated[
+        float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
+    ] = 0.018
     mag_norm_tolerance: Annotated[
         float,
         setting("Share by which the field may differ from its usual strength.", ge=0.01, le=1.0),
@@ -105,10 +105,10 @@ class EskfSettings(Settings, frozen=True):
     ] = 10.0
     baro_noise_m: Annotated[
         float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
-    ] = 1.4
+    ] = 0.3
     baro_walk_mprs: Annotated[
         float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
-    ] = 1.0
+    ] = 1.2
     unaided_velocity_mps: Annotated[
         float,
         setting(
@@ -118,7 +118,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.01,
             le=100.0,
         ),
-    ] = 0.1
+    ] = 0.14
     dead_reckoning_s: Annotated[
         float,
         setting("How long position and velocity are carried without GPS.", "s", ge=1.0, le=600.0),
@@ -177,8 +177,7 @@ class Gains(RestGains, FieldGains):
     """rad2/s."""
     gyro_roughness_sq: float
     accel_roughness_sq: float
-    gyro_scale_sq: float
-    """Times the squared rate and `SCALE_S`, rad2/s."""
+    gyro_scale_var: float
     accel_density: float
     """m2/s3."""
     accel_scale_sq: float
@@ -195,8 +194,8 @@ class Gains(RestGains, FieldGains):
     gps_climb_var: float
     gps_jitter_sq: float
     mag_var: float
-    mag_wander_var: float
-    mag_wander_s: float
+    mag_bias_var: float
+    mag_bias_density: float
     baro_var: float
     baro_density: float
     unaided_var: float
@@ -228,7 +227,7 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "gyro_density": (s.gyro_noise_degprs * DEG) ** 2,
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
-        "gyro_scale_sq": s.gyro_scale**2,
+        "gyro_scale_var": s.gyro_scale**2,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,
         "gyro_bias_density": (s.gyro_bias_walk_degpsprs * DEG) ** 2,
@@ -244,8 +243,8 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
         "mag_var": (s.mag_noise_deg * DEG) ** 2,
-        "mag_wander_var": (s.mag_wander_deg * DEG) ** 2,
-        "mag_wander_s": s.mag_wander_s,
+        "mag_bias_var": s.mag_bias_ut**2,
+        "mag_bias_density": s.mag_bias_walk_utprs**2,
         "mag_norm_tolerance": s.mag_norm_tolerance,
         "mag_dip_tolerance_rad": s.mag_dip_tolerance_deg * DEG,
         "baro_var": s.baro_noise_m**2,

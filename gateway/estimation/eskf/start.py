@@ -5,11 +5,13 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import forget, propagate
+from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
+    GYRO_SCALE,
     MAG_BIAS,
     POS,
     STATES,
@@ -21,7 +23,7 @@ from gateway.estimation.eskf.state import (
 from gateway.estimation.health import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
 from gateway.estimation.place import NEVER_S
 from gateway.estimation.record import as_quat, put, put_quat
-from gateway.geometry.quaternion import from_euler, multiply, normalise
+from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
 from gateway.records import NAN, Vec3
 
 FIRST_TILT_VAR: Final = 0.05**2
@@ -41,9 +43,11 @@ def start(s: State, p: Gains) -> None:
     for k in range(3):
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] = p.gyro_bias_var
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = p.accel_bias_var
-        s.P[WANDER + k, WANDER + k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
+        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = p.gyro_scale_var
+        s.wander_var[k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
+        s.P[WANDER + k, WANDER + k] = s.wander_var[k]
+        s.P[MAG_BIAS + k, MAG_BIAS + k] = p.mag_bias_var
         s.rate_b[k] = NAN
-    s.P[MAG_BIAS, MAG_BIAS] = p.mag_wander_var
     s.declination_rad = NAN
     forget_times(s)
 
@@ -90,13 +94,17 @@ def turn_heading(s: State, turn_rad: float) -> None:
 
 
 @compiled
-def start_heading_by_compass(s: State, p: Gains, turn_rad: float) -> None:
-    """Take the heading from the compass: its slow error is then the heading's, reversed."""
+def start_heading_by_compass(s: State, p: Gains, turn_rad: float, mag_b: Vec3) -> None:
+    """Take the heading from the compass: the iron's error is then the heading's, reversed."""
     turn_heading(s, turn_rad)
-    forget(s.P, TILT + 2, p.mag_wander_var + p.mag_var)
-    forget(s.P, MAG_BIAS, p.mag_wander_var)
-    s.P[TILT + 2, MAG_BIAS] = s.P[MAG_BIAS, TILT + 2] = -p.mag_wander_var
-    s.mag_bias_rad = 0.0
+    compass_row(s, rotate(as_quat(s.q_nb), mag_b))
+    forget(s.P, TILT + 2, p.mag_var)
+    for k in range(3):
+        share = s.h[MAG_BIAS + k]
+        forget(s.P, MAG_BIAS + k, p.mag_bias_var)
+        tie(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
+        s.P[TILT + 2, TILT + 2] += share * share * p.mag_bias_var
+        s.mag_bias_b[k] = 0.0
     s.heading_known = 1
 
 
@@ -128,14 +136,15 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
         forget(s.P, VEL + k, FIRST_VELOCITY_VAR)
         s.vel_n[k] = vel[k]
     for k in range(2):
-        start_position(s, k, pos[k] + vel[k] * lag, p.gps_wander_var, p.gps_position_var)
+        start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     if s.has_height == 0:
         down = pos[2] + vel[2] * lag
-        start_position(s, 2, down, p.gps_height_wander_var, p.gps_height_var)
+        start_position(s, 2, down, p.gps_height_var)
         s.has_height = 1
         if s.baro_known == 1:
             restart_baro(s, p)
     s.aided = 1
+    s.off_last_m = s.contradiction_m = 0.0
 
 
 @compiled
@@ -156,8 +165,9 @@ def tie(s: State, i: int, j: int, covariance: float) -> None:
 
 
 @compiled
-def start_position(s: State, k: int, value: float, wander_var: float, noise_var: float) -> None:
+def start_position(s: State, k: int, value: float, noise_var: float) -> None:
     """Start one coordinate at a fix: the fix's slow error is then its own, reversed."""
+    wander_var = s.wander_var[k]
     s.pos_n[k], s.wander_n[k] = value, 0.0
     forget(s.P, POS + k, wander_var + noise_var)
     forget(s.P, WANDER + k, wander_var)

@@ -18,10 +18,12 @@ ACCEL_BIAS: Final = 12
 WANDER: Final = 15
 """Slow error of the GPS position in NED, m."""
 MAG_BIAS: Final = 18
-"""Slow error of the compass, rad."""
-BARO_BIAS: Final = 19
+"""Iron that the calibration left, in body FRD, uT."""
+GYRO_SCALE: Final = 21
+"""Share by which each axis of the gyroscope tells too much."""
+BARO_BIAS: Final = 24
 """What is added to the barometer's depth, m."""
-STATES: Final = 20
+STATES: Final = 25
 
 
 class State(HealthState, RestState, FieldState, PlaceState, MatchState):
@@ -33,8 +35,9 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     q_nb: Annotated[FloatArray, (4,)]
     gyro_bias_b: Annotated[FloatArray, (3,)]
     accel_bias_b: Annotated[FloatArray, (3,)]
+    gyro_scale_b: Annotated[FloatArray, (3,)]
     wander_n: Annotated[FloatArray, (3,)]
-    mag_bias_rad: float
+    mag_bias_b: Annotated[FloatArray, (3,)]
     baro_bias_m: float
     P: Annotated[FloatArray, (STATES, STATES)]
 
@@ -49,16 +52,16 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     pending_s: float
     """Time over which the covariance has still to be propagated."""
     pending_force_n: Annotated[FloatArray, (3,)]
-    pending_rate_sq: float
-    """Integral of the squared angular rate over that time."""
     rough_gyro: float
     """Variance of the angle over that time if the changes of the rate were white noise."""
     rough_accel: float
     """The same of the velocity."""
     pending_accel_sq: float
-    """The same of the acceleration."""
+    """Integral of the squared acceleration over that time."""
     pending_turn: Annotated[FloatArray, (3, 3)]
     """Integral of `R_nb` over that time."""
+    pending_scaled: Annotated[FloatArray, (3, 3)]
+    """Integral of `R_nb diag(gyro)` over that time, while GPS is there to tell the scale."""
 
     aided: int
     """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""
@@ -81,3 +84,9 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     fix_valid_s: float
     fix_vel: Annotated[FloatArray, (3,)]
     fix_force: Annotated[FloatArray, (3,)]
+    wander_var: Annotated[FloatArray, (3,)]
+    """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
+    off_last_m: float
+    """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
+    contradiction_m: float
+    """By how much the last two fixes did; the true place may be either."""
