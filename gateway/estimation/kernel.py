@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
-from gateway.estimation.record import FloatArray, IntArray, copy_record, new_record
+from gateway.estimation.record import FloatArray, Held, IntArray, copy_record, new_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
@@ -50,11 +50,12 @@ def _direct(function: Callable[..., None]) -> Callable[..., None]:
     """Find the machine code behind a dispatcher that has compiled for one signature.
 
     The dispatcher looks the type of every argument up on every call, which for records of many
-    fields takes longer than the work. The caller must keep to the types of the first call.
+    fields takes longer than the work. The caller must keep to the types of the first call, and
+    hands records over as `Held`.
     """
     overloads = getattr(function, "overloads", {})
     if len(overloads) != 1:
-        return function
+        return lambda *args: function(*(a.record if isinstance(a, Held) else a for a in args))
     code: Callable[..., None] = next(iter(overloads.values())).entry_point
     return code
 
@@ -77,6 +78,7 @@ class KernelEstimator(Generic[State, Gains]):
     ) -> None:
         self._kernels = kernels
         self._gains = gains
+        self._held_gains = Held(gains)
         self._reference = reference
         self._earth = EarthField(reference)
         self._row = np.empty(NAV_COLUMNS)
@@ -94,6 +96,14 @@ class KernelEstimator(Generic[State, Gains]):
         self._earth.reset()
         self._state = new_record(self._kernels.declaration)
         self._kernels.start(self._state, self._gains)
+
+    @property
+    def _state(self) -> State:
+        return self._held.record
+
+    @_state.setter
+    def _state(self, record: State) -> None:
+        self._held = Held(record)
 
     @property
     def state(self) -> State:
@@ -119,8 +129,8 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._imu(self._state, self._gains, sample.time_us, *imu_row(sample))
-        self._tell(self._state, self._row)
+        self._imu(self._held, self._held_gains, sample.time_us, *imu_row(sample))
+        self._tell(self._held, self._row)
         return nav_state(sample.time_us, self._row)
 
     def update_baro(self, sample: BaroSample) -> None:

@@ -33,7 +33,7 @@ References
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -124,12 +124,11 @@ class PaperSettings(Settings, frozen=True):
 
 @dataclass(slots=True)
 class PaperState:
-    """Everything the estimator remembers."""
+    """What the estimator remembers, but for `paper_kernels.Memory`."""
 
     time_us: int | None = None
     q_nb: Quat = IDENTITY
     rate_b_radps: Vec3 = UNKNOWN_VEC3
-    memory: kernels.Memory = field(default_factory=lambda: new_record(kernels.Memory))
     mag_time_us: int | None = None
     place: kernels.Place = UNKNOWN_VEC3
     vel_n_mps: Vec3 = UNKNOWN_VEC3
@@ -157,20 +156,22 @@ class PaperEstimator:
         self._reference = reference
         self._earth = EarthField(reference)
         self._s = PaperState()
+        self._memory = new_record(kernels.Memory)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
         self._s = PaperState()
+        self._memory = new_record(kernels.Memory)
 
     @property
-    def state(self) -> PaperState:
+    def state(self) -> tuple[PaperState, kernels.Memory]:
         """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s, memory=copy_record(self._s.memory))
+        return replace(self._s), copy_record(self._memory)
 
     @state.setter
-    def state(self, state: PaperState) -> None:
-        self._s = replace(state, memory=copy_record(state.memory))
+    def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
+        self._s, self._memory = replace(state[0]), copy_record(state[1])
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
@@ -202,7 +203,7 @@ class PaperEstimator:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
-                s.memory.ring_count = 0
+                self._memory.ring_count = 0
             s.time_us, dt_us = sample.time_us, 0
         if dt_us > 0:
             s.time_us = sample.time_us
@@ -227,7 +228,7 @@ class PaperEstimator:
         s = self._s
         place, vel = self._read(fix)
         s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
-            s.memory,
+            self._memory,
             place,
             vel,
             fix.time_us,
@@ -304,7 +305,7 @@ class PaperEstimator:
             return
         age_us = _known(s.time_us) - _known(s.fix_time_us)
         s.rate_b_radps = kernels.unbiased(
-            s.memory, REST, gyro, accel, s.fix_vel_n_mps, age_us, dt_s
+            self._memory, REST, gyro, accel, s.fix_vel_n_mps, age_us, dt_s
         )
         s.q_nb = kernels.turn(s.q_nb, accel, s.rate_b_radps, dt_s, self._settings.alpha_gyro)
 
@@ -323,7 +324,7 @@ class PaperEstimator:
     def _update_position(self, accel: Vec3, dt_s: float) -> None:
         s = self._s
         s.place, s.vel_n_mps = kernels.advance(
-            s.memory, s.q_nb, accel, dt_s, _known(s.time_us), s.place, s.vel_n_mps
+            self._memory, s.q_nb, accel, dt_s, _known(s.time_us), s.place, s.vel_n_mps
         )
         if self._settings.blend == "every_sample":
             self._blend_fix()
