@@ -1,11 +1,28 @@
 """The one place where numba enters: a typed, cached, strict-IEEE `njit`."""
 
+import hashlib
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+class _FileBySignature(IndexDataCacheFile):
+    """Names a file of machine code by the types that it was compiled for.
+
+    Numba numbers the files of a function. Two processes that compile it for different types at the
+    same time may take the same number, and ever after one would run the other's code.
+    """
+
+    def save(self: Any, key: object, data: object) -> None:
+        """Keep the machine code of one signature."""
+        digest = hashlib.sha256(repr(key).encode()).digest()
+        name = self._data_name(int.from_bytes(digest[:8]))
+        self._save_index({**self._load_index(), key: name})
+        self._save_data(name, data)
 
 
 def compiled(function: Function) -> Function:
@@ -25,4 +42,7 @@ def compiled(function: Function) -> Function:
     callable
         The dispatcher, typed as the function it stands for.
     """
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
+    if hasattr(dispatcher, "_cache"):
+        dispatcher._cache._cache_file.__class__ = _FileBySignature  # noqa: SLF001
+    return cast(Function, dispatcher)
