@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 
 from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
-from gateway.estimation.record import FloatArray, Held, IntArray, copy_record, new_record
+from gateway.estimation.record import FloatArray, IntArray, copy_record, new_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
@@ -44,6 +44,25 @@ class Kernels(Generic[State, Gains]):
     """Writes the output row."""
     run: Callable[..., None]
     """`(state, gains, *arrays of a SampleLog, output)`."""
+
+
+class Held(Generic[State]):
+    """A record as machine code is handed it, by the address of its bytes.
+
+    Compiled code asks a record for its `data`, and numpy's own answer describes all the fields
+    anew on every call, which takes several times as long as the work.
+
+    Parameters
+    ----------
+    record : record
+        Stays the same memory for good; another record needs another `Held`.
+    """
+
+    __slots__ = ("data", "record")
+
+    def __init__(self, record: State) -> None:
+        self.record = record
+        self.data = memoryview(cast(Any, record)).cast("B")
 
 
 def _direct(function: Callable[..., None]) -> Callable[..., None]:

@@ -5,7 +5,7 @@ without conversion. The declaration is a class that is never instantiated: mypy 
 by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
 """
 
-from typing import Any, Generic, TypeVar, cast, get_args, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,25 +89,6 @@ def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declar
 def copy_record(record: Declared) -> Declared:
     """Copy a record, for a state that is read out or restored."""
     return cast(Declared, cast(np.void, record).copy())
-
-
-class Held(Generic[Declared]):
-    """A record as machine code is handed it, by the address of its bytes.
-
-    Compiled code asks a record for its `data`, and numpy's own answer describes all the fields
-    anew on every call, which takes several times as long as the work.
-
-    Parameters
-    ----------
-    record : record
-        Stays the same memory for good; another record needs another `Held`.
-    """
-
-    __slots__ = ("data", "record")
-
-    def __init__(self, record: Declared) -> None:
-        self.record = record
-        self.data = memoryview(cast(Any, record)).cast("B")
 
 
 @compiled
