@@ -1,7 +1,8 @@
 """The one place where numba enters: a typed, cached, strict-IEEE `njit`."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -25,6 +26,22 @@ class _FileBySignature(IndexDataCacheFile):
         self._save_data(name, data)
 
 
+def _files(dispatcher: object) -> Any:
+    """Find where numba keeps a function's machine code; None without a compiler."""
+    return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+
+
+def _borrowed(names: dict[str, Any]) -> Iterator[tuple[str, object]]:
+    """Tell what machine code may hold of other files: their constants, and what they compile."""
+    for name, value in names.items():
+        if isinstance(value, ModuleType):
+            yield from ((n, v) for n, v in vars(value).items() if isinstance(v, int | float))
+        elif isinstance(value, int | float | tuple):
+            yield (name, value)
+        elif isinstance(files := _files(value), _FileBySignature):
+            yield (name, files._source_stamp)  # noqa: SLF001
+
+
 def compiled(function: Function) -> Function:
     """Compile a numeric function to machine code on its first call.
 
@@ -43,6 +60,10 @@ def compiled(function: Function) -> Function:
         The dispatcher, typed as the function it stands for.
     """
     dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
-    if hasattr(dispatcher, "_cache"):
-        dispatcher._cache._cache_file.__class__ = _FileBySignature  # noqa: SLF001
+    if (files := _files(dispatcher)) is not None:
+        files.__class__ = _FileBySignature
+        # Numba looks at the function's own file only, whatever else the machine code is made of;
+        # what comes from other files is imported before.
+        made_of = (files._source_stamp, *_borrowed(function.__globals__))  # noqa: SLF001
+        files._source_stamp = hashlib.sha256(repr(made_of).encode()).hexdigest()  # noqa: SLF001
     return cast(Function, dispatcher)

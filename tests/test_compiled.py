@@ -1,4 +1,6 @@
+import importlib
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -51,3 +53,48 @@ def test_two_processes_compile_for_different_types_at_once(tmp_path: Path) -> No
     assert after(FAR) == 2.0
     assert after(NEAR) == 1.0
     assert after.stats.cache_hits[after.signatures[0]] == 1
+
+
+CALLED = """
+from gateway.compiled import compiled
+
+FACTOR = {factor}
+
+@compiled
+def inner():
+    return {inner}
+"""
+CALLING = """
+from gateway.compiled import compiled
+from called import FACTOR, inner
+
+@compiled
+def outer():
+    return FACTOR * middle()
+
+@compiled
+def middle():
+    return inner()
+"""
+
+
+@pytest.mark.io
+@pytest.mark.parametrize(
+    ("factor", "inner", "result"), [(2, "100", 200), (1, "3 + 4 * 5", 23), (1, "100", 100)]
+)
+def test_what_it_calls_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: int, inner: str, result: int
+) -> None:
+    """The machine code holds the constants and functions of other files, too."""
+    monkeypatch.syspath_prepend(tmp_path)
+    # Python itself takes a file of the same size and second for unchanged.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "calling.py").write_text(CALLING)
+    for parts, expected in (((1, "100"), 100), ((factor, inner), result)):
+        (tmp_path / "called.py").write_text(CALLED.format(factor=parts[0], inner=parts[1]))
+        for name in ("called", "calling"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        calling = importlib.import_module("calling")
+        assert calling.outer() == expected
+    assert bool(calling.outer.stats.cache_hits) == (result == 100)
