@@ -13,6 +13,7 @@ from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 State = TypeVar("State")
 Gains = TypeVar("Gains")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class Held(Generic[State]):
         self.data = memoryview(cast(Any, record)).cast("B")
 
 
-def _direct(function: Callable[..., None]) -> Callable[..., None]:
+def direct(function: Callable[..., Result]) -> Callable[..., Result]:
     """Find the machine code behind a dispatcher that has compiled for one signature.
 
     The dispatcher looks the type of every argument up on every call, which for records of many
@@ -75,7 +76,7 @@ def _direct(function: Callable[..., None]) -> Callable[..., None]:
     overloads = getattr(function, "overloads", {})
     if len(overloads) != 1:
         return lambda *args: function(*(a.record if isinstance(a, Held) else a for a in args))
-    code: Callable[..., None] = next(iter(overloads.values())).entry_point
+    code: Callable[..., Result] = next(iter(overloads.values())).entry_point
     return code
 
 
@@ -103,12 +104,12 @@ class KernelEstimator(Generic[State, Gains]):
         self._row = np.empty(NAV_COLUMNS)
         self._state = new_record(kernels.declaration)
         kernels.start(self._state, gains)
-        # A first call on a scrap state compiles, or loads, what `_direct` then finds.
+        # A first call on a scrap state compiles, or loads, what `direct` then finds.
         scrap = copy_record(self._state)
         kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
         kernels.tell(scrap, self._row)
-        self._imu = _direct(kernels.imu)
-        self._tell = _direct(kernels.tell)
+        self._imu = direct(kernels.imu)
+        self._tell = direct(kernels.tell)
 
     def reset(self) -> None:
         """Forget everything but the settings."""

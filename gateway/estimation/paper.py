@@ -39,6 +39,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 
 from gateway.estimation import paper_kernels as kernels
+from gateway.estimation.kernel import Held, direct
 from gateway.estimation.paper_kernels import is_finite
 from gateway.estimation.record import (
     FloatArray,
@@ -74,6 +75,7 @@ REST: Final = filled_record(
     },
 )
 """What is taken for rest: so quiet, for so long, turning no faster."""
+HELD_REST: Final = Held(REST)
 
 
 class PaperSettings(Settings, frozen=True):
@@ -156,22 +158,26 @@ class PaperEstimator:
         self._reference = reference
         self._earth = EarthField(reference)
         self._s = PaperState()
-        self._memory = new_record(kernels.Memory)
+        self._held = Held(new_record(kernels.Memory))
+        # A first call on a scrap compiles, or loads, what `direct` then finds.
+        nothing = (UNKNOWN_VEC3,) * 5
+        kernels.step(new_record(kernels.Memory), REST, 1.0, IDENTITY, *nothing, 0, 0, 0.0)
+        self._step = direct(kernels.step)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
         self._s = PaperState()
-        self._memory = new_record(kernels.Memory)
+        self._held = Held(new_record(kernels.Memory))
 
     @property
     def state(self) -> tuple[PaperState, kernels.Memory]:
         """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s), copy_record(self._memory)
+        return replace(self._s), copy_record(self._held.record)
 
     @state.setter
     def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
-        self._s, self._memory = replace(state[0]), copy_record(state[1])
+        self._s, self._held = replace(state[0]), Held(copy_record(state[1]))
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
@@ -197,20 +203,18 @@ class PaperEstimator:
             if not sound:
                 return self._nav(sample.time_us, sound)
             s.time_us = sample.time_us
-            self._update_attitude(accel, gyro, None)
+            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(accel)
         dt_us = sample.time_us - s.time_us
         if abs(dt_us) > kernels.GAP_US:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
-                self._memory.ring_count = 0
+                self._held.record.ring_count = 0
             s.time_us, dt_us = sample.time_us, 0
         if dt_us > 0:
             s.time_us = sample.time_us
             if sound:
-                dt_s = dt_us / US_PER_S
-                self._update_attitude(accel, gyro, dt_s)
-                self._update_position(accel, dt_s)
+                self._advance(accel, gyro, dt_us / US_PER_S)
         if sample.mag_b_ut is not None and dt_us >= 0 and is_finite(sample.mag_b_ut):
             self._update_yaw(sample.mag_b_ut)
         return self._nav(s.time_us, sound)
@@ -228,7 +232,7 @@ class PaperEstimator:
         s = self._s
         place, vel = self._read(fix)
         s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
-            self._memory,
+            self._held.record,
             place,
             vel,
             fix.time_us,
@@ -298,16 +302,24 @@ class PaperEstimator:
         s.last_fix, s.fix_time_us = place, fix.time_us
         return place, vel
 
-    def _update_attitude(self, accel: Vec3, gyro: Vec3, dt_s: float | None) -> None:
-        s = self._s
-        if dt_s is None:
-            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(accel)
-            return
-        age_us = _known(s.time_us) - _known(s.fix_time_us)
-        s.rate_b_radps = kernels.unbiased(
-            self._memory, REST, gyro, accel, s.fix_vel_n_mps, age_us, dt_s
+    def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
+        s, now_us = self._s, _known(self._s.time_us)
+        s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = self._step(
+            self._held,
+            HELD_REST,
+            self._settings.alpha_gyro,
+            s.q_nb,
+            accel,
+            gyro,
+            s.place,
+            s.vel_n_mps,
+            s.fix_vel_n_mps,
+            now_us - _known(s.fix_time_us),
+            now_us,
+            dt_s,
         )
-        s.q_nb = kernels.turn(s.q_nb, accel, s.rate_b_radps, dt_s, self._settings.alpha_gyro)
+        if self._settings.blend == "every_sample":
+            self._blend_fix()
 
     def _update_yaw(self, mag_b_ut: Vec3) -> None:
         s = self._s
@@ -320,14 +332,6 @@ class PaperEstimator:
             self._settings.alpha_yaw,
         )
         s.mag_time_us = s.time_us
-
-    def _update_position(self, accel: Vec3, dt_s: float) -> None:
-        s = self._s
-        s.place, s.vel_n_mps = kernels.advance(
-            self._memory, s.q_nb, accel, dt_s, _known(s.time_us), s.place, s.vel_n_mps
-        )
-        if self._settings.blend == "every_sample":
-            self._blend_fix()
 
     def _blend_fix(self) -> None:
         s = self._s

@@ -170,6 +170,28 @@ def advance(
 
 
 @compiled
+def step(
+    s: Memory,
+    p: RestGains,
+    alpha_gyro: float,
+    q_nb: Quat,
+    accel: Vec3,
+    gyro: Vec3,
+    place: Place,
+    vel: Vec3,
+    fix_vel: Vec3,
+    fix_age_us: int,
+    now_us: int,
+    dt_s: float,
+) -> tuple[Vec3, Quat, Place, Vec3]:
+    """Advance all that the inertial sensors drive; the rate comes back without its bias."""
+    gyro = unbiased(s, p, gyro, accel, fix_vel, fix_age_us, dt_s)
+    q_nb = turn(q_nb, accel, gyro, dt_s, alpha_gyro)
+    place, vel = advance(s, q_nb, accel, dt_s, now_us, place, vel)
+    return (gyro, q_nb, place, vel)
+
+
+@compiled
 def carry_forward(
     s: Memory, place: Place, vel: Vec3, arrival_us: int, now_us: int, latency_s: float
 ) -> tuple[Place, Vec3]:
@@ -317,9 +339,10 @@ def run(
             dt_us, now_us = time_us[i] - now_us, time_us[i]
             if sound and 0 < dt_us <= GAP_US:
                 dt_s, age_us = dt_us / US_PER_S, now_us - last_fix_us
-                gyro = unbiased(memory, rest, gyro, accel, fix_vel, age_us, dt_s)
-                q = turn(q, accel, gyro, dt_s, alpha_gyro)
-                place, vel = advance(memory, q, accel, dt_s, now_us, place, vel)
+                _, q, place, vel = step(
+                    memory, rest, alpha_gyro, q, accel, gyro, place, vel, fix_vel, age_us,
+                    now_us, dt_s,
+                )  # fmt: skip
                 if not at_fix:
                     place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
             if is_finite(mag):

@@ -20,7 +20,7 @@ from gateway.estimation.complementary.estimator import ComplementaryEstimator
 from gateway.estimation.complementary.state import ComplementarySettings
 from gateway.estimation.eskf.estimator import EskfEstimator
 from gateway.estimation.eskf.settings import EskfSettings
-from gateway.estimation.kernel import KernelEstimator, SampleLog, _direct
+from gateway.estimation.kernel import KernelEstimator, SampleLog, direct
 from gateway.estimation.record import layout
 from gateway.estimation.reference import ReferenceSettings
 from gateway.geometry.geodesy import displacement_m
@@ -149,7 +149,7 @@ def test_the_short_way_into_machine_code_gives_the_same_bits(estimator: KernelEs
 
 def test_what_has_no_machine_code_is_handed_the_record(estimator: KernelEstimator) -> None:
     taken = []
-    _direct(lambda *arguments: taken.append(arguments))(estimator._held, 1.0)
+    direct(lambda *arguments: taken.append(arguments))(estimator._held, 1.0)
     assert taken == [(estimator._held.record, 1.0)]
 
 
