@@ -198,7 +198,7 @@ class PaperEstimator:
         s = self._s
         accel, gyro = sample.accel_lowpass_b_mps2, sample.gyro_highpass_b_radps
         sound = is_finite(sample.accel_b_mps2) and is_finite(sample.gyro_b_radps)
-        sound = sound and is_finite(accel) and is_finite(gyro)
+        sound = sound and kernels.is_sound(accel, gyro)
         if s.time_us is None:
             if not sound:
                 return self._nav(sample.time_us, sound)

@@ -41,6 +41,9 @@ MIN_COS_PITCH: Final = 0.05
 """Nose up or down, the accelerometer does not tell the roll."""
 REST_SPEED_MPS: Final = 0.7
 """Nothing that GPS sees moving faster is at rest."""
+MAX_ACCEL_MPS2: Final = 500.0
+MAX_RATE_RADPS: Final = 50.0
+"""No sensor of this kind tells more: such a value is a fault."""
 BIAS_TAU_S: Final = 5.0
 """Time constant by which the gyroscope's bias is followed at rest."""
 
@@ -73,6 +76,15 @@ class Memory(RestState):
 def is_finite(v: Vec3) -> bool:
     """Tell whether all three are finite."""
     return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
+
+
+@compiled
+def is_sound(accel: Vec3, gyro: Vec3) -> bool:
+    """Tell whether a sample is finite and within what sensors can tell."""
+    force = max(abs(accel[0]), abs(accel[1]), abs(accel[2]))
+    rate = max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2]))
+    finite = is_finite(accel) and is_finite(gyro)
+    return finite and force < MAX_ACCEL_MPS2 and rate < MAX_RATE_RADPS
 
 
 @compiled
@@ -332,7 +344,7 @@ def run(
             place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
             k += 1
         accel, gyro, mag = three(samples, i, 0), three(samples, i, 3), three(samples, i, 6)
-        sound = is_finite(accel) and is_finite(gyro)
+        sound = is_sound(accel, gyro)
         if now_us == NEVER and sound:
             now_us, q = time_us[i], level_start(accel)
         if now_us != NEVER:

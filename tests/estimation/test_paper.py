@@ -250,6 +250,19 @@ class TestNonsense:
         assert all(map(math.isfinite, (*state.q_nb, state.lat_deg, *state.vel_n_mps)))
         assert NavFlags.SENSOR_FAULT not in run(estimator, [imu(520_000)]).flags
 
+    @pytest.mark.parametrize("bad", [1e30, 1e300, -1e4])
+    def test_a_value_beyond_any_sensor_leaves_no_trace(self, bad: float) -> None:
+        estimator = make()
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        broken = [imu(500_000 + t, (bad, 0.0, bad), (0.0, bad, 0.0)) for t in times(0.2)]
+        assert NavFlags.SENSOR_FAULT in run(estimator, broken).flags
+        estimator.update_gps(fix(700_000))
+        state = run(estimator, [imu(710_000)])
+        assert NavFlags.SENSOR_FAULT not in state.flags
+        assert state.q_nb == pytest.approx((1.0, 0.0, 0.0, 0.0))
+        assert metres(state) == pytest.approx((0.0, 0.0), abs=0.02)
+
     def test_not_finite_from_the_start(self) -> None:
         state = run(make(), [imu(0, (math.nan, math.nan, math.nan))])
         assert NavFlags.ATTITUDE_VALID not in state.flags
