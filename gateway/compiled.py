@@ -1,11 +1,45 @@
 """The one place where numba enters: a typed, cached, strict-IEEE `njit`."""
 
-from collections.abc import Callable
-from typing import TypeVar, cast
+import hashlib
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+class _FileBySignature(IndexDataCacheFile):
+    """Names a file of machine code by the types that it was compiled for.
+
+    Numba numbers the files of a function. Two processes that compile it for different types at the
+    same time may take the same number, and ever after one would run the other's code.
+    """
+
+    def save(self: Any, key: object, data: object) -> None:
+        """Keep the machine code of one signature."""
+        digest = hashlib.sha256(repr(key).encode()).digest()
+        name = self._data_name(int.from_bytes(digest[:8]))
+        self._save_index({**self._load_index(), key: name})
+        self._save_data(name, data)
+
+
+def _files(dispatcher: object) -> Any:
+    """Find where numba keeps a function's machine code; None without a compiler."""
+    return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+
+
+def _borrowed(names: dict[str, Any]) -> Iterator[tuple[str, object]]:
+    """Tell what machine code may hold of other files: their constants, and what they compile."""
+    for name, value in names.items():
+        if isinstance(value, ModuleType):
+            yield from ((n, v) for n, v in vars(value).items() if isinstance(v, int | float))
+        elif isinstance(value, int | float | tuple):
+            yield (name, value)
+        elif isinstance(files := _files(value), _FileBySignature):
+            yield (name, files._source_stamp)  # noqa: SLF001
 
 
 def compiled(function: Function) -> Function:
@@ -25,4 +59,11 @@ def compiled(function: Function) -> Function:
     callable
         The dispatcher, typed as the function it stands for.
     """
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
+    if (files := _files(dispatcher)) is not None:
+        files.__class__ = _FileBySignature
+        # Numba looks at the function's own file only, whatever else the machine code is made of;
+        # what comes from other files is imported before.
+        made_of = (files._source_stamp, *_borrowed(function.__globals__))  # noqa: SLF001
+        files._source_stamp = hashlib.sha256(repr(made_of).encode()).hexdigest()  # noqa: SLF001
+    return cast(Function, dispatcher)

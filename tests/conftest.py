@@ -9,22 +9,6 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Drop machine code that is older than the sources.
-
-    Numba looks only at the file of a compiled function, not at those of the functions it calls, so
-    a change in one file would be tested with the other's old code.
-    """
-    if hasattr(config, "workerinput"):
-        return
-    rooms = [ROOT / "gateway" / room for room in ("estimation", "geometry", "sensing")]
-    sources = [*(ROOT / "gateway").glob("*.py"), *(f for room in rooms for f in room.rglob("*.py"))]
-    newest = max(file.stat().st_mtime for file in sources)
-    for file in (ROOT / "gateway").rglob("__pycache__/*.nb[ic]"):
-        if file.stat().st_mtime < newest:
-            file.unlink(missing_ok=True)
-
-
 class ManualClock:
     """A gateway clock that moves only when the test says so."""
 

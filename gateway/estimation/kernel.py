@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 State = TypeVar("State")
 Gains = TypeVar("Gains")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +47,36 @@ class Kernels(Generic[State, Gains]):
     """`(state, gains, *arrays of a SampleLog, output)`."""
 
 
-def _direct(function: Callable[..., None]) -> Callable[..., None]:
+class Held(Generic[State]):
+    """A record as machine code is handed it, by the address of its bytes.
+
+    Compiled code asks a record for its `data`, and numpy's own answer describes all the fields
+    anew on every call, which takes several times as long as the work.
+
+    Parameters
+    ----------
+    record : record
+        Stays the same memory for good; another record needs another `Held`.
+    """
+
+    __slots__ = ("data", "record")
+
+    def __init__(self, record: State) -> None:
+        self.record = record
+        self.data = memoryview(cast(Any, record)).cast("B")
+
+
+def direct(function: Callable[..., Result]) -> Callable[..., Result]:
     """Find the machine code behind a dispatcher that has compiled for one signature.
 
     The dispatcher looks the type of every argument up on every call, which for records of many
-    fields takes longer than the work. The caller must keep to the types of the first call.
+    fields takes longer than the work. The caller must keep to the types of the first call, and
+    hands records over as `Held`.
     """
     overloads = getattr(function, "overloads", {})
     if len(overloads) != 1:
-        return function
-    code: Callable[..., None] = next(iter(overloads.values())).entry_point
+        return lambda *args: function(*(a.record if isinstance(a, Held) else a for a in args))
+    code: Callable[..., Result] = next(iter(overloads.values())).entry_point
     return code
 
 
@@ -77,23 +98,32 @@ class KernelEstimator(Generic[State, Gains]):
     ) -> None:
         self._kernels = kernels
         self._gains = gains
+        self._held_gains = Held(gains)
         self._reference = reference
         self._earth = EarthField(reference)
         self._row = np.empty(NAV_COLUMNS)
         self._state = new_record(kernels.declaration)
         kernels.start(self._state, gains)
-        # A first call on a scrap state compiles, or loads, what `_direct` then finds.
+        # A first call on a scrap state compiles, or loads, what `direct` then finds.
         scrap = copy_record(self._state)
         kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
         kernels.tell(scrap, self._row)
-        self._imu = _direct(kernels.imu)
-        self._tell = _direct(kernels.tell)
+        self._imu = direct(kernels.imu)
+        self._tell = direct(kernels.tell)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
         self._state = new_record(self._kernels.declaration)
         self._kernels.start(self._state, self._gains)
+
+    @property
+    def _state(self) -> State:
+        return self._held.record
+
+    @_state.setter
+    def _state(self, record: State) -> None:
+        self._held = Held(record)
 
     @property
     def state(self) -> State:
@@ -119,8 +149,8 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._imu(self._state, self._gains, sample.time_us, *imu_row(sample))
-        self._tell(self._state, self._row)
+        self._imu(self._held, self._held_gains, sample.time_us, *imu_row(sample))
+        self._tell(self._held, self._row)
         return nav_state(sample.time_us, self._row)
 
     def update_baro(self, sample: BaroSample) -> None:

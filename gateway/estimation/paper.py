@@ -10,11 +10,20 @@ acceleration is integrated twice and blended with GPS [1]_. Deviations from the 
   the held fix, as printed, drags the track back to the last fix.
 - Eq. 1, 2: the acceleration is the specific force turned into NED, gravity added; body axes cannot
   be integrated.
+- Eq. 1, 2, 7, 8: a fix is old when it arrives. What the inertial sensors saw since it was valid is
+  added to its velocity, and its place moves on by both.
 - Eq. 3 to 6: the receiver's own course over ground takes the place of the bearing between two
   fixes, which is used where a receiver tells no velocity.
 - The vertical axis, which the paper leaves out, is blended by the same equations.
 - The gyroscope is integrated as a quaternion, so that the angles are only blended, not integrated:
   Euler rates are singular at +-90 deg of pitch.
+- The gyroscope's high-pass acts at rest only: what the gyroscope shows there is its bias. One that
+  acts always takes the steady rate of a long turn for bias too, and the attitude with it; so that
+  of the filter chain is off unless it is asked for.
+- The gyroscope's weights, of which the paper tells nothing, give 33 s in tilt and 10 s in yaw. In a
+  turn of rate w at bank b the accelerometer says level, and pulls the tilt off by b / (w T): 3 deg
+  at a bank of 30 deg and 20 m/s. A gyroscope that is 0.1 deg/s off makes as much. The compass errs
+  by the tilt that levels it times the tangent of the dip, so yaw has to be slow as well.
 
 References
 ----------
@@ -25,20 +34,25 @@ References
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
 from gateway.estimation import paper_kernels as kernels
+from gateway.estimation.kernel import Held, direct
 from gateway.estimation.paper_kernels import is_finite
-from gateway.estimation.record import FloatArray, IntArray
-from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
-from gateway.geometry.geodesy import displacement_m, offset_deg
-from gateway.geometry.quaternion import (
-    IDENTITY,
+from gateway.estimation.record import (
+    FloatArray,
+    IntArray,
+    copy_record,
+    filled_record,
+    new_record,
 )
+from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
+from gateway.estimation.rest import RestGains
+from gateway.geometry.geodesy import displacement_m
+from gateway.geometry.quaternion import IDENTITY
 from gateway.records import (
-    NAN,
     UNKNOWN_VEC3,
     BaroSample,
     GpsFix,
@@ -51,6 +65,18 @@ from gateway.records import (
 from gateway.settings import Settings, setting
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
+REST: Final = filled_record(
+    RestGains,
+    {
+        "rest_gyro_radps": math.radians(2.0),
+        "rest_accel_mps2": 0.5,
+        "rest_time_s": 1.5,
+        "bias_limit_radps": math.radians(6.0),
+    },
+)
+"""What is taken for rest: so quiet, for so long, turning no faster."""
+HELD_REST: Final = Held(REST)
+
 
 class PaperSettings(Settings, frozen=True):
     """Weights of the paper's three complementary filters."""
@@ -59,18 +85,21 @@ class PaperSettings(Settings, frozen=True):
         float,
         setting(
             "Weight of the gyroscope in roll and pitch over 10 ms. Small follows the "
-            "accelerometer's noise and manoeuvres, large drifts; time constant "
+            "accelerometer's noise and levels long turns, large drifts; time constant "
             "0.01 s * a / (1 - a).",
             ge=0.0,
             le=1.0,
         ),
-    ] = 0.995
+    ] = 0.9997
     alpha_yaw: Annotated[
         float,
         setting(
-            "Weight of the gyroscope in yaw over 10 ms, against the magnetometer.", ge=0.0, le=1.0
+            "Weight of the gyroscope in yaw over 10 ms, against the magnetometer. Small swings "
+            "with the compass in turns, large drifts; time constant as above.",
+            ge=0.0,
+            le=1.0,
         ),
-    ] = 0.99
+    ] = 0.999
     alpha_accel: Annotated[
         float,
         setting(
@@ -97,20 +126,19 @@ class PaperSettings(Settings, frozen=True):
 
 @dataclass(slots=True)
 class PaperState:
-    """Everything the estimator remembers."""
+    """What the estimator remembers, but for `paper_kernels.Memory`."""
 
     time_us: int | None = None
     q_nb: Quat = IDENTITY
     rate_b_radps: Vec3 = UNKNOWN_VEC3
     mag_time_us: int | None = None
-    lat_deg: float = NAN
-    lon_deg: float = NAN
-    alt_m: float = NAN
+    place: kernels.Place = UNKNOWN_VEC3
     vel_n_mps: Vec3 = UNKNOWN_VEC3
     fix_time_us: int | None = None
-    fix_lat_deg: float = NAN
-    fix_lon_deg: float = NAN
-    fix_alt_m: float = NAN
+    last_fix: kernels.Place = UNKNOWN_VEC3
+    """As it came."""
+    fix_place: kernels.Place = UNKNOWN_VEC3
+    """Carried forward by its latency, as is its velocity."""
     fix_vel_n_mps: Vec3 = UNKNOWN_VEC3
 
 
@@ -130,20 +158,26 @@ class PaperEstimator:
         self._reference = reference
         self._earth = EarthField(reference)
         self._s = PaperState()
+        self._held = Held(new_record(kernels.Memory))
+        # A first call on a scrap compiles, or loads, what `direct` then finds.
+        nothing = (UNKNOWN_VEC3,) * 5
+        kernels.step(new_record(kernels.Memory), REST, 1.0, IDENTITY, *nothing, 0, 0, 0.0)
+        self._step = direct(kernels.step)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
         self._s = PaperState()
+        self._held = Held(new_record(kernels.Memory))
 
     @property
-    def state(self) -> PaperState:
+    def state(self) -> tuple[PaperState, kernels.Memory]:
         """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s)
+        return replace(self._s), copy_record(self._held.record)
 
     @state.setter
-    def state(self, state: PaperState) -> None:
-        self._s = replace(state)
+    def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
+        self._s, self._held = replace(state[0]), Held(copy_record(state[1]))
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
@@ -164,24 +198,23 @@ class PaperEstimator:
         s = self._s
         accel, gyro = sample.accel_lowpass_b_mps2, sample.gyro_highpass_b_radps
         sound = is_finite(sample.accel_b_mps2) and is_finite(sample.gyro_b_radps)
-        sound = sound and is_finite(accel) and is_finite(gyro)
+        sound = sound and kernels.is_sound(accel, gyro)
         if s.time_us is None:
             if not sound:
                 return self._nav(sample.time_us, sound)
             s.time_us = sample.time_us
-            self._update_attitude(accel, gyro, None)
+            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(accel)
         dt_us = sample.time_us - s.time_us
         if abs(dt_us) > kernels.GAP_US:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
+                self._held.record.ring_count = 0
             s.time_us, dt_us = sample.time_us, 0
         if dt_us > 0:
             s.time_us = sample.time_us
             if sound:
-                dt_s = dt_us / US_PER_S
-                self._update_attitude(accel, gyro, dt_s)
-                self._update_position(accel, dt_s)
+                self._advance(accel, gyro, dt_us / US_PER_S)
         if sample.mag_b_ut is not None and dt_us >= 0 and is_finite(sample.mag_b_ut):
             self._update_yaw(sample.mag_b_ut)
         return self._nav(s.time_us, sound)
@@ -192,16 +225,22 @@ class PaperEstimator:
         Parameters
         ----------
         fix : GpsFix
-            Moved forward by its latency and its own velocity before it is blended.
+            Moved forward by its latency before it is blended.
         """
         if not is_usable(fix, self._reference):
             return
         s = self._s
-        self._carry_forward(fix)
-        if s.fix_time_us is None or not math.isfinite(s.lat_deg):
-            s.lat_deg, s.lon_deg, s.alt_m = s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m
-            s.vel_n_mps = s.fix_vel_n_mps
-        s.fix_time_us = fix.time_us
+        place, vel = self._read(fix)
+        s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
+            self._held.record,
+            place,
+            vel,
+            fix.time_us,
+            _known(s.time_us),
+            self._reference.gps_latency_s,
+        )
+        if not math.isfinite(s.place[0]):
+            s.place, s.vel_n_mps = s.fix_place, s.fix_vel_n_mps
         self._blend_fix()
 
     def run(self, time_us: IntArray, samples: FloatArray, fixes: Iterable[GpsFix]) -> FloatArray:
@@ -231,16 +270,18 @@ class PaperEstimator:
         rows = []
         for fix in fixes:
             if is_usable(fix, self._reference):
-                rows.append((fix.time_us, *self._carry_forward(fix), self._earth.declination_rad))
-                self._s.fix_time_us = fix.time_us
+                place, vel = self._read(fix)
+                rows.append((fix.time_us, *place, *vel, self._earth.declination_rad))
         self.reset()
         table = np.array(rows, np.float64).reshape(-1, 1 + kernels.FIX_COLUMNS)
         fix_time_us = np.array([row[0] for row in rows], np.int64)
         if np.any(np.diff(time_us) < 0) or np.any(np.diff(fix_time_us) < 0):
             raise ValueError("the times of a log must not go back")
-        gains = self._settings
+        gains, latency_s = self._settings, self._reference.gps_latency_s
         return kernels.run(
-            (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity),
+            (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity, latency_s),
+            REST,
+            new_record(kernels.Memory),
             gains.blend == "at_fix",
             declination_rad,
             time_us,
@@ -249,47 +290,36 @@ class PaperEstimator:
             np.ascontiguousarray(table[:, 1:]),
         )
 
-    def _carry_forward(self, fix: GpsFix) -> tuple[float, ...]:
-        """Move a fix forward by its latency, and keep it; tells place and velocity."""
+    def _read(self, fix: GpsFix) -> tuple[kernels.Place, Vec3]:
+        """Tell the place and velocity of a fix, and keep it for the next one's bearing."""
         s = self._s
-        lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
-        self._earth.update(lat_deg, lon_deg, fix.alt_amsl_m, fix.utc_us)
-        vel = fix.vel_n_mps if is_finite(fix.vel_n_mps) else self._bearing_velocity(fix)
-        latency_s = self._reference.gps_latency_s
-        s.fix_lat_deg, s.fix_lon_deg = offset_deg(
-            lat_deg, lon_deg, fix.alt_amsl_m, vel[0] * latency_s, vel[1] * latency_s
-        )
-        s.fix_alt_m = fix.alt_amsl_m - vel[2] * latency_s
-        s.fix_vel_n_mps = vel
-        return (s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m, *vel)
+        place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, fix.alt_amsl_m)
+        self._earth.update(*place, fix.utc_us)
+        vel = fix.vel_n_mps
+        if not is_finite(vel):
+            dt_s = 0.0 if s.fix_time_us is None else (fix.time_us - s.fix_time_us) / US_PER_S
+            vel = _bearing_velocity(s.last_fix, place, dt_s)
+        s.last_fix, s.fix_time_us = place, fix.time_us
+        return place, vel
 
-    def _bearing_velocity(self, fix: GpsFix) -> Vec3:
-        """Speed and bearing from the last fix to this one: eq. 3 to 6 over a short way."""
-        s = self._s
-        dt_s = 0.0 if s.fix_time_us is None else (fix.time_us - s.fix_time_us) / US_PER_S
-        if not 0.0 < dt_s < kernels.POSITION_HOLD_US / US_PER_S:
-            return (0.0, 0.0, 0.0)
-        latency_s, old = self._reference.gps_latency_s, s.fix_vel_n_mps
-        north_m, east_m = displacement_m(
-            s.fix_lat_deg,
-            s.fix_lon_deg,
-            fix.lat_dege7 * DEG_PER_DEGE7,
-            fix.lon_dege7 * DEG_PER_DEGE7,
-            fix.alt_amsl_m,
+    def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
+        s, now_us = self._s, _known(self._s.time_us)
+        s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = self._step(
+            self._held,
+            HELD_REST,
+            self._settings.alpha_gyro,
+            s.q_nb,
+            accel,
+            gyro,
+            s.place,
+            s.vel_n_mps,
+            s.fix_vel_n_mps,
+            now_us - _known(s.fix_time_us),
+            now_us,
+            dt_s,
         )
-        return (
-            north_m / dt_s + old[0] * latency_s / dt_s,
-            east_m / dt_s + old[1] * latency_s / dt_s,
-            (s.fix_alt_m - fix.alt_amsl_m + old[2] * latency_s) / dt_s,
-        )
-
-    def _update_attitude(self, accel: Vec3, gyro: Vec3, dt_s: float | None) -> None:
-        s = self._s
-        s.rate_b_radps = gyro
-        if dt_s is None:
-            s.q_nb = kernels.level_start(accel)
-        else:
-            s.q_nb = kernels.turn(s.q_nb, accel, gyro, dt_s, self._settings.alpha_gyro)
+        if self._settings.blend == "every_sample":
+            self._blend_fix()
 
     def _update_yaw(self, mag_b_ut: Vec3) -> None:
         s = self._s
@@ -303,27 +333,16 @@ class PaperEstimator:
         )
         s.mag_time_us = s.time_us
 
-    def _update_position(self, accel: Vec3, dt_s: float) -> None:
-        s = self._s
-        if not math.isfinite(s.lat_deg):
-            return
-        place = (s.lat_deg, s.lon_deg, s.alt_m)
-        place, s.vel_n_mps = kernels.advance(s.q_nb, accel, dt_s, place, s.vel_n_mps)
-        s.lat_deg, s.lon_deg, s.alt_m = place
-        if self._settings.blend == "every_sample":
-            self._blend_fix()
-
     def _blend_fix(self) -> None:
         s = self._s
-        place, s.vel_n_mps = kernels.blend_fix(
+        s.place, s.vel_n_mps = kernels.blend_fix(
             self._settings.alpha_accel,
             self._settings.beta_velocity,
-            (s.lat_deg, s.lon_deg, s.alt_m),
+            s.place,
             s.vel_n_mps,
-            (s.fix_lat_deg, s.fix_lon_deg, s.fix_alt_m),
+            s.fix_place,
             s.fix_vel_n_mps,
         )
-        s.lat_deg, s.lon_deg, s.alt_m = place
 
     def _nav(self, time_us: int, sound: bool) -> NavState:
         s = self._s
@@ -339,9 +358,9 @@ class PaperEstimator:
             time_us=time_us,
             q_nb=s.q_nb,
             rate_b_radps=s.rate_b_radps,
-            lat_deg=s.lat_deg,
-            lon_deg=s.lon_deg,
-            alt_amsl_m=s.alt_m,
+            lat_deg=s.place[0],
+            lon_deg=s.place[1],
+            alt_amsl_m=s.place[2],
             vel_n_mps=s.vel_n_mps,
             attitude_std_rad=UNKNOWN_VEC3,
             vel_std_mps=UNKNOWN_VEC3,
@@ -352,3 +371,11 @@ class PaperEstimator:
 
 def _known(time_us: int | None) -> int:
     return kernels.NEVER if time_us is None else time_us
+
+
+def _bearing_velocity(old: kernels.Place, new: kernels.Place, dt_s: float) -> Vec3:
+    """Speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
+    if not 0.0 < dt_s < kernels.POSITION_HOLD_US / US_PER_S:
+        return (0.0, 0.0, 0.0)
+    north_m, east_m = displacement_m(*old[:2], *new)
+    return (north_m / dt_s, east_m / dt_s, (old[2] - new[2]) / dt_s)

@@ -5,13 +5,15 @@ running call the same functions, so a log gives bit for bit what its samples giv
 """
 
 import math
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 
 from gateway.compiled import compiled
 from gateway.estimation import flagbits
-from gateway.estimation.record import FloatArray, IntArray
+from gateway.estimation.history import SLOTS, recall, remember
+from gateway.estimation.record import FloatArray, IntArray, as_vec, put
+from gateway.estimation.rest import RestGains, RestState, watch_rest
 from gateway.geometry.geodesy import offset_deg
 from gateway.geometry.quaternion import (
     from_euler,
@@ -37,6 +39,13 @@ POSITION_HOLD_US: Final = 30_000_000
 STALE_MAG_US: Final = 2_000_000
 MIN_COS_PITCH: Final = 0.05
 """Nose up or down, the accelerometer does not tell the roll."""
+REST_SPEED_MPS: Final = 0.7
+"""Nothing that GPS sees moving faster is at rest."""
+MAX_ACCEL_MPS2: Final = 500.0
+MAX_RATE_RADPS: Final = 50.0
+"""No sensor of this kind tells more: such a value is a fault."""
+BIAS_TAU_S: Final = 5.0
+"""Time constant by which the gyroscope's bias is followed at rest."""
 
 Place = Vec3
 """Latitude and longitude in degrees, height in metres."""
@@ -45,15 +54,37 @@ SAMPLE_COLUMNS: Final = 9
 """Low-passed specific force, high-passed rate (NaN if the sample is not sound), magnetic field
 (NaN unless new)."""
 FIX_COLUMNS: Final = 7
-"""Place and velocity of a fix carried forward by its latency, and the declination in rad."""
+"""Place and velocity of a fix as of when it was valid, and the declination in rad."""
 OUT_COLUMNS: Final = 11
 """Attitude, place, velocity, flags."""
+
+
+class Memory(RestState):
+    """What the inertial sensors showed of late."""
+
+    bias_b: Annotated[FloatArray, (3,)]
+    """Of the gyroscope, as it last showed at rest."""
+    integrals: Annotated[FloatArray, (6,)]
+    """Of the acceleration in NED: once, and twice."""
+    ring: Annotated[FloatArray, (SLOTS, 7)]
+    ring_count: int
+    past: Annotated[FloatArray, (6,)]
+    """Scratch: the integrals as they were."""
 
 
 @compiled
 def is_finite(v: Vec3) -> bool:
     """Tell whether all three are finite."""
     return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
+
+
+@compiled
+def is_sound(accel: Vec3, gyro: Vec3) -> bool:
+    """Tell whether a sample is finite and within what sensors can tell."""
+    force = max(abs(accel[0]), abs(accel[1]), abs(accel[2]))
+    rate = max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2]))
+    finite = is_finite(accel) and is_finite(gyro)
+    return finite and force < MAX_ACCEL_MPS2 and rate < MAX_RATE_RADPS
 
 
 @compiled
@@ -79,6 +110,27 @@ def tilt_of(accel: Vec3) -> tuple[float, float]:
     roll_rad = math.atan2(-accel[1], -accel[2])
     level = math.sqrt(accel[1] * accel[1] + accel[2] * accel[2])
     return (roll_rad, math.atan2(accel[0], level))
+
+
+@compiled
+def unbiased(
+    s: Memory,
+    p: RestGains,
+    gyro: Vec3,
+    accel: Vec3,
+    fix_vel: Vec3,
+    fix_age_us: int,
+    dt_s: float,
+) -> Vec3:
+    """Take off the rate what the gyroscope last showed at rest."""
+    speed_sq = fix_vel[0] * fix_vel[0] + fix_vel[1] * fix_vel[1] + fix_vel[2] * fix_vel[2]
+    moving = fix_age_us < STALE_GPS_US and speed_sq > REST_SPEED_MPS * REST_SPEED_MPS
+    watch_rest(s, p, gyro, accel, moving, dt_s)
+    if s.at_rest == 1:
+        # A mean while this rest is young, then a low-pass.
+        share = dt_s / min(s.rest_s - p.rest_time_s + dt_s, BIAS_TAU_S)
+        put(s.bias_b, blend(1.0 - share, as_vec(s.bias_b), as_vec(s.gyro_rest)))
+    return (gyro[0] - s.bias_b[0], gyro[1] - s.bias_b[1], gyro[2] - s.bias_b[2])
 
 
 @compiled
@@ -114,16 +166,63 @@ def turn_to_compass(
 
 
 @compiled
-def advance(q_nb: Quat, accel: Vec3, dt_s: float, place: Place, vel: Vec3) -> tuple[Place, Vec3]:
-    """Third complementary filter, its inertial path: integrate twice."""
+def advance(
+    s: Memory, q_nb: Quat, accel: Vec3, dt_s: float, now_us: int, place: Place, vel: Vec3
+) -> tuple[Place, Vec3]:
+    """Third complementary filter, its inertial path: integrate twice; NaN before the first fix."""
     a = rotate(q_nb, accel)
-    vel = (
-        vel[0] + a[0] * dt_s,
-        vel[1] + a[1] * dt_s,
-        vel[2] + (a[2] + STANDARD_GRAVITY_MPS2) * dt_s,
-    )
+    step = (a[0] * dt_s, a[1] * dt_s, (a[2] + STANDARD_GRAVITY_MPS2) * dt_s)
+    for k in range(3):
+        s.integrals[k] += step[k]
+        s.integrals[3 + k] += s.integrals[k] * dt_s
+    s.ring_count = remember(s.ring, s.ring_count, now_us / US_PER_S, s.integrals)
+    vel = (vel[0] + step[0], vel[1] + step[1], vel[2] + step[2])
     lat, lon = offset_deg(place[0], place[1], place[2], vel[0] * dt_s, vel[1] * dt_s)
     return ((lat, lon, place[2] - vel[2] * dt_s), vel)
+
+
+@compiled
+def step(
+    s: Memory,
+    p: RestGains,
+    alpha_gyro: float,
+    q_nb: Quat,
+    accel: Vec3,
+    gyro: Vec3,
+    place: Place,
+    vel: Vec3,
+    fix_vel: Vec3,
+    fix_age_us: int,
+    now_us: int,
+    dt_s: float,
+) -> tuple[Vec3, Quat, Place, Vec3]:
+    """Advance all that the inertial sensors drive; the rate comes back without its bias."""
+    gyro = unbiased(s, p, gyro, accel, fix_vel, fix_age_us, dt_s)
+    q_nb = turn(q_nb, accel, gyro, dt_s, alpha_gyro)
+    place, vel = advance(s, q_nb, accel, dt_s, now_us, place, vel)
+    return (gyro, q_nb, place, vel)
+
+
+@compiled
+def carry_forward(
+    s: Memory, place: Place, vel: Vec3, arrival_us: int, now_us: int, latency_s: float
+) -> tuple[Place, Vec3]:
+    """Move a fix from when it was valid to the newest sample by what that time has brought."""
+    valid_s = arrival_us / US_PER_S - latency_s
+    # After a gap the sample that is to come does not make up for it.
+    until_us = now_us if abs(arrival_us - now_us) <= GAP_US else arrival_us
+    lag_s = latency_s + (until_us - arrival_us) / US_PER_S
+    now_s, now, past = now_us / US_PER_S, s.integrals, s.past
+    seen_s = now_s - recall(s.ring, s.ring_count, valid_s, now_s, now, past)
+    gained = (now[0] - past[0], now[1] - past[1], now[2] - past[2])
+    north_m = vel[0] * lag_s + now[3] - past[3] - past[0] * seen_s
+    east_m = vel[1] * lag_s + now[4] - past[4] - past[1] * seen_s
+    down_m = vel[2] * lag_s + now[5] - past[5] - past[2] * seen_s
+    lat, lon = offset_deg(place[0], place[1], place[2], north_m, east_m)
+    return (
+        (lat, lon, place[2] - down_m),
+        (vel[0] + gained[0], vel[1] + gained[1], vel[2] + gained[2]),
+    )
 
 
 @compiled
@@ -190,7 +289,9 @@ def flags_of(
 
 @compiled
 def run(
-    gains: tuple[float, float, float, float],
+    gains: tuple[float, float, float, float, float],
+    rest: RestGains,
+    memory: Memory,
     at_fix: bool,
     declination_rad: float,
     time_us: IntArray,
@@ -202,8 +303,12 @@ def run(
 
     Parameters
     ----------
-    gains : tuple of 4 floats
-        `alpha_gyro`, `alpha_yaw`, `alpha_accel`, `beta_velocity`.
+    gains : tuple of 5 floats
+        `alpha_gyro`, `alpha_yaw`, `alpha_accel`, `beta_velocity`, `gps_latency_s`.
+    rest : RestGains
+        What is taken for rest.
+    memory : Memory
+        Changed in place.
     at_fix : bool
         Whether place and velocity are blended at each fix, else at each sample.
     declination_rad : float
@@ -223,32 +328,35 @@ def run(
         One row a sample.
     """
     out = np.empty((len(time_us), OUT_COLUMNS))
-    alpha_gyro, alpha_yaw, alpha, beta = gains
+    alpha_gyro, alpha_yaw, alpha, beta, latency_s = gains
     q = (1.0, 0.0, 0.0, 0.0)
     place = vel = fix_place = fix_vel = (math.nan, math.nan, math.nan)
     now_us = mag_us = last_fix_us = NEVER
     k = 0
     for i in range(len(time_us)):
         while k < len(fix_time_us) and fix_time_us[k] <= time_us[i]:
-            fix_place, fix_vel = three(fixes, k, 0), three(fixes, k, 3)
+            fix_place, fix_vel = carry_forward(
+                memory, three(fixes, k, 0), three(fixes, k, 3), fix_time_us[k], now_us, latency_s
+            )
             declination_rad, last_fix_us = fixes[k, 6], fix_time_us[k]
             if not math.isfinite(place[0]):
                 place, vel = fix_place, fix_vel
             place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
             k += 1
         accel, gyro, mag = three(samples, i, 0), three(samples, i, 3), three(samples, i, 6)
-        sound = is_finite(accel) and is_finite(gyro)
+        sound = is_sound(accel, gyro)
         if now_us == NEVER and sound:
             now_us, q = time_us[i], level_start(accel)
         if now_us != NEVER:
             dt_us, now_us = time_us[i] - now_us, time_us[i]
             if sound and 0 < dt_us <= GAP_US:
-                dt_s = dt_us / US_PER_S
-                q = turn(q, accel, gyro, dt_s, alpha_gyro)
-                if math.isfinite(place[0]):
-                    place, vel = advance(q, accel, dt_s, place, vel)
-                    if not at_fix:
-                        place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
+                dt_s, age_us = dt_us / US_PER_S, now_us - last_fix_us
+                _, q, place, vel = step(
+                    memory, rest, alpha_gyro, q, accel, gyro, place, vel, fix_vel, age_us,
+                    now_us, dt_s,
+                )  # fmt: skip
+                if not at_fix:
+                    place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
             if is_finite(mag):
                 q = turn_to_compass(q, mag, declination_rad, now_us, mag_us, alpha_yaw)
                 mag_us = now_us

@@ -48,9 +48,13 @@ class SensingSettings(Settings, frozen=True):
     gyro_highpass_hz: Annotated[
         float,
         setting(
-            "Cutoff of the angular rate's first-order high-pass; 0 for none.", "Hz", ge=0.0, le=10.0
+            "Cutoff of the angular rate's first-order high-pass; 0 for none. It takes the steady "
+            "rate of a long turn away like a bias. Only the paper's estimator listens to it.",
+            "Hz",
+            ge=0.0,
+            le=10.0,
         ),
-    ] = 0.002
+    ] = 0.0
     nominal_rate_hz: Annotated[
         float,
         setting("IMU rate to design for until the true one is measured.", "Hz", ge=1.0, le=2000.0),

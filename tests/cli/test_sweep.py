@@ -50,7 +50,8 @@ def test_a_search_writes_its_best_too(recording: Path, tmp_path: Path) -> None:
     arguments = ["--beta", "0:1", "--optimise", "2", "-o", str(best), "--jobs", "1"]
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 0, result.output
-    assert 0.0 <= load(best).estimation.paper.beta_velocity < 0.6
+    # On this short, smooth flight the withheld fixes are nearest at 0.7; 0 and 1 are both worse.
+    assert 0.5 < load(best).estimation.paper.beta_velocity < 0.9
 
 
 @pytest.mark.parametrize(

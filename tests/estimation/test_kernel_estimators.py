@@ -20,7 +20,7 @@ from gateway.estimation.complementary.estimator import ComplementaryEstimator
 from gateway.estimation.complementary.state import ComplementarySettings
 from gateway.estimation.eskf.estimator import EskfEstimator
 from gateway.estimation.eskf.settings import EskfSettings
-from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel import KernelEstimator, SampleLog, direct
 from gateway.estimation.record import layout
 from gateway.estimation.reference import ReferenceSettings
 from gateway.geometry.geodesy import displacement_m
@@ -132,6 +132,25 @@ def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
     offline = estimator.run(as_log(estimator, items))
     assert offline.shape == (len(live), NAV_COLUMNS)
     np.testing.assert_array_equal(offline, live)
+
+
+def test_the_short_way_into_machine_code_gives_the_same_bits(estimator: KernelEstimator) -> None:
+    """By address, or through the dispatcher with all its checks."""
+    kernels, state, row = estimator._kernels, estimator.state, np.empty(NAV_COLUMNS)
+    for sample in events(4.0, 6):
+        if not isinstance(sample, ImuSample):
+            continue
+        estimator.update_imu(sample)
+        kernels.imu(state, estimator._gains, sample.time_us, *imu_row(sample))
+        kernels.tell(state, row)
+    assert state.tobytes() == estimator.state.tobytes()
+    np.testing.assert_array_equal(row, estimator._row)
+
+
+def test_what_has_no_machine_code_is_handed_the_record(estimator: KernelEstimator) -> None:
+    taken = []
+    direct(lambda *arguments: taken.append(arguments))(estimator._held, 1.0)
+    assert taken == [(estimator._held.record, 1.0)]
 
 
 @pytest.mark.parametrize("seed", range(3))

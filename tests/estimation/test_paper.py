@@ -111,6 +111,19 @@ def test_latency_moves_the_fix_forward() -> None:
     assert state.alt_amsl_m == pytest.approx(499.0)
 
 
+def test_latency_is_made_up_for_by_what_the_accelerometer_saw() -> None:
+    """Northwards with 2 m/s2, at 20 m/s after 10 s; the fix is half a second old."""
+    reference = ReferenceSettings(gps_latency_s=0.5, declination="fixed")
+    estimator = make(reference, alpha_gyro=1.0, alpha_accel=0.0, beta_velocity=0.0)
+    run(estimator, [imu(0)])
+    state = run(estimator, [imu(t, (2.0, 0.0, -G)) for t in times(10.01)])
+    assert math.isnan(state.lat_deg)
+    estimator.update_gps(fix(10_005_000, north_m=9.5**2, vel=(19.0, 0.0, 0.0)))
+    state = run(estimator, [imu(10_010_000, (2.0, 0.0, -G))])
+    assert state.vel_n_mps == pytest.approx((20.0, 0.0, 0.0), abs=0.03)
+    assert metres(state) == pytest.approx((100.2, 0.0), abs=0.1)
+
+
 def test_velocity_from_the_bearing_where_the_receiver_tells_none() -> None:
     estimator = make(alpha_accel=0.0)
     run(estimator, [imu(0)])
@@ -145,16 +158,81 @@ def noisy_flight(seed: int) -> list[ImuSample]:
     ]
 
 
+def noisy_rest(
+    rng: np.random.Generator, bias: Vec3, begin_us: int, long_s: float
+) -> list[ImuSample]:
+    """Stand still; the gyroscope is off."""
+    return [
+        imu(
+            begin_us + t,
+            tuple(rng.normal((0, 0, -G), 0.03).tolist()),
+            tuple(rng.normal(bias, math.radians(0.1)).tolist()),
+        )
+        for t in times(long_s)
+    ]
+
+
+BIAS = (math.radians(3.0), math.radians(-2.0), math.radians(1.0))
+
+
+class TestGyroscopeBias:
+    def test_is_what_the_gyroscope_shows_at_rest(self, rng: np.random.Generator) -> None:
+        estimator = make()
+        run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
+        estimator.update_gps(fix(20_000_000, vel=(20.0, 0.0, 0.0)))
+        still = [imu(20_000_000 + t, gyro=BIAS) for t in times(60.0)]
+        state = run(estimator, still)
+        assert state.rate_b_radps == pytest.approx((0.0, 0.0, 0.0), abs=math.radians(0.05))
+        assert to_euler(state.q_nb)[:2] == pytest.approx((0.0, 0.0), abs=math.radians(1.0))
+
+    def test_is_not_learned_in_motion(self, rng: np.random.Generator) -> None:
+        estimator, rate = make(), BIAS
+        run(estimator, noisy_rest(rng, (0.0, 0.0, 0.0), 0, 5.0))
+        for second in range(5, 15):
+            estimator.update_gps(fix(second * 1_000_000, vel=(20.0, 0.0, 0.0)))
+            state = run(estimator, noisy_rest(rng, rate, second * 1_000_000, 1.0))
+        assert state.rate_b_radps == pytest.approx(rate, abs=math.radians(0.5))
+
+    def test_follows_from_rest_to_rest(self, rng: np.random.Generator) -> None:
+        estimator = make()
+        run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
+        run(estimator, [imu(20_000_000 + t, gyro=(1.0, 0.0, 0.0)) for t in times(1.0)])
+        state = run(estimator, noisy_rest(rng, (0.0, 0.0, 0.0), 21_000_000, 20.0))
+        assert estimator.state[1].bias_b == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+        assert NavFlags.ATTITUDE_VALID in state.flags
+
+
+def test_a_long_turn_does_not_level_the_horizon() -> None:
+    """Two minutes of circling at 20 m/s, always the same way: the accelerometer says level."""
+    bank, speed_mps = math.radians(30.0), 20.0
+    turn_radps = G * math.tan(bank) / speed_mps
+    estimator, worst = make(), 0.0
+    run(estimator, [imu(0, tilted(bank, 0.0))])
+    rate = rotate_inverse(from_euler(bank, 0.0, 0.0), (0.0, 0.0, turn_radps))
+    for t in times(120.0):
+        yaw = turn_radps * t * 1e-6
+        q = from_euler(bank, 0.0, yaw)
+        if t % 1_000_000 == 0:
+            course = (speed_mps * math.cos(yaw), speed_mps * math.sin(yaw), 0.0)
+            estimator.update_gps(fix(t, vel=course))
+        mag = rotate_inverse(q, (20.0, 0.0, 40.0)) if t % 100_000 == 0 else None
+        state = estimator.update_imu(imu(t, (0.0, 0.0, -G / math.cos(bank)), rate, mag=mag))
+        roll, pitch, found = to_euler(state.q_nb)
+        off = (roll - bank, pitch, math.remainder(found - yaw, 2.0 * math.pi))
+        worst = max(worst, *map(abs, off))
+    assert math.degrees(worst) < 6.5, math.degrees(worst)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_split_run_equals_one_run(seed: int) -> None:
-    samples = noisy_flight(seed)
+    samples = noisy_rest(np.random.default_rng(seed), BIAS, -3_000_000, 3.0) + noisy_flight(seed)
     whole, first, second = make(), make(), make()
     for estimator in (whole, first):
-        run(estimator, samples[:50])
+        run(estimator, samples[:350])
         estimator.update_gps(fix(500_000, vel=(1.0, 2.0, 3.0)))
-    run(first, samples[50:211])
+    run(first, samples[350:511])
     second.state = first.state
-    assert run(whole, samples[50:]) == run(second, samples[211:])
+    assert run(whole, samples[350:]) == run(second, samples[511:])
 
 
 def test_norm_stays_one() -> None:
@@ -171,6 +249,19 @@ class TestNonsense:
         assert NavFlags.SENSOR_FAULT | NavFlags.DEGRADED in state.flags
         assert all(map(math.isfinite, (*state.q_nb, state.lat_deg, *state.vel_n_mps)))
         assert NavFlags.SENSOR_FAULT not in run(estimator, [imu(520_000)]).flags
+
+    @pytest.mark.parametrize("bad", [1e30, 1e300, -1e4])
+    def test_a_value_beyond_any_sensor_leaves_no_trace(self, bad: float) -> None:
+        estimator = make()
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        broken = [imu(500_000 + t, (bad, 0.0, bad), (0.0, bad, 0.0)) for t in times(0.2)]
+        assert NavFlags.SENSOR_FAULT in run(estimator, broken).flags
+        estimator.update_gps(fix(700_000))
+        state = run(estimator, [imu(710_000)])
+        assert NavFlags.SENSOR_FAULT not in state.flags
+        assert state.q_nb == pytest.approx((1.0, 0.0, 0.0, 0.0))
+        assert metres(state) == pytest.approx((0.0, 0.0), abs=0.02)
 
     def test_not_finite_from_the_start(self) -> None:
         state = run(make(), [imu(0, (math.nan, math.nan, math.nan))])
@@ -220,10 +311,11 @@ def test_reset_forgets() -> None:
 
 @pytest.mark.parametrize("blend", ["at_fix", "every_sample"])
 def test_a_whole_log_gives_the_same_bits(rng: np.random.Generator, blend: str) -> None:
-    """Noise, a gap, unsound and repeated samples, fixes with and without velocity."""
+    """Rest, noise, a gap, unsound and repeated samples, fixes with and without velocity."""
     moments = [t for t in times(4.0) if not 1_500_000 < t < 2_300_000]
     moments.insert(50, moments[49])
-    samples = [
+    samples = noisy_rest(rng, BIAS, -3_000_000, 3.0)
+    samples += [
         ImuSample(
             time_us=t,
             accel_b_mps2=(math.nan, 0.0, 0.0) if k == 30 else (0.0, 0.0, -G),
@@ -254,8 +346,8 @@ def test_a_whole_log_gives_the_same_bits(rng: np.random.Generator, blend: str) -
             for s in samples
         ]
     )
-    table[30, :6] = math.nan
-    found = estimator.run(np.array(moments), table, fixes)
+    table[len(samples) - len(moments) + 30, :6] = math.nan
+    found = estimator.run(np.array([s.time_us for s in samples]), table, fixes)
     np.testing.assert_array_equal(found, np.array(expected))
 
 

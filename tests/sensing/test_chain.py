@@ -66,6 +66,15 @@ def test_filters_where_the_node_has_not(chain: SensorChain) -> None:
     assert 0.0 < sample.accel_lowpass_b_mps2[0] < sample.accel_b_mps2[0]
 
 
+def test_the_rate_of_a_long_turn_is_kept_unless_it_is_asked_for(chain: SensorChain) -> None:
+    highpassed = SensorChain(SensingSettings(gyro_highpass_hz=0.002), NodeCalibration())
+    for i in range(3000):
+        turning = replace(LEVEL, time_us=i * 10_000, gyro_raw=(0, 0, 500 if i else 0))
+        kept, lost = chain.imu(turning), highpassed.imu(turning)
+    assert kept.gyro_highpass_b_radps == kept.gyro_b_radps
+    assert abs(lost.gyro_highpass_b_radps[2]) < 0.75 * abs(lost.gyro_b_radps[2])
+
+
 @pytest.mark.parametrize("rate_hz", [50, 200, 1000])
 def test_measures_the_rate_and_designs_anew(chain: SensorChain, rate_hz: int) -> None:
     step_us = 1_000_000 // rate_hz

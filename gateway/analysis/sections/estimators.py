@@ -35,8 +35,8 @@ def estimators(case: Case) -> Section | None:
     return Section(
         "Estimators compared",
         f"Every estimator fused the same samples, and is judged against {reference.story}. "
-        "`paper` is the paper's fusion with its equations corrected: in a turn it takes the bank "
-        "for level flight, since an accelerometer alone cannot tell them apart. `complementary` "
+        "`paper` is the paper's fusion with its equations corrected: in a turn its accelerometer "
+        "takes the bank for level flight and slowly pulls the horizon over. `complementary` "
         "and `eskf` let the GPS velocity tell the manoeuvre from gravity.",
         [
             Picture(

@@ -33,8 +33,8 @@ def orientation(case: Case) -> Section | None:
     return Section(
         "Yaw and quaternion",
         "Yaw by integrating the gyroscope alone drifts away without end; the magnetometer holds "
-        "it (figure 7 of the paper). In long turns the paper's filter takes the bank for level "
-        "flight, so its compass is tilted and swings; the drift of the gyroscope may be less "
+        "it (figure 7 of the paper). In long turns the paper's filter slowly takes the bank "
+        "for level flight, which tilts its compass; the drift of the gyroscope may be less "
         "than that for some minutes, but it never comes back. The quaternion has no gimbal lock "
         "and no jump at 360° (figure 8).",
         [
