@@ -4,6 +4,7 @@ import heapq
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
@@ -42,6 +43,8 @@ from gateway.units import DEG_PER_DEGE7, M_PER_MM
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 GLOBAL_POSITION_INT_ID: Final = 33
+TRACKER_LOG: Final = files("gateway.cli") / "tracker-log.toml"
+"""The map for logs whose columns are time_s, ax, gx and so on."""
 _POSITION: Final = struct.Struct("<Iiii")
 
 Position = Literal["causal", "interpolated"]
@@ -68,7 +71,7 @@ class Wishes:
     """Whose settings a table is fused with; those of today where it has none of its own."""
     position: Position = "causal"
     columns: ColumnMap | None = None
-    """For a CSV that is not ours."""
+    """For a CSV that is not ours; by default those of a tracker log."""
     system_id: int | None = None
     """The vehicle of a tlog to take."""
     progress: Progress | None = None
@@ -269,15 +272,13 @@ def _open_table(path: Path, wishes: Wishes) -> Table:
 
 
 def _open_foreign(path: Path, wishes: Wishes) -> Table:
-    if wishes.columns is None:
-        raise FlightError(f"{path}: is a CSV of another program; tell its columns: --columns MAP")
-    vehicle_id = wishes.system_id or 1
-    lines = _lines(path, wishes.progress)
-    rows = ForeignReader(wishes.columns, vehicle_id).rows(lines)
+    vehicle_id, lines = wishes.system_id or 1, _lines(path, wishes.progress)
+    known = wishes.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+    rows = ForeignReader(known, vehicle_id, lenient=wishes.columns is None).rows(lines)
     try:
         first = next(rows, None)
     except ValueError as error:
-        raise FlightError(f"{path}: {error}") from error
+        raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
     return _headed(first, rows, wishes, vehicle_id, None)

@@ -13,7 +13,6 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from gateway.cli.errors import refuse
 from gateway.cli.flights import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
 from gateway.cli.recording_files import (
     PANEL,
@@ -43,7 +42,6 @@ from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName, make_estimator
-from gateway.flightlog.foreign import Column, ColumnMap
 from gateway.pipeline import AircraftSettings, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
@@ -52,9 +50,6 @@ from gateway.units import US_PER_S
 
 Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
-COLUMN_MAP: Final = Path(__file__).parents[2] / "config" / "columns" / "tracker-log.toml"
-"""The map for logs whose columns are time_s, ax, gx and so on."""
-NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 HEAD_LINES: Final = 20
 
@@ -106,13 +101,11 @@ def fuse_log(
     """
     current = read_settings(config)
     with progress_of([file]) as advance, refusing():
-        foreign = kind_of(file) is FileKind.FOREIGN
-        names, facts = _look_at(file) if foreign else (set[str](), {})
-        column_map = read_column_map(columns or COLUMN_MAP) if foreign else None
+        facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
         wishes = Wishes(
             current=PipelineSettings(current.default_aircraft, read_aircraft(current)),
             choice="current" if config is not None else settings,
-            columns=None if column_map is None else _present(column_map, names),
+            columns=read_column_map(columns),
             progress=advance,
         )
         table = open_rows(file, wishes)
@@ -225,28 +218,14 @@ def _row(s: NavState) -> list[float]:
     ]  # fmt: skip
 
 
-def _look_at(path: Path) -> tuple[set[str], dict[str, float]]:
-    """Read a foreign file's column names and the `key=value` words of its comments."""
+def _facts_of(path: Path) -> dict[str, float]:
+    """Read the `key=value` words of a foreign file's comments."""
     facts: dict[str, float] = {}
     with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
         for line, _ in zip(file, range(HEAD_LINES), strict=False):
-            if not line.startswith("#"):
-                return {name.strip() for name in line.split(",")}, facts
-            facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
-    return set(), facts
-
-
-def _present(column_map: ColumnMap, names: set[str]) -> ColumnMap:
-    """Leave out what a file does not have; a tracker need not have every sensor."""
-    found = {
-        ours: theirs
-        for ours, theirs in column_map.columns.items()
-        if (theirs.column if isinstance(theirs, Column) else theirs) in names
-    }
-    missing = [name for name in NEEDED if name not in found]
-    if missing:
-        refuse(f"the file has no column for {', '.join(missing)}; name one with --columns")
-    return ColumnMap(columns=found)
+            if line.startswith("#"):
+                facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
+    return facts
 
 
 def _adjusted(

@@ -23,7 +23,6 @@ from tests.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 
-ROOT = Path(__file__).resolve().parents[2]
 RECORDS = make_records(500)
 
 
@@ -181,15 +180,21 @@ def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
         lines.append(f"{0.02 * i},0,0,-9.81,0,0,0,20,0,40,430,{gps}")
     source = tmp_path / "log.csv.gz"
     source.write_bytes(gzip.compress("\n".join(lines).encode()))
-    assert "--columns" in run("convert", source, "-o", tmp_path / "x.csv", code=2)
     out = tmp_path / "flight.csv"
-    column_map = ROOT / "config" / "columns" / "tracker-log.toml"
-    run("convert", source, "-o", out, "--columns", column_map)
+    run("convert", source, "-o", out)
     _, rows = read_table(out)
     states = [row.state for row in rows if row.state is not None]
     assert len(states) == 500
     assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
     assert math.isfinite(states[-1].alt_amsl_m)
+    own = tmp_path / "map.toml"
+    own.write_text('[columns]\ntime_us = "t"\naccel_x_b_mps2 = "ax"\ngyro_x_b_radps = "gx"\n')
+    refused = run("convert", source, "-o", tmp_path / "x.csv", "--columns", own, code=2)
+    assert "has no column t" in " ".join(refused.split())
+    own.write_text(own.read_text().replace('"t"', '{ column = "time_s", scale = 1e6 }'))
+    run("convert", source, "-o", tmp_path / "x.csv", "--columns", own)
+    _, rows = read_table(tmp_path / "x.csv")
+    assert (len(rows), rows[-1].gps) == (500, None)
 
 
 @pytest.mark.parametrize(
