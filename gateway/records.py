@@ -261,6 +261,18 @@ class FusedSample:
 
 
 @dataclass(frozen=True, slots=True)
+class FusionState:
+    """All that filters and estimator of one aircraft remember between two samples."""
+
+    vehicle_id: int
+    fits: str
+    """Program and settings that it can be given back to; compared, never read."""
+    sensing: bytes
+    estimation: bytes
+    """Written by the stages, and read by nobody else."""
+
+
+@dataclass(frozen=True, slots=True)
 class NodeLink:
     """What the gateway counted of one node since it started."""
 

@@ -21,7 +21,7 @@ from gateway.cli.recording_files import (
     read_column_map,
     refusing,
 )
-from gateway.cli.run import ConfigOption, read_aircraft, read_settings
+from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.estimation.columns import (
     GPS_COLUMNS,
@@ -42,7 +42,7 @@ from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName, make_estimator
-from gateway.pipeline import AircraftSettings, PipelineSettings
+from gateway.pipeline import AircraftSettings
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
 from gateway.sensing.chain import SensorChain
@@ -103,7 +103,7 @@ def fuse_log(
     with progress_of([file]) as advance, refusing():
         facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
         wishes = Wishes(
-            current=PipelineSettings(current.default_aircraft, read_aircraft(current)),
+            current=pipeline_settings(current),
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,

@@ -31,8 +31,10 @@ from gateway.flightlog.table import (
     encode_head,
     encode_header,
     encode_mark,
+    encode_state,
 )
 from gateway.flightlog.tlog import encode_record
+from gateway.records import FusionState
 from gateway.units import US_PER_S
 
 SHOWN: Final = 8
@@ -145,6 +147,8 @@ def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
                 yield row_to_line(event).encode()
             case TableHeader():
                 yield encode_header(event).encode()
+            case FusionState():
+                yield encode_state(event).encode()
             case TableMark():
                 yield encode_mark(event).encode()
             case TableFault():

@@ -27,12 +27,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 
 from gateway.estimation import paper_kernels as kernels
 from gateway.estimation.paper_kernels import is_finite
 from gateway.estimation.record import FloatArray, IntArray
-from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
+from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import (
     IDENTITY,
@@ -144,6 +145,15 @@ class PaperEstimator:
     @state.setter
     def state(self, state: PaperState) -> None:
         self._s = replace(state)
+
+    def snapshot(self) -> bytes:
+        """Write down all that is remembered, the declination included."""
+        return msgspec.msgpack.encode((self._s, self._earth.state))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot; raises ValueError if it is none of this estimator."""
+        kind = tuple[PaperState, EarthPlace | None]
+        self._s, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""

@@ -5,6 +5,7 @@ without conversion. The declaration is a class that is never instantiated: mypy 
 by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
 """
 
+import zlib
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
@@ -89,6 +90,53 @@ def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declar
 def copy_record(record: Declared) -> Declared:
     """Copy a record, for a state that is read out or restored."""
     return cast(Declared, cast(np.void, record).copy())
+
+
+def pack_record(record: object) -> tuple[str, bytes]:
+    """Write a record as its layout and its bytes.
+
+    Parameters
+    ----------
+    record : record
+        Of any declaration.
+
+    Returns
+    -------
+    tuple of str and bytes
+        For `unpack_record`.
+    """
+    void = cast(np.void, record)
+    return (repr(void.dtype.descr), zlib.compress(void.tobytes(), 1))
+
+
+def unpack_record(declaration: type[Declared], packed: tuple[str, bytes]) -> Declared:
+    """Read a record back.
+
+    Parameters
+    ----------
+    declaration : type
+        See `layout`.
+    packed : tuple of str and bytes
+        From `pack_record`.
+
+    Returns
+    -------
+    Declared
+        The same to the last bit.
+
+    Raises
+    ------
+    ValueError
+        If it was written from another declaration, or is damaged.
+    """
+    wanted, (descr, data) = layout(declaration), packed
+    if descr != repr(wanted.descr):
+        raise ValueError("a state of another layout")
+    try:
+        plain = zlib.decompress(data)
+    except zlib.error as error:
+        raise ValueError(f"a damaged state: {error}") from error
+    return cast(Declared, np.frombuffer(plain, wanted, 1)[0].copy())
 
 
 @compiled

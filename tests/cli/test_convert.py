@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.cli.convert import pipeline_settings
+from gateway.config import GatewaySettings
 from gateway.flightlog.row import TableRow
 from gateway.flightlog.table import TableFault, TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
@@ -49,7 +49,7 @@ def tlog(tmp_path: Path) -> Path:
 @pytest.fixture
 def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     path = tmp_path / "flight.csv"
-    path.write_bytes(fly(pipeline_settings(None).default, make_flight(rng, 20))[0])
+    path.write_bytes(fly(GatewaySettings().default_aircraft, make_flight(rng, 20))[0])
     return path
 
 
@@ -126,7 +126,7 @@ def test_positions_on_straight_lines(table: Path, tmp_path: Path) -> None:
     run("convert", table, "-o", out, "--fuse", "--position", "interpolated")
     _, rows = read_table(out)
     fixes = [(row.gps.time_us, row.gps.alt_amsl_m) for row in rows if row.gps]
-    latency_us = round(1e6 * pipeline_settings(None).default.estimation.reference.gps_latency_s)
+    latency_us = round(1e6 * GatewaySettings().default_aircraft.estimation.reference.gps_latency_s)
     times, alts = np.array(fixes).T
     middle = rows[len(rows) // 2].state
     assert middle is not None
