@@ -1,6 +1,7 @@
 """`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
 
 import gzip
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
@@ -13,7 +14,14 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from gateway.cli.flights import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
+from gateway.cli.flights import (
+    FlightError,
+    SettingsChoice,
+    Table,
+    Wishes,
+    aircraft_of,
+    open_rows,
+)
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -21,6 +29,7 @@ from gateway.cli.recording_files import (
     read_column_map,
     refusing,
 )
+from gateway.cli.refusion import SETTLES
 from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.estimation.columns import (
@@ -41,9 +50,9 @@ from gateway.estimation.columns import (
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
-from gateway.estimation.select import EstimatorName, make_estimator
-from gateway.pipeline import AircraftSettings
-from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
+from gateway.estimation.select import EstimatorName
+from gateway.pipeline import AircraftSettings, make_fusion
+from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
 from gateway.sensing.chain import SensorChain
 from gateway.units import US_PER_S
@@ -113,8 +122,9 @@ def fuse_log(
             aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
         )
         try:
+            chain, running = _begin(table, aircraft)
             records = (record for row in table.plain_rows for record in records_of(row))
-            time_us, states = fuse(records, aircraft)
+            time_us, states = fuse(records, chain, running)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
         write_new(out, _lines(time_us, states), overwrite=True)
@@ -122,15 +132,33 @@ def fuse_log(
     Console(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}")
 
 
-def fuse(records: Iterable[Record], aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
+def _begin(table: Table, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
+    """Go on from the state at the table's begin where there is one that fits."""
+    first = next(table.rows)
+    if isinstance(first, FusionState):
+        try:
+            return make_fusion(aircraft, first)
+        except ValueError as error:
+            told = Console(stderr=True, highlight=False)
+            told.print(SETTLES.format(error), markup=False)
+    else:
+        table.rows = itertools.chain([first], table.rows)
+    return make_fusion(aircraft)
+
+
+def fuse(
+    records: Iterable[Record], chain: SensorChain, estimator: Estimator
+) -> tuple[IntArray, FloatArray]:
     """Run an estimator over records in their order.
 
     Parameters
     ----------
     records : iterable of record
         Raw or calibrated samples and fixes.
-    aircraft : AircraftSettings
-        Calibration, filters and estimator.
+    chain : SensorChain
+        Calibration and filters.
+    estimator : Estimator
+        Fresh, or in a state to go on from.
 
     Returns
     -------
@@ -139,8 +167,6 @@ def fuse(records: Iterable[Record], aircraft: AircraftSettings) -> tuple[IntArra
     states : ndarray, shape (n, NAV_COLUMNS)
         See `gateway.estimation.columns`.
     """
-    chain = SensorChain(aircraft.sensing, aircraft.calibration)
-    estimator = make_estimator(aircraft.estimation)
     if isinstance(estimator, KernelEstimator):
         log = _collect(records, chain, estimator)
         return log.imu_time_us, estimator.run(log)

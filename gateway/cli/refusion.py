@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -25,6 +26,8 @@ from gateway.flightlog.tlog import TlogRecord
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, Outgoing
 from gateway.replay import InterpolatedPosition, Replay, header_for
+
+SETTLES: Final = "what was remembered at the begin is left aside: {}; the estimator settles anew"
 
 
 class Refusion:
@@ -57,8 +60,7 @@ class Refusion:
     @property
     def remarks(self) -> list[str]:
         """What the user should know of the states, as far as it was seen by now."""
-        told = "the state at the begin is not gone on from: {}; it settles as after a cold start"
-        return [told.format(reason) for reason in self._replay.refused]
+        return [SETTLES.format(reason) for reason in self._replay.refused]
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink that the gateway would have sent, at civil times."""

@@ -1,8 +1,10 @@
 """The files of one part on the disk; everything here may block and runs in the recorder's worker.
 
-Files are only ever appended to, so a cut at any moment leaves what was written before.
+Files are only ever appended to, so a cut at any moment leaves what was written before. Only what a
+disk has refused in the middle is taken back.
 """
 
+import contextlib
 import errno
 import os
 from collections.abc import Mapping
@@ -118,8 +120,13 @@ class PartFiles:
         return self._folder / (part_stem(self.session, self._part) + ending)
 
     def _append(self, ending: str, data: bytes) -> None:
-        view = memoryview(data)
-        while view:
-            written = os.write(self._files[ending], view)
-            self._sizes[ending] += written
-            view = view[written:]
+        file, size, view = self._files[ending], self._sizes[ending], memoryview(data)
+        try:
+            while view:
+                view = view[os.write(file, view) :]
+        except OSError:
+            # A full disk takes the begin of what is written: no half record may stay.
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, size)
+            raise
+        self._sizes[ending] = size + len(data)

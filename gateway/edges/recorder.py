@@ -23,7 +23,8 @@ from typing import ParamSpec, TypeVar
 import msgspec
 
 from gateway.edges.part_files import DiskState, PartFiles, free_bytes_near, reason_of
-from gateway.edges.recordings import RecordingError, rename_recording, restamp_recording
+from gateway.edges.recordings import RecordingError, part_of, rename_recording
+from gateway.edges.restamp import Restamper, clear_copies
 from gateway.flightlog.part import PENDING_LIMIT, Part
 from gateway.flightlog.session import (
     Announce,
@@ -104,6 +105,10 @@ class Recorder:
         self._wake = asyncio.Event()
         self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self._offsets: dict[int, int] = {}
+        """Civil time of gateway time zero with which each part of the session was written."""
+        self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
+        self._restamping: asyncio.Task[None] | None = None
         self.folder = Path(settings.folder).expanduser()
         """Where the recordings are."""
 
@@ -113,6 +118,7 @@ class Recorder:
         A recording that is wanted already is opened at once: nothing runs yet that could be held
         up, and a table is worth most from the estimator's first sample on.
         """
+        clear_copies(self.folder)
         self._civil.hear_machine(self._machine_us(), self._clock())
         if self._session.wanted:
             self._open_at_once()
@@ -120,18 +126,19 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and end; waits for the disk."""
-        if self._task is not None:
-            self._task.cancel()
+        for task in (self._task, self._restamping):
+            if task is not None:
+                task.cancel()
         self._worker.shutdown(wait=True)
         files, self._files = self._files, None
-        if files is None or self._part is None:
-            return
         try:
-            self._part.flush_rows()
-            files.write(self._part.take(), sync=True)
-            files.close()
+            if files is not None and self._part is not None:
+                self._part.flush_rows()
+                files.write(self._part.take(), sync=True)
+                files.close()
         except OSError as error:
             log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+        self._restamper.finish()
 
     async def settle(self) -> None:
         """Wait until orders given so far have been carried out."""
@@ -171,6 +178,7 @@ class Recorder:
         """
         if not self._session.name:
             raise RecordingError("nothing was recorded since the gateway started")
+        await self._restamped()
         old, files = self._session.name, self._files
         await self._on_disk(_rename_open, self.folder, old, name, files)
         self._session.name = name
@@ -222,6 +230,9 @@ class Recorder:
     def _new_part(self, session: str, number: int) -> Part:
         """Begin to gather for a part; later, the fusion would be ahead of its first row."""
         part = Part(session, number, self._civil.offset_us or 0)
+        if number == 1:
+            self._offsets.clear()
+        self._offsets[number] = part.stamper.offset_us
         if self._settings.table:
             for vehicle_id in self._seen:
                 part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
@@ -294,7 +305,7 @@ class Recorder:
                 case ClosePart():
                     await self._close_part(closing)
                 case Rename():
-                    await self._rename(action, closing)
+                    await self._rename(action)
                 case OpenPart():
                     following += await self._open_part(action)
                 case Announce():
@@ -347,17 +358,26 @@ class Recorder:
         with contextlib.suppress(OSError):
             await self._on_disk(files.close)
 
-    async def _rename(self, action: Rename, closed: Part | None) -> None:
-        """Name a session by its true time, and shift its time stamps to it."""
+    async def _rename(self, action: Rename) -> None:
+        """Name a session by its true time, and let its finished parts be shifted to it."""
+        await self._restamped()
+        old, new = action.session, action.to_session
         try:
-            if closed is not None:
-                shift_us = (self._civil.offset_us or 0) - closed.stamper.offset_us
-                await self._on_disk(
-                    restamp_recording, self.folder, action.session, closed.number, shift_us
-                )
-            await self._on_disk(rename_recording, self.folder, action.session, action.to_session)
+            found = await self._on_disk(rename_recording, self.folder, old, new)
         except (OSError, RecordingError) as error:
-            log.warning("Recording %s keeps its name: %s", action.session, error)
+            log.warning("Recording %s keeps its name and times: %s", old, error)
+            return
+        true_us = self._civil.offset_us or 0
+        for path in found.files:
+            self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
+        self._offsets = dict.fromkeys(self._offsets, true_us)
+        run = self._restamper.run(lambda step: self._on_disk(step))
+        self._restamping = asyncio.get_running_loop().create_task(run)
+
+    async def _restamped(self) -> None:
+        """Wait until no file is being copied, so that its name may change."""
+        if self._restamping is not None:
+            await self._restamping
 
     async def _on_disk(
         self,

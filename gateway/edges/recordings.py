@@ -11,11 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.flightlog.session import check_name, part_stem
-from gateway.flightlog.tlog import TlogScanner, encode_record
-
-RESTAMP_LIMIT: Final = 16 << 20
-"""Larger files keep the times they were written with: rewriting them would hold up the disk."""
+from gateway.flightlog.session import check_name
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 
@@ -33,6 +29,14 @@ class Recording:
 
 class RecordingError(Exception):
     """What was asked for cannot be done; the text says why."""
+
+
+def part_of(path: Path) -> int:
+    """Tell which part of its recording a file is; raises ValueError if it is none."""
+    match = _FILE_NAME.fullmatch(path.name)
+    if match is None:
+        raise ValueError(f"{path} is no part of a recording")
+    return int(match["part"])
 
 
 def list_recordings(folder: Path) -> list[Recording]:
@@ -104,26 +108,6 @@ def delete_recording(folder: Path, name: str) -> Recording:
         path.unlink()
     sync_folder(folder)
     return recording
-
-
-def restamp_recording(folder: Path, name: str, part: int, shift_us: int) -> None:
-    """Shift all times of a part's tlog, once the true time is known.
-
-    The new file takes the place of the old one in one step, so a power cut leaves either.
-    """
-    path = folder / f"{part_stem(name, part)}.tlog"
-    if not path.exists() or path.stat().st_size > RESTAMP_LIMIT:
-        return
-    batch = TlogScanner().feed(path.read_bytes(), final=True)
-    shifted = b"".join(
-        encode_record(max(record.time_us + shift_us, 0), record.frame) for record in batch.records()
-    )
-    temporary = path.with_suffix(".tlog.new")
-    with temporary.open("wb") as file:
-        file.write(shifted)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def sync_folder(folder: Path) -> None:

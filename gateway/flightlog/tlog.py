@@ -86,6 +86,18 @@ class Batch:
         begin = int(self.starts[index]) + TIME_SIZE
         return self.data[begin : begin + int(self.sizes[index])]
 
+    def shifted(self, shift_us: int) -> bytes:
+        """Return the bytes from the first record to the last, with all times moved."""
+        if not len(self):
+            return b""
+        begin = int(self.starts[0])
+        end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
+        shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
+        times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
+        places = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
+        shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
+        return shifted.tobytes()
+
     def records(self, begin: int = 0) -> Iterator[TlogRecord]:
         """Go through the records from one of them on."""
         data = self.data

@@ -266,18 +266,28 @@ async def test_a_disk_that_hangs_costs_recording_not_memory(bench: Bench) -> Non
 
 
 async def test_names_and_times_are_put_right_once_gps_tells_them(
-    bench: Bench, rng: np.random.Generator
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
+    bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
     bench.unix_at_zero_us = 1_000_000
     await bench.turn()
-    bench.send(FRAMES[:5])
+    bench.send(FRAMES[:3])
+    await bench.turn(100)
+    bench.send(FRAMES[3:5])
+    bench.recorder.flight(make_fused(rng, 1000))
     await bench.turn()
     bench.recorder._civil.hear_gps(UNIX_US + bench.clock(), bench.clock())
     await bench.turn()
     bench.send(FRAMES[5:])
     bench.recorder.close()
     files = sorted(bench.recorder.folder.iterdir())
-    assert [path.name for path in files] == [f"{NAME}_01.tlog", f"{NAME}_02.tlog"]
+    table = files.pop(2)
+    assert [path.name for path in files] == [f"{NAME}_0{n}.tlog" for n in (1, 2, 3)]
+    assert table.name == f"{NAME}_02_v3.csv"
+    reader = TableReader()
+    reader.feed(table.read_bytes())
+    assert reader.header is not None
+    assert reader.header.unix_us_at_zero == UNIX_US
     records = [record for path in files for record in read_tlog(path)]
     assert [record.frame for record in records] == FRAMES
     times = [record.time_us for record in records]

@@ -12,10 +12,7 @@ from gateway.edges.recordings import (
     free_name,
     list_recordings,
     rename_recording,
-    restamp_recording,
 )
-from gateway.flightlog.tlog import TlogScanner
-from tests.flightlog.frames import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 
@@ -67,13 +64,3 @@ def test_a_free_name_has_a_number_where_needed(folder: Path) -> None:
     assert free_name(folder, "a") == "a-2"
     (folder / "a-2_01.tlog").touch()
     assert free_name(folder, "a") == "a-3"
-
-
-def test_restamp_shifts_the_times_alone(tmp_path: Path) -> None:
-    records = make_records(10)
-    (tmp_path / "a_01.tlog").write_bytes(make_tlog(records))
-    restamp_recording(tmp_path, "a", 1, 5_000_000)
-    (path,) = tmp_path.iterdir()
-    after = list(TlogScanner().feed(path.read_bytes(), final=True).records())
-    assert [record.frame for record in after] == [record.frame for record in records]
-    assert after[0].time_us == START_US + 5_000_000
