@@ -12,7 +12,7 @@ who calls `feed` (bytes) or `take` (raw records of a recording).
 
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Final
 
 import msgspec
@@ -55,7 +55,7 @@ from gateway.vehicle.actions import (
     SettingsChange,
 )
 from gateway.vehicle.events import Told
-from gateway.vehicle.home import Place
+from gateway.vehicle.home import Home, Place
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
@@ -125,16 +125,24 @@ class Aircraft:
 
     @property
     def fusion_state(self) -> FusionState:
-        """All that filters and estimator remember now."""
+        """All that filters and estimator remember now, and where home is."""
+        home = self.vehicle.telemetry.home
         return FusionState(
-            self.vehicle_id,
-            _fits(self.settings),
-            self._chain.snapshot(),
-            self._estimator.snapshot(),
+            vehicle_id=self.vehicle_id,
+            fits=_fits(self.settings),
+            sensing=self._chain.snapshot(),
+            estimation=self._estimator.snapshot(),
+            home=None if home is None else (*astuple(home.place), home.set_time_us),
         )
 
     def restore(self, state: FusionState) -> None:
-        """Go on from a state to the last bit; raises ValueError as `make_fusion`."""
+        """Go on from a state to the last bit; raises ValueError as `make_fusion`.
+
+        Home is where it was also if the rest does not fit.
+        """
+        if state.home is not None:
+            *place, since_us = state.home
+            self.vehicle.telemetry.set_home(Home(Place(*place), since_us))
         self._chain, self._estimator = make_fusion(self.settings, state)
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:

@@ -262,7 +262,7 @@ class FusedSample:
 
 @dataclass(frozen=True, slots=True)
 class FusionState:
-    """All that filters and estimator of one aircraft remember between two samples."""
+    """All that must be known of one aircraft between two samples to go on as if nothing was."""
 
     vehicle_id: int
     fits: str
@@ -270,6 +270,8 @@ class FusionState:
     sensing: bytes
     estimation: bytes
     """Written by the stages, and read by nobody else."""
+    home: tuple[float, float, float, int] | None = None
+    """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
 
 
 @dataclass(frozen=True, slots=True)

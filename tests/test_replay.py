@@ -215,6 +215,14 @@ def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
     ]
     assert repr(again) == repr(recorded)
     assert repr(fuse_again(settings, rows)) != repr(recorded)
+    assert state.home is not None
+    assert state.home[3] < rows[0].time_us
+    # With other settings, home is still where it was.
+    pipeline = Pipeline(PipelineSettings(make_settings("paper" if estimator == "eskf" else "eskf")))
+    assert not Replay(pipeline).restore(state)
+    for _ in Replay(pipeline).take(rows[0]):
+        pass
+    assert pipeline.aircraft[1].fusion_state.home == state.home
 
 
 @pytest.mark.parametrize("estimator", ["paper", "complementary"])
