@@ -12,7 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.recordings import free_name, sync_folder
+from gateway.edges.recordings import (
+    check_free,
+    free_name,
+    list_recordings,
+    rename_recording,
+    sync_folder,
+)
 from gateway.flightlog.session import part_stem
 
 RIGHTS: Final = 0o644
@@ -98,6 +104,20 @@ class PartFiles:
             if os.fstat(file).st_nlink == 0:
                 raise FileNotFoundError(errno.ENOENT, "removed while it was written")
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
+
+    def rename(self, to_name: str) -> None:
+        """Name the recording otherwise between two writes, also before the first.
+
+        Raises
+        ------
+        RecordingError
+            If the name is taken, or is none.
+        """
+        if self.session in {recording.name for recording in list_recordings(self._folder)}:
+            rename_recording(self._folder, self.session, to_name)
+        else:
+            check_free(self._folder, to_name)
+        self.session = to_name
 
     def close(self) -> None:
         """Close all files; what the disk holds stays whatever happens, but none stays empty."""

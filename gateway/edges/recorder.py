@@ -180,7 +180,10 @@ class Recorder:
             raise RecordingError("nothing was recorded since the gateway started")
         await self._restamped()
         old, files = self._session.name, self._files
-        await self._on_disk(_rename_open, self.folder, old, name, files)
+        if files is None:
+            await self._on_disk(rename_recording, self.folder, old, name)
+        else:
+            await self._on_disk(files.rename, name)
         self._session.name = name
         if self._part is not None:
             self._part.session = name
@@ -387,10 +390,3 @@ class Recorder:
     ) -> Result:
         assert not kwargs
         return await asyncio.get_running_loop().run_in_executor(self._worker, job, *args)
-
-
-def _rename_open(folder: Path, name: str, to_name: str, files: PartFiles | None) -> None:
-    """Rename between two writes, so that no file is begun under the old name afterwards."""
-    rename_recording(folder, name, to_name)
-    if files is not None:
-        files.session = to_name

@@ -74,6 +74,16 @@ def free_name(folder: Path, wanted: str) -> str:
     return next(name for name in names if name not in taken)
 
 
+def check_free(folder: Path, name: str) -> None:
+    """Check that a recording can be named so; raises RecordingError if not."""
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+    if free_name(folder, name) != name:
+        raise RecordingError(f"there is a recording {name!r} already in {folder}")
+
+
 def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
     """Give a recording another name, also while it is being written; never overwrites.
 
@@ -82,13 +92,8 @@ def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
     RecordingError
         If there is no such recording, the new name is taken, or it is no name.
     """
-    try:
-        check_name(to_name)
-    except ValueError as error:
-        raise RecordingError(str(error)) from error
     recording = find_recording(folder, name)
-    if free_name(folder, to_name) != to_name:
-        raise RecordingError(f"there is a recording {to_name!r} already in {folder}")
+    check_free(folder, to_name)
     for path in recording.files:
         _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
     sync_folder(folder)

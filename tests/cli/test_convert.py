@@ -258,6 +258,43 @@ def test_recover_a_table(table: Path, tmp_path: Path) -> None:
     assert len(rows) == len(lines) - 4 - 2
 
 
+def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
+    whole = table.read_bytes()
+    table.write_bytes(whole.replace(b"# header: {", b"# header: }", 1))
+    text = run("recover", table)
+    assert "head is lost" in text
+    header, rows = read_table(tmp_path / "flight.recovered.csv")
+    assert header.settings == {}
+    assert len(rows) == whole.count(b"\n") - 3
+    run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
+
+
+def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> None:
+    plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
+    run("convert", table, "-o", plain, "--from", "5", "--to", "10")
+    run("convert", table, "-o", fused, "--from", "5", "--to", "10", "--fuse")
+    assert fused.read_bytes() == plain.read_bytes()
+    header, rows = read_table(fused)
+    assert not header.cold_start
+    assert 0 < len(rows) < len(read_table(table)[1])
+
+
+def test_a_table_tells_what_it_was_fused_with(table: Path, tmp_path: Path) -> None:
+    config = tmp_path / "other.toml"
+    config.write_text('[estimation]\nestimator = "paper"\n')
+    again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
+    run("convert", table, "-o", again, "--fuse", "--settings", "current", "--config", config)
+    run("convert", again, "-o", twice, "--fuse")
+    assert twice.read_bytes() == again.read_bytes() != table.read_bytes()
+
+
+def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.csv"
+    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
+    text = run("convert", table, other, "-o", tmp_path / "x.csv", code=2)
+    assert "aircraft 1 and 2" in " ".join(text.split())
+
+
 def test_recover_of_a_sound_file_says_so(tlog: Path, tmp_path: Path) -> None:
     assert "nothing was damaged" in run("recover", tlog)
     assert (tmp_path / "flight.recovered.tlog").read_bytes() == tlog.read_bytes()
