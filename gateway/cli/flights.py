@@ -23,6 +23,7 @@ from gateway.flightlog.autopilot import AutopilotReader
 from gateway.flightlog.foreign import ColumnMap, ForeignReader
 from gateway.flightlog.mapshape import TrackPoint
 from gateway.flightlog.row import RowBuilder, TableRow
+from gateway.flightlog.stamps import JUMP_US
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table import TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord
@@ -174,10 +175,11 @@ def joined_rows(tables: list[Table]) -> Table:
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int:
-    follows = header.session == first.session or not header.cold_start
-    if follows or header.unix_us_at_zero is None or first.unix_us_at_zero is None:
+    """Tell how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
         return 0
-    return header.unix_us_at_zero - first.unix_us_at_zero
+    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
+    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
 
 
 def shifted(row: Line, shift_us: int) -> Iterator[Line]:
