@@ -46,9 +46,10 @@ from gateway.edges.flight_files import FileKind, kind_of
 from gateway.edges.fused_tlog import FusedTlog
 from gateway.edges.hub import Hub
 from gateway.edges.player import PlayerEdge, PlayerStatus, TlogFile
+from gateway.edges.recordings import parts_together
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, check_speed
-from gateway.flightlog.track import Track
+from gateway.flightlog.track import Source, Track
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.vehicle import Vehicle
@@ -96,7 +97,7 @@ def play(
     ] = None,
     system: Annotated[
         list[int] | None,
-        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each file."),
+        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each recording."),
     ] = None,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
@@ -107,7 +108,8 @@ def play(
     """Play recordings to the ground stations, several at once if you like.
 
     A tlog is sent byte for byte. A table is fused again while it plays, so the recorded flight and
-    its re-fused twin can fly on one map. `mavgate seek` and `mavgate player` steer it meanwhile.
+    its re-fused twin can fly on one map; the parts of a recording are one flight. `mavgate seek`
+    and `mavgate player` steer it meanwhile.
     """
     gateway = with_endpoints(read_settings(config), endpoint)
     with ExitStack() as opened, refusing():
@@ -117,8 +119,8 @@ def play(
         today = pipeline_settings(read_settings(config))
         wishes = Wishes(today, settings, position, read_column_map(columns))
         with progress_of(files) as advance:
-            sources = _open_all(files, replace(wishes, progress=advance), opened)
-            tracks = _lay_out(sources, system or [])
+            flights = _open_all(files, replace(wishes, progress=advance), opened)
+            tracks = _lay_out(flights, system or [])
             _prepare(tracks, course)
         try:
             asyncio.run(_serve(gateway, tracks, course, [file.name for file in files]))
@@ -301,25 +303,26 @@ async def _watch(daemon: PlayerDaemon) -> None:
     console.print(f"ended: {_place(daemon.edge.status())}")
 
 
-def _open_all(
-    files: Sequence[Path], wishes: Wishes, opened: ExitStack
-) -> list[TlogFile | FusedTlog]:
-    """Index the tlogs, and begin to fuse what is none."""
-    sources: list[TlogFile | FusedTlog] = []
-    for file in files:
-        source: TlogFile | FusedTlog
-        if kind_of(file) is FileKind.TLOG:
-            source = TlogFile(file, wishes.progress)
+def _open_all(files: Sequence[Path], wishes: Wishes, opened: ExitStack) -> list[list[Source]]:
+    """Index the tlogs, and begin to fuse what is none; the parts of a recording together."""
+    flights: list[list[Source]] = []
+    for parts in parts_together(files):
+        sources: list[TlogFile | FusedTlog] = []
+        if kind_of(parts[0]) is FileKind.TLOG:
+            for file in parts:
+                sources.append(TlogFile(file, wishes.progress))
+                opened.callback(sources[-1].close)
         else:
-            refusion = Refusion([file], wishes)
-            source = FusedTlog(refusion.frames(), end_of(file, wishes))
+            refusion = Refusion(parts, wishes)
+            sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], wishes)))
+            opened.callback(sources[-1].close)
             for remark in refusion.remarks:
-                Console(stderr=True, highlight=False).print(f"{file}: {remark}", markup=False)
-        opened.callback(source.close)
-        if not source.index.count:
-            raise FlightError(f"{file}: holds no MAVLink")
-        sources.append(source)
-    return sources
+                Console(stderr=True, highlight=False).print(f"{parts[0]}: {remark}", markup=False)
+        for source, file in zip(sources, parts, strict=False):
+            if not source.index.count:
+                raise FlightError(f"{file}: holds no MAVLink")
+        flights.append([*sources])
+    return flights
 
 
 def _prepare(tracks: Sequence[Track], course: Course) -> None:
@@ -330,16 +333,16 @@ def _prepare(tracks: Sequence[Track], course: Course) -> None:
             pass
 
 
-def _lay_out(sources: Sequence[TlogFile | FusedTlog], wished: Sequence[int]) -> list[Track]:
+def _lay_out(flights: Sequence[Sequence[Source]], wished: Sequence[int]) -> list[Track]:
     """Give each vehicle its own system id, and recordings of other days the same begin."""
-    begin_us, end_us = sources[0].index.first_us or 0, sources[0].last_us
+    begin_us, end_us = _span(flights[0])
     used: set[int] = set()
     tracks = []
-    for number, source in enumerate(sources):
-        index = source.index
-        meets = (index.first_us or 0) <= end_us and begin_us <= source.last_us
-        shift_us = 0 if meets else begin_us - (index.first_us or 0)
-        vehicles = sorted(s for s in index.systems if s < FIRST_GROUND_STATION)
+    for number, sources in enumerate(flights):
+        first_us, last_us = _span(sources)
+        shift_us = 0 if first_us <= end_us and begin_us <= last_us else begin_us - first_us
+        senders = {sender for source in sources for sender in source.index.systems}
+        vehicles = sorted(sender for sender in senders if sender < FIRST_GROUND_STATION)
         system_ids: dict[int, int] = {}
         for place, system_id in enumerate(vehicles):
             wanted = wished[number] if place == 0 and number < len(wished) else system_id
@@ -348,8 +351,16 @@ def _lay_out(sources: Sequence[TlogFile | FusedTlog], wished: Sequence[int]) -> 
             used.add(wanted)
             if wanted != system_id:
                 system_ids[system_id] = wanted
-        tracks.append(Track(source, shift_us=shift_us, system_ids=system_ids))
+        tracks += [Track(s, shift_us=shift_us, system_ids=system_ids) for s in sources]
     return tracks
+
+
+def _span(sources: Sequence[Source]) -> tuple[int, int]:
+    """Tell begin and end of a recording of several parts."""
+    return (
+        min(source.index.first_us or 0 for source in sources),
+        max(source.last_us for source in sources),
+    )
 
 
 def _speed(text: str) -> float:

@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -37,6 +38,25 @@ def part_of(path: Path) -> int:
     if match is None:
         raise ValueError(f"{path} is no part of a recording")
     return int(match["part"])
+
+
+def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
+    """Put the parts of a recording that follow one another together; all else stays alone."""
+    found: list[list[Path]] = []
+    newest: dict[tuple[Path, str, str], list[Path]] = {}
+    for path in paths:
+        match = _FILE_NAME.fullmatch(path.name)
+        if match is None:
+            found.append([path])
+            continue
+        series = (path.parent, match["name"], path.name[match.end("part") :])
+        before = newest.get(series)
+        if before is not None and part_of(before[-1]) < part_of(path):
+            before.append(path)
+        else:
+            newest[series] = [path]
+            found.append(newest[series])
+    return found
 
 
 def list_recordings(folder: Path) -> list[Recording]:

@@ -11,6 +11,7 @@ from gateway.edges.recordings import (
     find_recording,
     free_name,
     list_recordings,
+    parts_together,
     rename_recording,
 )
 
@@ -57,6 +58,19 @@ def test_delete_takes_its_own_files_only(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["a_01.tlog", "note.txt"]
     with pytest.raises(RecordingError, match="no recording 'b'"):
         delete_recording(folder, "b")
+
+
+def test_parts_that_follow_one_another_are_together(tmp_path: Path) -> None:
+    names = ["a_01.tlog", "a_01_v1.csv", "a_02.tlog", "x.tlog", "a_02_v1.csv", "a_02_v2.csv"]
+    found = parts_together([tmp_path / name for name in [*names, "x.tlog", "a_02.tlog"]])
+    assert [[path.name for path in parts] for parts in found] == [
+        ["a_01.tlog", "a_02.tlog"],
+        ["a_01_v1.csv", "a_02_v1.csv"],
+        ["x.tlog"],
+        ["a_02_v2.csv"],
+        ["x.tlog"],
+        ["a_02.tlog"],
+    ]
 
 
 def test_a_free_name_has_a_number_where_needed(folder: Path) -> None:
