@@ -252,12 +252,15 @@ class Recorder:
         )
 
     async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
         while True:
+            # A slow disk takes its time from the pause: what waits for it is not to grow by both.
+            due_s = loop.time() + self._settings.flush_s
             self._wake.clear()
             await self._turn()
             self._turned.set()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), self._settings.flush_s)
+                await asyncio.wait_for(self._wake.wait(), max(due_s - loop.time(), 0.0))
 
     async def _turn(self) -> None:
         """Write what was gathered, then let the session decide."""
