@@ -11,6 +11,7 @@ from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row
 from gateway.estimation.record import (
     FloatArray,
     IntArray,
+    Packed,
     copy_record,
     new_record,
     pack_record,
@@ -120,7 +121,7 @@ class KernelEstimator(Generic[State, Gains]):
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
-        kind = tuple[tuple[str, bytes], EarthPlace | None]
+        kind = tuple[Packed, EarthPlace | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
         self._state = unpack_record(self._kernels.declaration, packed)
 

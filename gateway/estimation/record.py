@@ -92,31 +92,24 @@ def copy_record(record: Declared) -> Declared:
     return cast(Declared, cast(np.void, record).copy())
 
 
-def pack_record(record: object) -> tuple[str, bytes]:
-    """Write a record as its layout and its bytes.
+Packed = tuple[int, bytes]
+"""A mark of the layout, and the bytes of a record."""
 
-    Parameters
-    ----------
-    record : record
-        Of any declaration.
 
-    Returns
-    -------
-    tuple of str and bytes
-        For `unpack_record`.
-    """
+def pack_record(record: object) -> Packed:
+    """Write a record of any declaration as bytes."""
     void = cast(np.void, record)
-    return (repr(void.dtype.descr), zlib.compress(void.tobytes(), 1))
+    return (_mark(void.dtype), void.tobytes())
 
 
-def unpack_record(declaration: type[Declared], packed: tuple[str, bytes]) -> Declared:
+def unpack_record(declaration: type[Declared], packed: Packed) -> Declared:
     """Read a record back.
 
     Parameters
     ----------
     declaration : type
         See `layout`.
-    packed : tuple of str and bytes
+    packed : Packed
         From `pack_record`.
 
     Returns
@@ -129,14 +122,14 @@ def unpack_record(declaration: type[Declared], packed: tuple[str, bytes]) -> Dec
     ValueError
         If it was written from another declaration, or is damaged.
     """
-    wanted, (descr, data) = layout(declaration), packed
-    if descr != repr(wanted.descr):
+    wanted, (mark, data) = layout(declaration), packed
+    if mark != _mark(wanted) or len(data) != wanted.itemsize:
         raise ValueError("a state of another layout")
-    try:
-        plain = zlib.decompress(data)
-    except zlib.error as error:
-        raise ValueError(f"a damaged state: {error}") from error
-    return cast(Declared, np.frombuffer(plain, wanted, 1)[0].copy())
+    return cast(Declared, np.frombuffer(data, wanted, 1)[0].copy())
+
+
+def _mark(wanted: np.dtype[Any]) -> int:
+    return zlib.crc32(repr(wanted.descr).encode())
 
 
 @compiled
