@@ -1,6 +1,7 @@
 """`mavgate convert`: recordings into one another, into tables and maps."""
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from gateway.cli import flights
 from gateway.cli.errors import refuse
-from gateway.cli.flights import Line, Table, Wishes, open_rows
+from gateway.cli.flights import FlightError, Line, Table, Wishes, open_rows
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -129,7 +130,11 @@ def _tlog_bytes(records: Iterable[TlogRecord]) -> Iterator[bytes]:
 
 def _map_shape(out: Path, points: Iterable[TrackPoint]) -> Iterator[bytes]:
     shape = to_kml if out.suffix == ".kml" else to_gpx
-    return (piece.encode() for piece in shape(out.stem, thin_out(points)))
+    points = iter(points)
+    first = next(points, None)
+    if first is None:
+        raise FlightError(f"{out}: nothing to draw, for the flight tells no position")
+    return (piece.encode() for piece in shape(out.stem, thin_out(chain([first], points))))
 
 
 def _table_text(table: Table) -> Iterator[bytes]:

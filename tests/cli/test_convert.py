@@ -148,6 +148,12 @@ def test_a_track_for_a_map(
     assert tags.count("coord" if ending == "kml" else "trkpt") > 50
 
 
+def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:
+    text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
+    assert "tells no position" in " ".join(text.split())
+    assert not (tmp_path / "out.kml").exists()
+
+
 def test_an_autopilots_tlog_becomes_a_table_that_is_fused(tmp_path: Path) -> None:
     mav = mavlink.MAVLink(None, 4, 1)
     records = []
