@@ -5,7 +5,6 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -33,8 +32,6 @@ from gateway.cli.refusion import SETTLES
 from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.estimation.columns import (
-    GPS_COLUMNS,
-    IMU_COLUMNS,
     NAV_ALT,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
@@ -44,11 +41,8 @@ from gateway.estimation.columns import (
     NAV_QUAT,
     NAV_VEL,
     NAV_VEL_STD,
-    ImuRow,
-    imu_row,
 )
 from gateway.estimation.interface import Estimator
-from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName
 from gateway.pipeline import AircraftSettings, make_fusion
@@ -149,7 +143,7 @@ def _begin(table: Table, aircraft: AircraftSettings) -> tuple[SensorChain, Estim
 def fuse(
     records: Iterable[Record], chain: SensorChain, estimator: Estimator
 ) -> tuple[IntArray, FloatArray]:
-    """Run an estimator over records in their order.
+    """Run an estimator over records in the order in which they came, as live.
 
     Parameters
     ----------
@@ -167,50 +161,6 @@ def fuse(
     states : ndarray, shape (n, NAV_COLUMNS)
         See `gateway.estimation.columns`.
     """
-    if isinstance(estimator, KernelEstimator):
-        log = _collect(records, chain, estimator)
-        return log.imu_time_us, estimator.run(log)
-    return _one_by_one(records, chain, estimator)
-
-
-@dataclass(slots=True)
-class _Columns:
-    imu_us: list[int] = field(default_factory=list)
-    imu: list[ImuRow] = field(default_factory=list)
-    baro_us: list[int] = field(default_factory=list)
-    baro: list[float] = field(default_factory=list)
-    gps_us: list[int] = field(default_factory=list)
-    gps: list[tuple[float, ...]] = field(default_factory=list)
-
-
-def _collect(
-    records: Iterable[Record], chain: SensorChain, estimator: KernelEstimator[object, object]
-) -> SampleLog:
-    c = _Columns()
-    for record in records:
-        match record:
-            case BaroRaw():
-                c.baro_us.append(record.time_us)
-                c.baro.append(chain.baro(record).alt_pressure_m)
-            case GpsFix():
-                c.gps_us.append(record.time_us)
-                c.gps.append(estimator.fix_row(record))
-            case _:
-                c.imu_us.append(record.time_us)
-                c.imu.append(imu_row(_sample(chain, record)))
-    return SampleLog(
-        imu_time_us=np.array(c.imu_us, np.int64),
-        imu=np.array(c.imu, float).reshape(-1, IMU_COLUMNS),
-        baro_time_us=np.array(c.baro_us, np.int64),
-        baro_alt_m=np.array(c.baro, float),
-        gps_time_us=np.array(c.gps_us, np.int64),
-        gps=np.array(c.gps, float).reshape(-1, GPS_COLUMNS),
-    )
-
-
-def _one_by_one(
-    records: Iterable[Record], chain: SensorChain, estimator: Estimator
-) -> tuple[IntArray, FloatArray]:
     times, rows = [], []
     for record in records:
         match record:
