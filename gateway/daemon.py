@@ -85,7 +85,12 @@ class Daemon:
             on_trouble=self._on_trouble,
         )
         self._recorder = Recorder(
-            settings.recording, self.now_us, unix_time_us, self._table_head, self._tell
+            settings.recording,
+            self.now_us,
+            unix_time_us,
+            self._table_head,
+            self._tell,
+            lambda vehicle_id: self._pipeline.aircraft[vehicle_id].fusion_state,
         )
         self._heard: bytes | None = None
         self._control = ControlServer(socket_path("run"))

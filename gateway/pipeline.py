@@ -10,18 +10,21 @@ order. An aircraft comes into being with its first payload. Live, demo and playb
 who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
+import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Final
 
 import msgspec
 
+from gateway import __version__
 from gateway.estimation.interface import Estimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import (
     BaroRaw,
     ClientInterval,
     FusedSample,
+    FusionState,
     GpsFix,
     ImuCalibrated,
     ImuRaw,
@@ -52,7 +55,7 @@ from gateway.vehicle.actions import (
     SettingsChange,
 )
 from gateway.vehicle.events import Told
-from gateway.vehicle.home import Place
+from gateway.vehicle.home import Home, Place
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
@@ -117,9 +120,30 @@ class Aircraft:
             sections=sections,
             unix_us_at_zero=common.unix_us_at_zero,
         )
-        self._chain = SensorChain(settings.sensing, settings.calibration)
-        self._estimator: Estimator = make_estimator(settings.estimation)
+        self._chain, self._estimator = make_fusion(settings)
         self._correct = common.correct
+
+    @property
+    def fusion_state(self) -> FusionState:
+        """All that filters and estimator remember now, and where home is."""
+        home = self.vehicle.telemetry.home
+        return FusionState(
+            vehicle_id=self.vehicle_id,
+            fits=_fits(self.settings),
+            sensing=self._chain.snapshot(),
+            estimation=self._estimator.snapshot(),
+            home=None if home is None else (*astuple(home.place), home.set_time_us),
+        )
+
+    def restore(self, state: FusionState) -> None:
+        """Go on from a state to the last bit; raises ValueError as `make_fusion`.
+
+        Home is where it was also if the rest does not fit.
+        """
+        if state.home is not None:
+            *place, since_us = state.home
+            self.vehicle.telemetry.set_home(Home(Place(*place), since_us))
+        self._chain, self._estimator = make_fusion(self.settings, state)
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Let one raw record run through the stages."""
@@ -208,6 +232,44 @@ class Aircraft:
         return [SettingsChanged(self.vehicle_id)]
 
 
+def make_fusion(
+    settings: AircraftSettings, state: FusionState | None = None
+) -> tuple[SensorChain, Estimator]:
+    """Build the two stages that make navigation states of raw records.
+
+    Parameters
+    ----------
+    settings : AircraftSettings
+        Of the aircraft.
+    state : FusionState, optional
+        To go on from; else they begin afresh.
+
+    Returns
+    -------
+    chain : SensorChain
+    estimator : Estimator
+
+    Raises
+    ------
+    ValueError
+        If the state is of another version or other settings, or damaged.
+    """
+    chain = SensorChain(settings.sensing, settings.calibration)
+    estimator = make_estimator(settings.estimation)
+    if state is not None:
+        if state.fits != _fits(settings):
+            raise ValueError("it is of another version or other settings")
+        chain.restore(state.sensing)
+        estimator.restore(state.estimation)
+    return chain, estimator
+
+
+def _fits(settings: AircraftSettings) -> str:
+    """Tell version and settings apart from all others, in a few letters."""
+    fused_with = (settings.sensing, settings.estimation, settings.calibration)
+    return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
+
+
 def _succeed(old: Estimator, new: Estimator) -> Estimator:
     """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
     state = getattr(old, "state", None)
@@ -244,16 +306,22 @@ class Pipeline:
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
-        vehicle_id = record.node.vehicle_id
+        return self._aircraft_of(record.node.vehicle_id).take(record, now_us)
+
+    def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
             aircraft = self.aircraft[vehicle_id] = Aircraft(vehicle_id, self._settings)
-        return aircraft.take(record, now_us)
+        return aircraft
 
     def change(self, vehicle_id: int, settings: AircraftSettings) -> None:
         """Let an aircraft go on with other settings, as it did when it was recorded."""
         if vehicle_id in self.aircraft:
             self.aircraft[vehicle_id].change(settings)
+
+    def restore(self, state: FusionState) -> None:
+        """Let an aircraft's fusion go on from a state; raises ValueError as `make_fusion`."""
+        self._aircraft_of(state.vehicle_id).restore(state)
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""

@@ -261,6 +261,20 @@ class FusedSample:
 
 
 @dataclass(frozen=True, slots=True)
+class FusionState:
+    """All that must be known of one aircraft between two samples to go on as if nothing was."""
+
+    vehicle_id: int
+    fits: str
+    """Program and settings that it can be given back to; compared, never read."""
+    sensing: bytes
+    estimation: bytes
+    """Written by the stages, and read by nobody else."""
+    home: tuple[float, float, float, int] | None = None
+    """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
+
+
+@dataclass(frozen=True, slots=True)
 class NodeLink:
     """What the gateway counted of one node since it started."""
 

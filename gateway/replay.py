@@ -5,15 +5,23 @@ from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from gateway import __version__
 from gateway.flightlog.row import TableRow
 from gateway.flightlog.table import TableHeader
 from gateway.pipeline import Action, AircraftSettings, Pipeline
-from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuRaw, NavState
+from gateway.records import (
+    BaroRaw,
+    FusionState,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuRaw,
+    NavState,
+)
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
+HALF_TURN_DEGE7: Final = 1_800_000_000
 LONGEST_SILENCE_US: Final = 1_000_000
 """In a longer one the pipeline's timers are not run through one by one."""
 
@@ -34,12 +42,15 @@ class Replay:
         self._follow = follow
         self._now_us: int | None = None
 
-    def take(self, row: TableRow | TableHeader) -> Iterator[tuple[int, Action]]:
-        """Take one row, or a change of settings.
+        self.refused: list[str] = []
+        """Why states of the file were not gone on from: it then settles like a cold start."""
+
+    def take(self, row: TableRow | TableHeader | FusionState) -> Iterator[tuple[int, Action]]:
+        """Take one row, a change of settings, or a state to go on from.
 
         Parameters
         ----------
-        row : TableRow or TableHeader
+        row : TableRow, TableHeader or FusionState
             The next of the file.
 
         Yields
@@ -51,11 +62,23 @@ class Replay:
             if self._follow:
                 self._pipeline.change(row.vehicle_id, settings_of(row))
             return
+        if isinstance(row, FusionState):
+            self.restore(row)
+            return
         for record in records_of(row):
             yield from self._wait(record.time_us)
             now_us = self._now_us if self._now_us is not None else record.time_us
             for action in self._pipeline.take(record, now_us):
                 yield now_us, action
+
+    def restore(self, state: FusionState) -> bool:
+        """Go on from a state of the file, if it fits; tells whether it does."""
+        try:
+            self._pipeline.restore(state)
+        except ValueError as error:
+            self.refused.append(str(error))
+            return False
+        return True
 
     def _wait(self, until_us: int) -> Iterator[tuple[int, Action]]:
         """Run what is due by time before the next record; the clock never falls."""
@@ -131,33 +154,36 @@ class InterpolatedPosition:
     Parameters
     ----------
     fixes : iterable of GpsFix
-        Of one aircraft, the whole flight.
+        Of one aircraft, in the order of their arrival; taken only as far as the states go.
     latency_s : float
         How much earlier than its arrival a fix was valid.
     """
 
     def __init__(self, fixes: Iterable[GpsFix], latency_s: float) -> None:
-        usable = [
-            (fix.time_us, fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_m)
+        self._latency_us = round(latency_s * US_PER_S)
+        self._fixes = (
+            fix
             for fix in fixes
             if fix.fix_ok and fix.fix_type in (GpsFixType.FIX_3D, GpsFixType.FIX_2D)
-        ]
-        track = np.array(sorted(usable), float).reshape(-1, 4)
-        self._time_us = track[:, 0] - latency_s * US_PER_S
-        self._lat_deg = track[:, 1] * DEG_PER_DEGE7
-        # Unwrapped, so that a flight over the date line does not go round the earth.
-        self._lon_deg = np.unwrap(track[:, 2] * DEG_PER_DEGE7, period=360.0)
-        self._alt_m = track[:, 3]
+        )
+        self._before: GpsFix | None = None
+        self._after = next(self._fixes, None)
 
     def __call__(self, state: NavState) -> NavState:
         """Put the interpolated position into a state; before and after the fixes it stays."""
-        t = state.time_us
-        if not len(self._time_us) or not self._time_us[0] <= t <= self._time_us[-1]:
+        arrival_us = state.time_us + self._latency_us
+        while self._after is not None and self._after.time_us < arrival_us:
+            self._before, self._after = self._after, next(self._fixes, None)
+        a, b = self._before or self._after, self._after
+        if a is None or b is None or arrival_us < a.time_us:
             return state
-        lon_deg = float(np.interp(t, self._time_us, self._lon_deg))
+        way = (arrival_us - a.time_us) / max(b.time_us - a.time_us, 1)
+        # The short way round, so that a flight over the date line does not go round the earth.
+        east_dege7 = (b.lon_dege7 - a.lon_dege7 + HALF_TURN_DEGE7) % (2 * HALF_TURN_DEGE7)
+        lon_dege7 = a.lon_dege7 + way * (east_dege7 - HALF_TURN_DEGE7)
         return replace(
             state,
-            lat_deg=float(np.interp(t, self._time_us, self._lat_deg)),
-            lon_deg=(lon_deg + 180.0) % 360.0 - 180.0,
-            alt_amsl_m=float(np.interp(t, self._time_us, self._alt_m)),
+            lat_deg=(a.lat_dege7 + way * (b.lat_dege7 - a.lat_dege7)) * DEG_PER_DEGE7,
+            lon_deg=(lon_dege7 * DEG_PER_DEGE7 + 180.0) % 360.0 - 180.0,
+            alt_amsl_m=a.alt_amsl_m + way * (b.alt_amsl_m - a.alt_amsl_m),
         )

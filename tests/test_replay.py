@@ -9,11 +9,18 @@ import pytest
 
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
-from gateway.flightlog.table import TableHeader, TableReader, encode_head, encode_header
+from gateway.flightlog.table import (
+    TableHeader,
+    TableReader,
+    encode_head,
+    encode_header,
+    encode_state,
+)
 from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
 from gateway.records import (
     BaroRaw,
     FusedSample,
+    FusionState,
     GpsFix,
     GpsFixType,
     ImuFlags,
@@ -165,6 +172,82 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
         if isinstance(action, FusedSample)
     ]
     assert repr(again) == repr(states)
+
+
+def fly_from_the_middle(
+    estimator: str, rng: np.random.Generator
+) -> tuple[AircraftSettings, FusionState, list[TableRow]]:
+    """Fly, and keep only what was remembered in the middle and the rows behind it."""
+    settings = make_settings(estimator)
+    pipeline, builder = Pipeline(PipelineSettings(settings)), RowBuilder()
+    records = make_flight(rng, 30)
+    state: FusionState | None = None
+    rows: list[TableRow] = []
+    for number, record in enumerate(records):
+        if number == len(records) // 2:
+            state = pipeline.aircraft[1].fusion_state
+            builder.flush()
+            rows.clear()
+        for action in pipeline.take(record, record.time_us):
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                rows += builder.add(action)
+    assert state is not None
+    text = encode_head(header_for(settings, 1)) + encode_state(state)
+    text += "".join(map(row_to_line, rows))
+    found, *again = TableReader().feed(text.encode(), final=True)
+    assert isinstance(found, FusionState)
+    assert repr(again) == repr(rows)
+    return settings, found, rows
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
+    rng: np.random.Generator, estimator: str
+) -> None:
+    settings, state, rows = fly_from_the_middle(estimator, rng)
+    recorded = [row.state for row in rows if row.state]
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    again = [
+        action.state
+        for line in [state, *rows]
+        for _, action in replay.take(line)
+        if isinstance(action, FusedSample)
+    ]
+    assert repr(again) == repr(recorded)
+    assert repr(fuse_again(settings, rows)) != repr(recorded)
+    assert state.home is not None
+    assert state.home[3] < rows[0].time_us
+    # With other settings, home is still where it was.
+    pipeline = Pipeline(PipelineSettings(make_settings("paper" if estimator == "eskf" else "eskf")))
+    assert not Replay(pipeline).restore(state)
+    for _ in Replay(pipeline).take(rows[0]):
+        pass
+    assert pipeline.aircraft[1].fusion_state.home == state.home
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary"])
+def test_a_state_that_does_not_fit_is_told_and_left_alone(
+    rng: np.random.Generator, estimator: str
+) -> None:
+    settings, state, rows = fly_from_the_middle(estimator, rng)
+    other = msgspec.structs.replace(settings, sensing=SensingSettings(accel_cutoff_hz=7.4))
+    for settings_now, found, reason in (
+        (other, state, "other settings"),
+        (settings, replace(state, fits=f"0.0.1 {state.fits.split()[1]}"), "another version"),
+        (settings, replace(state, sensing=b"\x01"), "Expected"),
+        (settings, replace(state, estimation=state.estimation[:-40]), "truncated"),
+    ):
+        replay = Replay(Pipeline(PipelineSettings(settings_now)))
+        assert not list(replay.take(found))
+        (refused,) = replay.refused
+        assert reason in refused
+        states = [
+            action.state
+            for row in rows[:50]
+            for _, action in replay.take(row)
+            if isinstance(action, FusedSample)
+        ]
+        assert repr(states) == repr(fuse_again(settings_now, rows[:50]))
 
 
 def test_other_settings_give_another_flight(rng: np.random.Generator) -> None:

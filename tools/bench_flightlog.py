@@ -33,6 +33,7 @@ from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
 from gateway.flightlog.session import RecordingSettings
 from gateway.flightlog.table import TableHeader
 from gateway.flightlog.tlog import encode_record
+from gateway.flightlog.track import Track
 from gateway.records import (
     FusedSample,
     ImuFlags,
@@ -98,7 +99,7 @@ def measure_index(path: Path, count: int) -> dict[str, float]:
     open_s, file = timed(lambda: TlogFile(path))
     assert file.index.count == count
     grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
-    track = file.track()
+    track = Track(file)
     places = np.random.default_rng(1).integers(0, count, SEEKS).tolist()
 
     def seek_all() -> None:
@@ -207,7 +208,7 @@ async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
     hub.start()
     file = TlogFile(path)
     ended = asyncio.Event()
-    player = Player([file.track()], clock(), speed=AS_FAST_AS_POSSIBLE)
+    player = Player([Track(file)], clock(), speed=AS_FAST_AS_POSSIBLE)
 
     def emit(frames: Iterable[bytes]) -> None:
         for frame in frames:

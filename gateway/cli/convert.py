@@ -1,15 +1,17 @@
 """`mavgate convert`: recordings into one another, into tables and maps."""
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final
 
+import msgspec
 import typer
 from rich.console import Console
 
 from gateway.cli import flights
 from gateway.cli.errors import refuse
-from gateway.cli.flights import Line, Table, Wishes
+from gateway.cli.flights import FlightError, Line, Table, Wishes, open_rows
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -24,14 +26,15 @@ from gateway.cli.recording_files import (
     read_moment,
     refusing,
 )
-from gateway.cli.run import ConfigOption, read_aircraft, read_settings
+from gateway.cli.refusion import Refusion
+from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.row import row_to_line
-from gateway.flightlog.table import TableHeader, encode_head, encode_header
+from gateway.flightlog.row import TableRow, row_to_line
+from gateway.flightlog.table import TableHeader, encode_head, encode_header, encode_state
 from gateway.flightlog.tlog import TlogRecord, encode_record
-from gateway.pipeline import PipelineSettings
+from gateway.records import FusionState
 
 OUTPUTS: Final = (".tlog", ".csv", ".kml", ".gpx")
 LINES: Final = 1000
@@ -71,9 +74,10 @@ def convert(
     """
     if out.suffix not in OUTPUTS:
         refuse(f"{out}: the output must end in {', '.join(OUTPUTS)}")
+    refusion: Refusion | None = None
     with progress_of(files) as advance, refusing():
         wishes = Wishes(
-            current=pipeline_settings(config),
+            current=pipeline_settings(read_settings(config)),
             choice=settings,
             position=position,
             columns=read_column_map(columns),
@@ -81,59 +85,69 @@ def convert(
             progress=advance,
         )
         limits = (read_moment(begin), read_moment(end))
-        if out.suffix != ".csv" and all(kind_of(file) is FileKind.TLOG for file in files):
+        kinds = {kind_of(file) for file in files}
+        if out.suffix != ".csv" and kinds == {FileKind.TLOG}:
             pieces = _from_tlogs(files, out, wishes, limits)
+        elif kinds == {FileKind.TABLE} and not fuse and out.suffix != ".tlog":
+            pieces = _as_recorded(files, out, wishes, limits)
         else:
-            pieces = _from_tables(files, out, wishes, limits, fuse_again=fuse)
+            refusion = Refusion(files, wishes)
+            pieces = _fused_again(refusion, out, limits)
         size = write_new(out, pieces, overwrite=force)
+    for remark in refusion.remarks if refusion else ():
+        Console(stderr=True, highlight=False).print(remark)
     Console(highlight=False).print(f"{out}: {size / 1e6:.3f} MB")
-
-
-def pipeline_settings(config: Path | None) -> PipelineSettings:
-    """Read the settings of today."""
-    settings = read_settings(config)
-    return PipelineSettings(settings.default_aircraft, read_aircraft(settings))
 
 
 def _from_tlogs(files: list[Path], out: Path, wishes: Wishes, limits: Limits) -> Iterator[bytes]:
     records = _within(flights.recorded_frames(files, wishes.progress), limits)
     if out.suffix == ".tlog":
-        return (encode_record(record.time_us, record.frame) for record in records)
+        return _tlog_bytes(records)
     return _map_shape(out, flights.points_of_frames(records, wishes.system_id))
 
 
-def _from_tables(
-    files: list[Path], out: Path, wishes: Wishes, limits: Limits, *, fuse_again: bool
-) -> Iterator[bytes]:
-    table = flights.joined_rows([flights.open_rows(file, wishes) for file in files])
-    table = Table(table.header, _rows_within(table, limits))
-    recorded = all(kind_of(file) is FileKind.TABLE for file in files)
-    if fuse_again or not recorded or out.suffix == ".tlog":
-        interpolated = wishes.position == "interpolated"
-        fixes = [fix for file in files for fix in flights.fixes_of(file, wishes)]
-        replay = flights.fuse(table, wishes, fixes if interpolated else ())
-        if out.suffix == ".tlog":
-            frames = flights.fused_frames(table, replay)
-            return (encode_record(record.time_us, record.frame) for record in frames)
-        table = Table(table.header, flights.fused_rows(table, replay))
+def _as_recorded(files: list[Path], out: Path, wishes: Wishes, limits: Limits) -> Iterator[bytes]:
+    return _from_rows(flights.joined_rows([open_rows(file, wishes) for file in files]), out, limits)
+
+
+def _fused_again(refusion: Refusion, out: Path, limits: Limits) -> Iterator[bytes]:
+    """Fuse from the begin, so that what is cut out has settled as it had in flight."""
+    if out.suffix == ".tlog":
+        return _tlog_bytes(_within(refusion.frames(), limits))
+    return _from_rows(refusion.table(), out, limits)
+
+
+def _from_rows(table: Table, out: Path, limits: Limits) -> Iterator[bytes]:
+    table = _trimmed(table, limits)
     if out.suffix == ".csv":
         return _table_text(table)
     return _map_shape(out, flights.points_of_rows(table))
 
 
+def _tlog_bytes(records: Iterable[TlogRecord]) -> Iterator[bytes]:
+    return (encode_record(record.time_us, record.frame) for record in records)
+
+
 def _map_shape(out: Path, points: Iterable[TrackPoint]) -> Iterator[bytes]:
     shape = to_kml if out.suffix == ".kml" else to_gpx
-    return (piece.encode() for piece in shape(out.stem, thin_out(points)))
+    points = iter(points)
+    first = next(points, None)
+    if first is None:
+        raise FlightError(f"{out}: nothing to draw, for the flight tells no position")
+    return (piece.encode() for piece in shape(out.stem, thin_out(chain([first], points))))
 
 
 def _table_text(table: Table) -> Iterator[bytes]:
     yield encode_head(table.header).encode()
     lines: list[str] = []
     for row in table.rows:
-        if isinstance(row, TableHeader):
-            lines.append(encode_header(row))
-        else:
-            lines.append(row_to_line(row))
+        match row:
+            case TableRow():
+                lines.append(row_to_line(row))
+            case TableHeader():
+                lines.append(encode_header(row))
+            case FusionState():
+                lines.append(encode_state(row))
         if len(lines) == LINES:
             yield "".join(lines).encode()
             lines.clear()
@@ -151,17 +165,23 @@ def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecor
             yield record
 
 
-def _rows_within(table: Table, limits: Limits) -> Iterator[Line]:
+def _trimmed(table: Table, limits: Limits) -> Table:
     begin, end = limits
     zero_us = table.header.unix_us_at_zero or 0
-    first_us: int | None = None
-    for row in table.rows:
-        if isinstance(row, TableHeader):
-            yield row
-            continue
-        time_us = zero_us + row.time_us
-        first_us = time_us if first_us is None else first_us
-        if end is not None and time_us > place_in(end, first_us):
-            return
-        if begin is None or time_us >= place_in(begin, first_us):
-            yield row
+
+    def rows() -> Iterator[Line]:
+        first_us: int | None = None
+        begun = begin is None
+        for row in table.rows:
+            if isinstance(row, TableRow):
+                time_us = zero_us + row.time_us
+                first_us = time_us if first_us is None else first_us
+                if end is not None and time_us > place_in(end, first_us):
+                    return
+                begun = begun or (begin is not None and time_us >= place_in(begin, first_us))
+            # What was changed before the begin still holds, but a state from there does not.
+            if begun or isinstance(row, TableHeader):
+                yield row
+
+    cold_start = table.header.cold_start and begin is None
+    return Table(msgspec.structs.replace(table.header, cold_start=cold_start), rows())

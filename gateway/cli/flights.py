@@ -4,6 +4,8 @@ import heapq
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
@@ -21,27 +23,28 @@ from gateway.flightlog.autopilot import AutopilotReader
 from gateway.flightlog.foreign import ColumnMap, ForeignReader
 from gateway.flightlog.mapshape import TrackPoint
 from gateway.flightlog.row import RowBuilder, TableRow
-from gateway.flightlog.stamps import Stamper
+from gateway.flightlog.stamps import JUMP_US
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table import TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord
-from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
+from gateway.pipeline import AircraftSettings, PipelineSettings
 from gateway.records import (
     BaroRaw,
-    FusedSample,
+    FusionState,
     GpsFix,
     ImuCalibrated,
     ImuRaw,
     NavFlags,
     NavState,
-    Outgoing,
 )
-from gateway.replay import InterpolatedPosition, Replay, header_for, settings_of
+from gateway.replay import header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import DEG_PER_DEGE7, M_PER_MM
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 GLOBAL_POSITION_INT_ID: Final = 33
+TRACKER_LOG: Final = files("gateway.cli") / "tracker-log.toml"
+"""The map for logs whose columns are time_s, ax, gx and so on."""
 _POSITION: Final = struct.Struct("<Iiii")
 
 Position = Literal["causal", "interpolated"]
@@ -51,7 +54,7 @@ SettingsChoice = Literal["recorded", "current"]
 Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 
 
-Line = TableRow | TableHeader
+Line = TableRow | TableHeader | FusionState
 
 
 class FlightError(Exception):
@@ -68,7 +71,7 @@ class Wishes:
     """Whose settings a table is fused with; those of today where it has none of its own."""
     position: Position = "causal"
     columns: ColumnMap | None = None
-    """For a CSV that is not ours."""
+    """For a CSV that is not ours; by default those of a tracker log."""
     system_id: int | None = None
     """The vehicle of a tlog to take."""
     progress: Progress | None = None
@@ -80,7 +83,8 @@ class Table:
 
     header: TableHeader
     rows: Iterator[Line]
-    """A header among them tells of settings that were changed in flight."""
+    """A header among them tells of settings that were changed in flight, a state of what the
+    fusion remembered there."""
 
     @property
     def plain_rows(self) -> Iterator[TableRow]:
@@ -119,17 +123,6 @@ def open_rows(path: Path, wishes: Wishes) -> Table:
             return _open_autopilot(path, wishes)
 
 
-def fuse(table: Table, wishes: Wishes, fixes: Iterable[GpsFix] = ()) -> Replay:
-    """Make a replay with the settings that the wishes name, for one table."""
-    aircraft, correct = aircraft_of(table, wishes), None
-    if wishes.position == "interpolated":
-        latency_s = aircraft.estimation.reference.gps_latency_s
-        correct = InterpolatedPosition(fixes, latency_s)
-    zero_us = table.header.unix_us_at_zero or 0
-    pipeline = Pipeline(PipelineSettings(aircraft, {}, zero_us, correct))
-    return Replay(pipeline, follow=wishes.choice == "recorded")
-
-
 def aircraft_of(table: Table, wishes: Wishes) -> AircraftSettings:
     """Choose the settings for one table: its own, or those of today."""
     if wishes.choice == "current" or not table.header.settings:
@@ -143,34 +136,6 @@ def aircraft_of(table: Table, wishes: Wishes) -> AircraftSettings:
         ) from error
 
 
-def fixes_of(path: Path, wishes: Wishes) -> list[GpsFix]:
-    """List all fixes of a flight; a few per second, so hours of them fit the memory."""
-    quiet = replace(wishes, progress=None)
-    return [row.gps for row in open_rows(path, quiet).plain_rows if row.gps is not None]
-
-
-def fused_rows(table: Table, replay: Replay) -> Iterator[Line]:
-    """Fuse a table and yield its rows with the new states."""
-    builder = RowBuilder()
-    for row in table.rows:
-        if isinstance(row, TableHeader):
-            yield from builder.flush()
-            yield row
-        for _, action in replay.take(row):
-            if isinstance(action, FusedSample | BaroRaw | GpsFix):
-                yield from builder.add(action)
-    yield from builder.flush()
-
-
-def fused_frames(table: Table, replay: Replay) -> Iterator[TlogRecord]:
-    """Fuse a table and yield the MAVLink that the gateway would have sent."""
-    stamper = Stamper(table.header.unix_us_at_zero or 0)
-    for row in table.rows:
-        for now_us, action in replay.take(row):
-            if isinstance(action, Outgoing) and action.client_id is None:
-                yield TlogRecord(stamper.stamp(now_us), action.frame)
-
-
 def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterator[TlogRecord]:
     """Yield the records of tlogs, merged by time."""
     streams = [
@@ -181,37 +146,55 @@ def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterato
 
 
 def joined_rows(tables: list[Table]) -> Table:
-    """Put tables behind one another on the clock of the first.
+    """Put tables of one aircraft behind one another on the clock of the first.
 
     Parts of one recording share a clock; other recordings are put in their place by civil time.
+
+    Raises
+    ------
+    FlightError
+        If they are of several aircraft.
     """
+    vehicles = sorted({table.header.vehicle_id for table in tables})
+    if len(vehicles) > 1:
+        listed = " and ".join(map(str, vehicles))
+        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
     first = tables[0].header
 
     def rows() -> Iterator[Line]:
+        known = first
         for table in tables:
             header = table.header
-            follows = header.session == first.session or not header.cold_start
-            shift_us = 0
-            if not follows and None not in (header.unix_us_at_zero, first.unix_us_at_zero):
-                shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
+            if (header.settings, header.calibration) != (known.settings, known.calibration):
+                yield header
             for row in table.rows:
-                yield shifted(row, shift_us) if shift_us else row
+                known = row if isinstance(row, TableHeader) else known
+                yield from shifted(row, _shift_us(header, first))
 
     return Table(first, rows())
 
 
-def shifted(row: Line, shift_us: int) -> Line:
-    """Move a row and all its records in time."""
-    if isinstance(row, TableHeader):
-        return row
-    return TableRow(
-        row.time_us + shift_us,
-        _moved(row.baro, shift_us),
-        _moved(row.gps, shift_us),
-        _moved(row.raw, shift_us),
-        _moved(row.imu, shift_us),
-        _moved(row.state, shift_us),
-    )
+def _shift_us(header: TableHeader, first: TableHeader) -> int:
+    """Tell how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
+        return 0
+    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
+    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
+
+
+def shifted(row: Line, shift_us: int) -> Iterator[Line]:
+    """Move a row and all its records in time; a state holds times of its own and is left out."""
+    if not shift_us or isinstance(row, TableHeader):
+        yield row
+    elif isinstance(row, TableRow):
+        yield TableRow(
+            row.time_us + shift_us,
+            _moved(row.baro, shift_us),
+            _moved(row.gps, shift_us),
+            _moved(row.raw, shift_us),
+            _moved(row.imu, shift_us),
+            _moved(row.state, shift_us),
+        )
 
 
 def points_of_rows(table: Table) -> Iterator[TrackPoint]:
@@ -245,6 +228,13 @@ def _moved(record: Moved | None, shift_us: int) -> Moved | None:
     return None if record is None else replace(record, time_us=record.time_us + shift_us)
 
 
+def foreign_rows(lines: Iterable[str], wishes: Wishes) -> Iterator[TableRow]:
+    """Read the lines of another program's CSV; raises ValueError as `ForeignReader.rows`."""
+    known = wishes.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+    reader = ForeignReader(known, wishes.system_id or 1, lenient=wishes.columns is None)
+    return reader.rows(lines)
+
+
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
     rest = b""
     for data in read_chunks(path, progress):
@@ -257,30 +247,24 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
 def _open_table(path: Path, wishes: Wishes) -> Table:
     reader = TableReader()
     events = read_events(path, reader, wishes.progress)
-    first = next((event for event in events if isinstance(event, TableRow)), None)
-    if first is None:
-        raise FlightError(f"{path}: holds no row")
-
-    def rows() -> Iterator[Line]:
-        yield first
-        yield from (event for event in events if isinstance(event, TableRow | TableHeader))
-
-    return Table(reader.header or TableHeader(), rows())
+    lines = (event for event in events if isinstance(event, Line))
+    head: list[Line] = []
+    for line in lines:
+        head.append(line)
+        if isinstance(line, TableRow):
+            return Table(reader.header or TableHeader(), chain(head, lines))
+    raise FlightError(f"{path}: holds no row")
 
 
 def _open_foreign(path: Path, wishes: Wishes) -> Table:
-    if wishes.columns is None:
-        raise FlightError(f"{path}: is a CSV of another program; tell its columns: --columns MAP")
-    vehicle_id = wishes.system_id or 1
-    lines = _lines(path, wishes.progress)
-    rows = ForeignReader(wishes.columns, vehicle_id).rows(lines)
+    rows = foreign_rows(_lines(path, wishes.progress), wishes)
     try:
         first = next(rows, None)
     except ValueError as error:
-        raise FlightError(f"{path}: {error}") from error
+        raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
-    return _headed(first, rows, wishes, vehicle_id, None)
+    return _headed(first, rows, wishes, wishes.system_id or 1, None)
 
 
 def _open_autopilot(path: Path, wishes: Wishes) -> Table:
@@ -315,9 +299,4 @@ def _headed(
     calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
     known = header_for(calibrated, vehicle_id)
     header = msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
-
-    def rows() -> Iterator[TableRow]:
-        yield first
-        yield from rest
-
-    return Table(header, rows())
+    return Table(header, chain([first], rest))

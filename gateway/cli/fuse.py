@@ -1,10 +1,10 @@
 """`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
 
 import gzip
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -13,8 +13,14 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from gateway.cli.errors import refuse
-from gateway.cli.flights import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
+from gateway.cli.flights import (
+    FlightError,
+    SettingsChoice,
+    Table,
+    Wishes,
+    aircraft_of,
+    open_rows,
+)
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -22,11 +28,10 @@ from gateway.cli.recording_files import (
     read_column_map,
     refusing,
 )
-from gateway.cli.run import ConfigOption, read_aircraft, read_settings
+from gateway.cli.refusion import SETTLES
+from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.estimation.columns import (
-    GPS_COLUMNS,
-    IMU_COLUMNS,
     NAV_ALT,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
@@ -36,25 +41,18 @@ from gateway.estimation.columns import (
     NAV_QUAT,
     NAV_VEL,
     NAV_VEL_STD,
-    ImuRow,
-    imu_row,
 )
 from gateway.estimation.interface import Estimator
-from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.record import FloatArray, IntArray
-from gateway.estimation.select import EstimatorName, make_estimator
-from gateway.flightlog.foreign import Column, ColumnMap
-from gateway.pipeline import AircraftSettings, PipelineSettings
-from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
+from gateway.estimation.select import EstimatorName
+from gateway.pipeline import AircraftSettings, make_fusion
+from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
 from gateway.sensing.chain import SensorChain
 from gateway.units import US_PER_S
 
 Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
-COLUMN_MAP: Final = Path(__file__).parents[2] / "config" / "columns" / "tracker-log.toml"
-"""The map for logs whose columns are time_s, ax, gx and so on."""
-NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 HEAD_LINES: Final = 20
 
@@ -106,13 +104,11 @@ def fuse_log(
     """
     current = read_settings(config)
     with progress_of([file]) as advance, refusing():
-        foreign = kind_of(file) is FileKind.FOREIGN
-        names, facts = _look_at(file) if foreign else (set[str](), {})
-        column_map = read_column_map(columns or COLUMN_MAP) if foreign else None
+        facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
         wishes = Wishes(
-            current=PipelineSettings(current.default_aircraft, read_aircraft(current)),
+            current=pipeline_settings(current),
             choice="current" if config is not None else settings,
-            columns=None if column_map is None else _present(column_map, names),
+            columns=read_column_map(columns),
             progress=advance,
         )
         table = open_rows(file, wishes)
@@ -120,8 +116,9 @@ def fuse_log(
             aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
         )
         try:
+            chain, running = _begin(table, aircraft)
             records = (record for row in table.plain_rows for record in records_of(row))
-            time_us, states = fuse(records, aircraft)
+            time_us, states = fuse(records, chain, running)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
         write_new(out, _lines(time_us, states), overwrite=True)
@@ -129,15 +126,33 @@ def fuse_log(
     Console(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}")
 
 
-def fuse(records: Iterable[Record], aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
-    """Run an estimator over records in their order.
+def _begin(table: Table, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
+    """Go on from the state at the table's begin where there is one that fits."""
+    first = next(table.rows)
+    if isinstance(first, FusionState):
+        try:
+            return make_fusion(aircraft, first)
+        except ValueError as error:
+            told = Console(stderr=True, highlight=False)
+            told.print(SETTLES.format(error), markup=False)
+    else:
+        table.rows = itertools.chain([first], table.rows)
+    return make_fusion(aircraft)
+
+
+def fuse(
+    records: Iterable[Record], chain: SensorChain, estimator: Estimator
+) -> tuple[IntArray, FloatArray]:
+    """Run an estimator over records in the order in which they came, as live.
 
     Parameters
     ----------
     records : iterable of record
         Raw or calibrated samples and fixes.
-    aircraft : AircraftSettings
-        Calibration, filters and estimator.
+    chain : SensorChain
+        Calibration and filters.
+    estimator : Estimator
+        Fresh, or in a state to go on from.
 
     Returns
     -------
@@ -146,52 +161,6 @@ def fuse(records: Iterable[Record], aircraft: AircraftSettings) -> tuple[IntArra
     states : ndarray, shape (n, NAV_COLUMNS)
         See `gateway.estimation.columns`.
     """
-    chain = SensorChain(aircraft.sensing, aircraft.calibration)
-    estimator = make_estimator(aircraft.estimation)
-    if isinstance(estimator, KernelEstimator):
-        log = _collect(records, chain, estimator)
-        return log.imu_time_us, estimator.run(log)
-    return _one_by_one(records, chain, estimator)
-
-
-@dataclass(slots=True)
-class _Columns:
-    imu_us: list[int] = field(default_factory=list)
-    imu: list[ImuRow] = field(default_factory=list)
-    baro_us: list[int] = field(default_factory=list)
-    baro: list[float] = field(default_factory=list)
-    gps_us: list[int] = field(default_factory=list)
-    gps: list[tuple[float, ...]] = field(default_factory=list)
-
-
-def _collect(
-    records: Iterable[Record], chain: SensorChain, estimator: KernelEstimator[object, object]
-) -> SampleLog:
-    c = _Columns()
-    for record in records:
-        match record:
-            case BaroRaw():
-                c.baro_us.append(record.time_us)
-                c.baro.append(chain.baro(record).alt_pressure_m)
-            case GpsFix():
-                c.gps_us.append(record.time_us)
-                c.gps.append(estimator.fix_row(record))
-            case _:
-                c.imu_us.append(record.time_us)
-                c.imu.append(imu_row(_sample(chain, record)))
-    return SampleLog(
-        imu_time_us=np.array(c.imu_us, np.int64),
-        imu=np.array(c.imu, float).reshape(-1, IMU_COLUMNS),
-        baro_time_us=np.array(c.baro_us, np.int64),
-        baro_alt_m=np.array(c.baro, float),
-        gps_time_us=np.array(c.gps_us, np.int64),
-        gps=np.array(c.gps, float).reshape(-1, GPS_COLUMNS),
-    )
-
-
-def _one_by_one(
-    records: Iterable[Record], chain: SensorChain, estimator: Estimator
-) -> tuple[IntArray, FloatArray]:
     times, rows = [], []
     for record in records:
         match record:
@@ -225,28 +194,14 @@ def _row(s: NavState) -> list[float]:
     ]  # fmt: skip
 
 
-def _look_at(path: Path) -> tuple[set[str], dict[str, float]]:
-    """Read a foreign file's column names and the `key=value` words of its comments."""
+def _facts_of(path: Path) -> dict[str, float]:
+    """Read the `key=value` words of a foreign file's comments."""
     facts: dict[str, float] = {}
     with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
         for line, _ in zip(file, range(HEAD_LINES), strict=False):
-            if not line.startswith("#"):
-                return {name.strip() for name in line.split(",")}, facts
-            facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
-    return set(), facts
-
-
-def _present(column_map: ColumnMap, names: set[str]) -> ColumnMap:
-    """Leave out what a file does not have; a tracker need not have every sensor."""
-    found = {
-        ours: theirs
-        for ours, theirs in column_map.columns.items()
-        if (theirs.column if isinstance(theirs, Column) else theirs) in names
-    }
-    missing = [name for name in NEEDED if name not in found]
-    if missing:
-        refuse(f"the file has no column for {', '.join(missing)}; name one with --columns")
-    return ColumnMap(columns=found)
+            if line.startswith("#"):
+                facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
+    return facts
 
 
 def _adjusted(

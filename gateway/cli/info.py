@@ -31,8 +31,10 @@ from gateway.flightlog.table import (
     encode_head,
     encode_header,
     encode_mark,
+    encode_state,
 )
 from gateway.flightlog.tlog import encode_record
+from gateway.records import FusionState
 from gateway.units import US_PER_S
 
 SHOWN: Final = 8
@@ -137,20 +139,24 @@ def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
     reader = TableReader()
     begun = False
     for event in read_events(file, reader, advance):
-        if not begun and reader.header is not None:
+        if not begun and not isinstance(event, TableFault):
             begun = True
-            yield encode_head(reader.header).encode()
+            if reader.header is None:
+                tell("the head is lost: settings and calibration of today will take its place")
+            yield encode_head(reader.header or TableHeader()).encode()
         match event:
             case TableRow():
                 yield row_to_line(event).encode()
             case TableHeader():
                 yield encode_header(event).encode()
+            case FusionState():
+                yield encode_state(event).encode()
             case TableMark():
                 yield encode_mark(event).encode()
             case TableFault():
                 tell(f"line {event.line}: {event.size} bytes: {event.reason}")
     if not begun:
-        raise FlightError(f"{file}: has no head that can be read, so it cannot be mended")
+        raise FlightError(f"{file}: holds no row that can be read")
 
 
 def _show(file: Path, found: FileInfo) -> None:

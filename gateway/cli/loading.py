@@ -11,10 +11,9 @@ from gateway.analysis.flight import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
 from gateway.cli.flights import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
 from gateway.cli.recording_files import progress_of, read_column_map, refusing
-from gateway.cli.run import read_aircraft
+from gateway.cli.run import pipeline_settings
 from gateway.config import GatewaySettings
 from gateway.edges.flight_files import FileKind, kind_of
-from gateway.pipeline import PipelineSettings
 
 FlightArgument = Annotated[
     Path | None,
@@ -85,7 +84,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
 def _wishes(loading: Loading, advance: Callable[[int], None]) -> Wishes:
     settings = loading.settings
     return Wishes(
-        current=PipelineSettings(settings.default_aircraft, read_aircraft(settings)),
+        current=pipeline_settings(settings),
         choice=loading.choice,
         columns=read_column_map(loading.columns),
         system_id=loading.system,

@@ -3,8 +3,8 @@
 import asyncio
 import contextlib
 import signal
-import tempfile
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -14,8 +14,6 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gateway.cli import flights
-from gateway.cli.convert import pipeline_settings
 from gateway.cli.errors import refuse
 from gateway.cli.flights import FlightError, Wishes
 from gateway.cli.record import ask
@@ -32,18 +30,26 @@ from gateway.cli.recording_files import (
     read_moment,
     refusing,
 )
-from gateway.cli.run import ConfigOption, EndpointOption, read_settings, with_endpoints
+from gateway.cli.refusion import Refusion, end_of
+from gateway.cli.run import (
+    ConfigOption,
+    EndpointOption,
+    pipeline_settings,
+    read_settings,
+    with_endpoints,
+)
 from gateway.config import GatewaySettings
 from gateway.edges.clock import GatewayClock
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.control_verbs import PlayerVerbs
-from gateway.edges.flight_files import FileKind, kind_of, write_new
+from gateway.edges.flight_files import FileKind, kind_of
+from gateway.edges.fused_tlog import FusedTlog
 from gateway.edges.hub import Hub
 from gateway.edges.player import PlayerEdge, PlayerStatus, TlogFile
+from gateway.edges.recordings import parts_together
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, check_speed
-from gateway.flightlog.tlog import encode_record
-from gateway.flightlog.track import Track
+from gateway.flightlog.track import Source, Track
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.vehicle import Vehicle
@@ -91,7 +97,7 @@ def play(
     ] = None,
     system: Annotated[
         list[int] | None,
-        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each file."),
+        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each recording."),
     ] = None,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
@@ -101,24 +107,25 @@ def play(
 ) -> None:
     """Play recordings to the ground stations, several at once if you like.
 
-    A tlog is sent byte for byte. A table is fused again first, so the recorded flight and its
-    re-fused twin can fly on one map. `mavgate seek` and `mavgate player` steer it meanwhile.
+    A tlog is sent byte for byte. A table is fused again while it plays, so the recorded flight and
+    its re-fused twin can fly on one map; the parts of a recording are one flight. `mavgate seek`
+    and `mavgate player` steer it meanwhile.
     """
     gateway = with_endpoints(read_settings(config), endpoint)
-    with tempfile.TemporaryDirectory(prefix="mavgate-play-") as folder, refusing():
+    with ExitStack() as opened, refusing():
         course = Course(
             read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused
         )
-        wishes = Wishes(pipeline_settings(config), settings, position, read_column_map(columns))
-        tlogs = _open_all(files, wishes, Path(folder))
+        today = pipeline_settings(read_settings(config))
+        wishes = Wishes(today, settings, position, read_column_map(columns))
+        with progress_of(files) as advance:
+            flights = _open_all(files, replace(wishes, progress=advance), opened)
+            tracks = _lay_out(flights, system or [])
+            _prepare(tracks, course)
         try:
-            tracks = _lay_out(tlogs, system or [])
             asyncio.run(_serve(gateway, tracks, course, [file.name for file in files]))
         except ControlError as error:
             refuse(str(error))
-        finally:
-            for tlog in tlogs:
-                tlog.close()
 
 
 group = typer.Typer(help="Steer the player that runs.", no_args_is_help=True)
@@ -296,37 +303,46 @@ async def _watch(daemon: PlayerDaemon) -> None:
     console.print(f"ended: {_place(daemon.edge.status())}")
 
 
-def _open_all(files: Sequence[Path], wishes: Wishes, folder: Path) -> list[TlogFile]:
-    """Index the tlogs; fuse what is none into one."""
-    opened = []
-    with progress_of(files) as advance:
-        for number, file in enumerate(files):
-            path = file
-            if kind_of(file) is not FileKind.TLOG:
-                told = replace(wishes, progress=advance)
-                path = folder / f"{number}.tlog"
-                table = flights.open_rows(file, told)
-                interpolated = wishes.position == "interpolated"
-                fixes = flights.fixes_of(file, wishes) if interpolated else ()
-                frames = flights.fused_frames(table, flights.fuse(table, told, fixes))
-                write_new(path, (encode_record(r.time_us, r.frame) for r in frames))
-            opened.append(TlogFile(path, advance if path is file else None))
-            if not opened[-1].index.count:
+def _open_all(files: Sequence[Path], wishes: Wishes, opened: ExitStack) -> list[list[Source]]:
+    """Index the tlogs, and begin to fuse what is none; the parts of a recording together."""
+    flights: list[list[Source]] = []
+    for parts in parts_together(files):
+        sources: list[TlogFile | FusedTlog] = []
+        if kind_of(parts[0]) is FileKind.TLOG:
+            for file in parts:
+                sources.append(TlogFile(file, wishes.progress))
+                opened.callback(sources[-1].close)
+        else:
+            refusion = Refusion(parts, wishes)
+            sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], wishes)))
+            opened.callback(sources[-1].close)
+            for remark in refusion.remarks:
+                Console(stderr=True, highlight=False).print(f"{parts[0]}: {remark}", markup=False)
+        for source, file in zip(sources, parts, strict=False):
+            if not source.index.count:
                 raise FlightError(f"{file}: holds no MAVLink")
-    return opened
+        flights.append([*sources])
+    return flights
 
 
-def _lay_out(tlogs: Sequence[TlogFile], wished: Sequence[int]) -> list[Track]:
+def _prepare(tracks: Sequence[Track], course: Course) -> None:
+    """Fuse tables up to the begin that the user wants."""
+    if course.begin is not None:
+        begin_us = place_in(course.begin, min(track.first_us for track in tracks))
+        while not all(track.prepare(begin_us) for track in tracks):
+            pass
+
+
+def _lay_out(flights: Sequence[Sequence[Source]], wished: Sequence[int]) -> list[Track]:
     """Give each vehicle its own system id, and recordings of other days the same begin."""
-    first = tlogs[0].index
-    begin_us, end_us = first.first_us or 0, first.last_us or 0
+    begin_us, end_us = _span(flights[0])
     used: set[int] = set()
     tracks = []
-    for number, tlog in enumerate(tlogs):
-        index = tlog.index
-        meets = (index.first_us or 0) <= end_us and begin_us <= (index.last_us or 0)
-        shift_us = 0 if meets else begin_us - (index.first_us or 0)
-        vehicles = sorted(s for s in index.systems if s < FIRST_GROUND_STATION)
+    for number, sources in enumerate(flights):
+        first_us, last_us = _span(sources)
+        shift_us = 0 if first_us <= end_us and begin_us <= last_us else begin_us - first_us
+        senders = {sender for source in sources for sender in source.index.systems}
+        vehicles = sorted(sender for sender in senders if sender < FIRST_GROUND_STATION)
         system_ids: dict[int, int] = {}
         for place, system_id in enumerate(vehicles):
             wanted = wished[number] if place == 0 and number < len(wished) else system_id
@@ -335,8 +351,16 @@ def _lay_out(tlogs: Sequence[TlogFile], wished: Sequence[int]) -> list[Track]:
             used.add(wanted)
             if wanted != system_id:
                 system_ids[system_id] = wanted
-        tracks.append(tlog.track(shift_us=shift_us, system_ids=system_ids))
+        tracks += [Track(s, shift_us=shift_us, system_ids=system_ids) for s in sources]
     return tracks
+
+
+def _span(sources: Sequence[Source]) -> tuple[int, int]:
+    """Tell begin and end of a recording of several parts."""
+    return (
+        min(source.index.first_us or 0 for source in sources),
+        max(source.last_us for source in sources),
+    )
 
 
 def _speed(text: str) -> float:

@@ -86,20 +86,23 @@ def delete(
     if not yes:
         typer.confirm(f"Delete the recording {name!r} for ever?", abort=True)
     if socket_path("run").exists():
-        deleted = msgspec.convert(ask("record.delete", {"name": name}), Recording)
+        deleted = _recording(ask("record.delete", {"name": name}))
     else:
         try:
             deleted = delete_recording(_folder(config), name)
         except RecordingError as error:
             refuse(str(error))
     for path in deleted.files:
-        Console(highlight=False).print(f"deleted {path}", markup=False)
+        print(f"deleted {path}")
 
 
 @group.command("list")
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
-    found = list_recordings(_folder(config))
+    if config is None and socket_path("run").exists():
+        found = [_recording(told) for told in ask("record.list")]
+    else:
+        found = list_recordings(_folder(config))
     if json:
         print(msgspec.json.encode(found, enc_hook=str).decode())
     else:
@@ -118,6 +121,10 @@ def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> 
         return request(socket_path(of), verb, params)
     except ControlError as error:
         refuse(str(error))
+
+
+def _recording(told: dict[str, Any]) -> Recording:
+    return Recording(**{**told, "files": tuple(Path(file) for file in told["files"])})
 
 
 def _folder(config: Path | None) -> Path:

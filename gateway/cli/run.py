@@ -17,7 +17,7 @@ from gateway.cli.prepare import compile_everything
 from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
 from gateway.daemon import Daemon
 from gateway.edges.live_view import LiveView, summary_line
-from gateway.pipeline import AircraftSettings
+from gateway.pipeline import AircraftSettings, PipelineSettings
 
 log = logging.getLogger(__name__)
 
@@ -93,6 +93,11 @@ def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
         return load_aircraft(settings)
     except ConfigError as error:
         refuse(str(error))
+
+
+def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:
+    """Take what the pipeline needs, the single aircraft's files included."""
+    return PipelineSettings(settings.default_aircraft, read_aircraft(settings))
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:

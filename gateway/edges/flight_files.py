@@ -12,6 +12,8 @@ from gateway.flightlog.tlog import Batch, TlogScanner
 
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512
+TAIL: Final = 1 << 14
+"""Some twenty rows."""
 GZIP: Final = ".gz"
 
 Progress = Callable[[int], None]
@@ -46,6 +48,31 @@ def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]
             if progress is not None:
                 progress(raw.tell() - done)
                 done = raw.tell()
+
+
+def read_ends(path: Path) -> tuple[bytes, bytes]:
+    """Read the lines of a text that stand before its first row, and some of the last.
+
+    Returns
+    -------
+    head : bytes
+        The lines up to the first that is no comment, and that one.
+    tail : bytes
+        The last lines, the first of them whole.
+    """
+    head = tail = b""
+    with _open(path) as file:
+        for line in file:
+            head += line
+            if not line.startswith(b"#"):
+                break
+        if path.suffix == GZIP:
+            while data := file.read(CHUNK):
+                tail = tail[-TAIL:] + data
+        else:
+            file.seek(max(len(head), path.stat().st_size - TAIL))
+            tail = file.read()
+    return head, tail[-TAIL:].partition(b"\n")[2]
 
 
 def _open(path: Path) -> BinaryIO:

@@ -1,8 +1,10 @@
 """The files of one part on the disk; everything here may block and runs in the recorder's worker.
 
-Files are only ever appended to, so a cut at any moment leaves what was written before.
+Files are only ever appended to, so a cut at any moment leaves what was written before. Only what a
+disk has refused in the middle is taken back.
 """
 
+import contextlib
 import errno
 import os
 from collections.abc import Mapping
@@ -10,7 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.recordings import free_name, sync_folder
+from gateway.edges.recordings import (
+    check_free,
+    free_name,
+    list_recordings,
+    rename_recording,
+    sync_folder,
+)
 from gateway.flightlog.session import part_stem
 
 RIGHTS: Final = 0o644
@@ -97,6 +105,20 @@ class PartFiles:
                 raise FileNotFoundError(errno.ENOENT, "removed while it was written")
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
 
+    def rename(self, to_name: str) -> None:
+        """Name the recording otherwise between two writes, also before the first.
+
+        Raises
+        ------
+        RecordingError
+            If the name is taken, or is none.
+        """
+        if self.session in {recording.name for recording in list_recordings(self._folder)}:
+            rename_recording(self._folder, self.session, to_name)
+        else:
+            check_free(self._folder, to_name)
+        self.session = to_name
+
     def close(self) -> None:
         """Close all files; what the disk holds stays whatever happens, but none stays empty."""
         files, self._files = self._files, {}
@@ -118,8 +140,13 @@ class PartFiles:
         return self._folder / (part_stem(self.session, self._part) + ending)
 
     def _append(self, ending: str, data: bytes) -> None:
-        view = memoryview(data)
-        while view:
-            written = os.write(self._files[ending], view)
-            self._sizes[ending] += written
-            view = view[written:]
+        file, size, view = self._files[ending], self._sizes[ending], memoryview(data)
+        try:
+            while view:
+                view = view[os.write(file, view) :]
+        except OSError:
+            # A full disk takes the begin of what is written: no half record may stay.
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, size)
+            raise
+        self._sizes[ending] = size + len(data)

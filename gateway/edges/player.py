@@ -2,21 +2,20 @@
 
 import asyncio
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, PlayState, check_speed
 from gateway.flightlog.tlog import TlogIndex, TlogScanner
-from gateway.flightlog.track import Track
 from gateway.units import US_PER_S
 
 READ_SIZE: Final = 1 << 20
 BATCH: Final = 200
 """Frames in one go: about a millisecond, after which others get their turn."""
 LONGEST_WAIT_S: Final = 0.5
+SEEKING: Final = "seeking"
 
 Progress = Callable[[int], None]
 """Told how many more bytes were read."""
@@ -61,11 +60,14 @@ class TlogFile:
         except OSError:
             return b""
 
-    def track(
-        self, *, shift_us: int = 0, system_ids: Mapping[int, int] = MappingProxyType({})
-    ) -> Track:
-        """Make a track that plays it; see `Track`."""
-        return Track(self.read, self.index, shift_us=shift_us, system_ids=system_ids)
+    @property
+    def last_us(self) -> int:
+        """Greatest time; 0 in an empty file."""
+        return self.index.last_us or 0
+
+    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
+        """Tell that everything is there."""
+        return True
 
     def close(self) -> None:
         """Close the file; its tracks end."""
@@ -120,6 +122,7 @@ class PlayerEdge:
         self._clock = now_us
         self._files = tuple(files)
         self._on_end = on_end
+        self._wanted_us: int | None = None
         self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
 
     def start(self) -> None:
@@ -159,13 +162,13 @@ class PlayerEdge:
     def seek(self, offset_s: float, *, relative: bool = False) -> None:
         """Move to an offset from the begin of the range, or from here."""
         player = self._player
-        base_us = player.position_us if relative else player.begin_us
-        player.seek(base_us + round(offset_s * US_PER_S), self._clock())
-        self._turn()
+        here_us = player.position_us if self._wanted_us is None else self._wanted_us
+        base_us = here_us if relative else player.begin_us
+        self.seek_time(base_us + round(offset_s * US_PER_S))
 
     def seek_time(self, time_us: int) -> None:
-        """Move to a recorded civil time in µs since 1970."""
-        self._player.seek(time_us, self._clock())
+        """Move to a recorded civil time in µs since 1970, as soon as that is ready."""
+        self._wanted_us = time_us
         self._turn()
 
     def status(self) -> PlayerStatus:
@@ -173,7 +176,7 @@ class PlayerEdge:
         player = self._player
         fastest = player.speed == AS_FAST_AS_POSSIBLE
         return PlayerStatus(
-            state=player.state.value,
+            state=player.state.value if self._wanted_us is None else SEEKING,
             position_s=(player.position_us - player.begin_us) / US_PER_S,
             duration_s=(player.end_us - player.begin_us) / US_PER_S,
             time_us=player.position_us,
@@ -184,14 +187,19 @@ class PlayerEdge:
         )
 
     def _turn(self) -> None:
-        """Hand on what is due and wait for the next."""
+        """Hand on what is due and wait for the next; what a seek needs is done in between."""
         self.close()
+        wanted_us = self._wanted_us
+        if wanted_us is not None and self._player.prepare(wanted_us):
+            self._player.seek(wanted_us, self._clock())
+            self._wanted_us = None
         was_playing = self._player.state is PlayState.PLAYING
         if frames := self._player.poll(self._clock(), BATCH):
             self._emit(frames)
-        due_us = self._player.next_due_us()
-        if due_us is not None:
-            loop = asyncio.get_running_loop()
+        loop, due_us = asyncio.get_running_loop(), self._player.next_due_us()
+        if self._wanted_us is not None:
+            self._timer = loop.call_soon(self._turn)
+        elif due_us is not None:
             wait_s = (due_us - self._clock()) / US_PER_S
             if wait_s <= 0:
                 self._timer = loop.call_soon(self._turn)

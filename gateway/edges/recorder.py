@@ -20,10 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+import msgspec
+
 from gateway.edges.part_files import DiskState, PartFiles, free_bytes_near, reason_of
-from gateway.edges.recordings import RecordingError, rename_recording, restamp_recording
-from gateway.flightlog.part import PENDING_LIMIT, TLOG, Part, table_ending
-from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
+from gateway.edges.recordings import RecordingError, part_of, rename_recording
+from gateway.edges.restamp import Restamper, clear_copies
+from gateway.flightlog.part import PENDING_LIMIT, Part
 from gateway.flightlog.session import (
     Announce,
     ClosePart,
@@ -35,9 +37,8 @@ from gateway.flightlog.session import (
     SessionState,
 )
 from gateway.flightlog.stamps import CivilClock
-from gateway.flightlog.table import TableHeader, TableMark, encode_head, encode_header, encode_mark
-from gateway.flightlog.tlog import encode_record
-from gateway.records import BaroRaw, FusedSample, GpsFix
+from gateway.flightlog.table import TableHeader, TableMark
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
@@ -75,6 +76,8 @@ class Recorder:
         start are filled in here.
     announce : callable
         Told whether it is trouble, and a text for the user.
+    state_of : callable
+        Tells what the fusion of a vehicle remembers after all that was handed to `flight`.
     """
 
     def __init__(
@@ -84,14 +87,15 @@ class Recorder:
         unix_us: Callable[[], int],
         header_of: Callable[[int], TableHeader],
         announce: Callable[[bool, str], None],
+        state_of: Callable[[int], FusionState | None] = lambda _: None,
     ) -> None:
         self._settings = settings
         self._clock, self._machine_us = now_us, unix_us
         self._header_of = header_of
         self._announce = announce
+        self._state_of = state_of
         self._session = Session(settings)
         self._civil = CivilClock()
-        self._rows: dict[int, RowBuilder] = {}
         self._seen: set[int] = set()
         self._part: Part | None = None
         self._files: PartFiles | None = None
@@ -101,6 +105,10 @@ class Recorder:
         self._wake = asyncio.Event()
         self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self._offsets: dict[int, int] = {}
+        """Civil time of gateway time zero with which each part of the session was written."""
+        self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
+        self._restamping: asyncio.Task[None] | None = None
         self.folder = Path(settings.folder).expanduser()
         """Where the recordings are."""
 
@@ -110,6 +118,7 @@ class Recorder:
         A recording that is wanted already is opened at once: nothing runs yet that could be held
         up, and a table is worth most from the estimator's first sample on.
         """
+        clear_copies(self.folder)
         self._civil.hear_machine(self._machine_us(), self._clock())
         if self._session.wanted:
             self._open_at_once()
@@ -117,18 +126,19 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and end; waits for the disk."""
-        if self._task is not None:
-            self._task.cancel()
+        for task in (self._task, self._restamping):
+            if task is not None:
+                task.cancel()
         self._worker.shutdown(wait=True)
         files, self._files = self._files, None
-        if files is None or self._part is None:
-            return
         try:
-            self._flush_rows(self._part)
-            files.write(self._part.take(), sync=True)
-            files.close()
+            if files is not None and self._part is not None:
+                self._part.flush_rows()
+                files.write(self._part.take(), sync=True)
+                files.close()
         except OSError as error:
             log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+        self._restamper.finish()
 
     async def settle(self) -> None:
         """Wait until orders given so far have been carried out."""
@@ -155,9 +165,7 @@ class Recorder:
     def mark(self, text: str) -> None:
         """Put a remark at this moment into the recording."""
         if self._part is not None:
-            line = encode_mark(TableMark(self._clock(), text)).encode()
-            for vehicle_id in self._part.tables:
-                self._part.add(table_ending(vehicle_id), line)
+            self._part.add_mark(TableMark(self._clock(), text))
         self._announce(False, f"Mark: {text}")
 
     async def save(self, name: str) -> None:
@@ -170,8 +178,12 @@ class Recorder:
         """
         if not self._session.name:
             raise RecordingError("nothing was recorded since the gateway started")
+        await self._restamped()
         old, files = self._session.name, self._files
-        await self._on_disk(_rename_open, self.folder, old, name, files)
+        if files is None:
+            await self._on_disk(rename_recording, self.folder, old, name)
+        else:
+            await self._on_disk(files.rename, name)
         self._session.name = name
         if self._part is not None:
             self._part.session = name
@@ -196,9 +208,8 @@ class Recorder:
 
     def frame(self, frame: bytes) -> None:
         """Keep a MAVLink frame that was sent or received."""
-        part = self._part
-        if part is not None and self._settings.tlog:
-            part.add(TLOG, encode_record(part.stamper.stamp(self._clock()), frame))
+        if self._part is not None and self._settings.tlog:
+            self._part.add_frame(frame, self._clock())
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample) -> None:
         """Keep what the estimator took, and the state that it made of it."""
@@ -207,51 +218,49 @@ class Recorder:
         vehicle_id = (
             record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
         )
-        if self._part is not None and self._settings.table:
-            rows = self._rows.setdefault(vehicle_id, RowBuilder())
-            self._write_rows(self._part, vehicle_id, rows.add(record))
+        part = self._part
+        if part is not None and self._settings.table:
+            if not part.has_table(vehicle_id):
+                part.prepare_table(self._header(vehicle_id, part))
+            part.add_flight(vehicle_id, record)
         self._seen.add(vehicle_id)
 
     def settings_changed(self, vehicle_id: int) -> None:
         """Note that what comes is fused with other settings, which a new head tells."""
-        if self._part is not None and vehicle_id in self._part.tables:
-            self._write_rows(self._part, vehicle_id, self._rows[vehicle_id].flush())
-            head = encode_header(self._head(vehicle_id, self._part))
-            self._part.add(table_ending(vehicle_id), head.encode())
+        if self._part is not None and self._part.has_table(vehicle_id):
+            self._part.change_settings(self._header(vehicle_id, self._part))
 
-    def _write_rows(self, part: Part, vehicle_id: int, rows: list[TableRow]) -> None:
-        ending = table_ending(vehicle_id)
-        if vehicle_id not in part.tables:
-            part.tables.add(vehicle_id)
-            part.add(ending, encode_head(self._head(vehicle_id, part)).encode())
-        for row in rows:
-            part.add(ending, row_to_line(row).encode())
+    def _new_part(self, session: str, number: int) -> Part:
+        """Begin to gather for a part; later, the fusion would be ahead of its first row."""
+        part = Part(session, number, self._civil.offset_us or 0)
+        if number == 1:
+            self._offsets.clear()
+        self._offsets[number] = part.stamper.offset_us
+        if self._settings.table:
+            for vehicle_id in self._seen:
+                part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
+        return part
 
-    def _flush_rows(self, part: Part) -> None:
-        for vehicle_id, rows in self._rows.items():
-            self._write_rows(part, vehicle_id, rows.flush())
-        self._rows.clear()
-
-    def _head(self, vehicle_id: int, part: Part) -> TableHeader:
-        known = self._header_of(vehicle_id)
-        return TableHeader(
-            mavgate_version=known.mavgate_version,
+    def _header(self, vehicle_id: int, part: Part) -> TableHeader:
+        return msgspec.structs.replace(
+            self._header_of(vehicle_id),
             vehicle_id=vehicle_id,
             session=part.session,
             part=part.number,
             cold_start=vehicle_id not in self._seen,
             unix_us_at_zero=part.stamper.offset_us,
-            settings=known.settings,
-            calibration=known.calibration,
         )
 
     async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
         while True:
+            # A slow disk takes its time from the pause: what waits for it is not to grow by both.
+            due_s = loop.time() + self._settings.flush_s
             self._wake.clear()
             await self._turn()
             self._turned.set()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), self._settings.flush_s)
+                await asyncio.wait_for(self._wake.wait(), max(due_s - loop.time(), 0.0))
 
     async def _turn(self) -> None:
         """Write what was gathered, then let the session decide."""
@@ -291,17 +300,18 @@ class Recorder:
         closing = self._part
         opening = next((action for action in actions if isinstance(action, OpenPart)), None)
         # The next part gathers from here on, so that nothing is lost while the last one closes.
-        self._part = None if any(isinstance(a, ClosePart) for a in actions) else self._part
+        if closing is not None and any(isinstance(a, ClosePart) for a in actions):
+            closing.flush_rows()
+            self._part = None
         if opening is not None:
-            offset_us = self._civil.offset_us or 0
-            self._part = Part(opening.session, opening.part, offset_us)
+            self._part = self._new_part(opening.session, opening.part)
         following: list[SessionAction] = []
         for action in actions:
             match action:
                 case ClosePart():
-                    await self._close_part(closing, has_next=opening is not None)
+                    await self._close_part(closing)
                 case Rename():
-                    await self._rename(action, closing)
+                    await self._rename(action)
                 case OpenPart():
                     following += await self._open_part(action)
                 case Announce():
@@ -320,7 +330,7 @@ class Recorder:
             for action in actions:
                 if isinstance(action, OpenPart):
                     files = PartFiles(self.folder, action.session, action.part)
-                    self._part = Part(action.session, action.part, offset_us)
+                    self._part = self._new_part(action.session, action.part)
                     actions = self._adopt(files)
         except OSError as error:
             actions = self._session.failed(reason_of(error), now_us)
@@ -343,12 +353,10 @@ class Recorder:
             self._part.session = files.session
         return self._session.opened(self._clock())
 
-    async def _close_part(self, part: Part | None, *, has_next: bool) -> None:
+    async def _close_part(self, part: Part | None) -> None:
         files, self._files = self._files, None
         if part is None or files is None:
             return
-        if not has_next:
-            self._flush_rows(part)
         try:
             await self._on_disk(files.write, part.take(), True)
         except OSError as error:
@@ -356,17 +364,26 @@ class Recorder:
         with contextlib.suppress(OSError):
             await self._on_disk(files.close)
 
-    async def _rename(self, action: Rename, closed: Part | None) -> None:
-        """Name a session by its true time, and shift its time stamps to it."""
+    async def _rename(self, action: Rename) -> None:
+        """Name a session by its true time, and let its finished parts be shifted to it."""
+        await self._restamped()
+        old, new = action.session, action.to_session
         try:
-            if closed is not None:
-                shift_us = (self._civil.offset_us or 0) - closed.stamper.offset_us
-                await self._on_disk(
-                    restamp_recording, self.folder, action.session, closed.number, shift_us
-                )
-            await self._on_disk(rename_recording, self.folder, action.session, action.to_session)
+            found = await self._on_disk(rename_recording, self.folder, old, new)
         except (OSError, RecordingError) as error:
-            log.warning("Recording %s keeps its name: %s", action.session, error)
+            log.warning("Recording %s keeps its name and times: %s", old, error)
+            return
+        true_us = self._civil.offset_us or 0
+        for path in found.files:
+            self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
+        self._offsets = dict.fromkeys(self._offsets, true_us)
+        run = self._restamper.run(lambda step: self._on_disk(step))
+        self._restamping = asyncio.get_running_loop().create_task(run)
+
+    async def _restamped(self) -> None:
+        """Wait until no file is being copied, so that its name may change."""
+        if self._restamping is not None:
+            await self._restamping
 
     async def _on_disk(
         self,
@@ -376,10 +393,3 @@ class Recorder:
     ) -> Result:
         assert not kwargs
         return await asyncio.get_running_loop().run_in_executor(self._worker, job, *args)
-
-
-def _rename_open(folder: Path, name: str, to_name: str, files: PartFiles | None) -> None:
-    """Rename between two writes, so that no file is begun under the old name afterwards."""
-    rename_recording(folder, name, to_name)
-    if files is not None:
-        files.session = to_name

@@ -7,15 +7,12 @@ import contextlib
 import itertools
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.flightlog.session import check_name, part_stem
-from gateway.flightlog.tlog import TlogScanner, encode_record
-
-RESTAMP_LIMIT: Final = 16 << 20
-"""Larger files keep the times they were written with: rewriting them would hold up the disk."""
+from gateway.flightlog.session import check_name
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 
@@ -33,6 +30,33 @@ class Recording:
 
 class RecordingError(Exception):
     """What was asked for cannot be done; the text says why."""
+
+
+def part_of(path: Path) -> int:
+    """Tell which part of its recording a file is; raises ValueError if it is none."""
+    match = _FILE_NAME.fullmatch(path.name)
+    if match is None:
+        raise ValueError(f"{path} is no part of a recording")
+    return int(match["part"])
+
+
+def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
+    """Put the parts of a recording that follow one another together; all else stays alone."""
+    found: list[list[Path]] = []
+    newest: dict[tuple[Path, str, str], list[Path]] = {}
+    for path in paths:
+        match = _FILE_NAME.fullmatch(path.name)
+        if match is None:
+            found.append([path])
+            continue
+        series = (path.parent, match["name"], path.name[match.end("part") :])
+        before = newest.get(series)
+        if before is not None and part_of(before[-1]) < part_of(path):
+            before.append(path)
+        else:
+            newest[series] = [path]
+            found.append(newest[series])
+    return found
 
 
 def list_recordings(folder: Path) -> list[Recording]:
@@ -70,6 +94,16 @@ def free_name(folder: Path, wanted: str) -> str:
     return next(name for name in names if name not in taken)
 
 
+def check_free(folder: Path, name: str) -> None:
+    """Check that a recording can be named so; raises RecordingError if not."""
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+    if free_name(folder, name) != name:
+        raise RecordingError(f"there is a recording {name!r} already in {folder}")
+
+
 def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
     """Give a recording another name, also while it is being written; never overwrites.
 
@@ -78,13 +112,8 @@ def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
     RecordingError
         If there is no such recording, the new name is taken, or it is no name.
     """
-    try:
-        check_name(to_name)
-    except ValueError as error:
-        raise RecordingError(str(error)) from error
     recording = find_recording(folder, name)
-    if free_name(folder, to_name) != to_name:
-        raise RecordingError(f"there is a recording {to_name!r} already in {folder}")
+    check_free(folder, to_name)
     for path in recording.files:
         _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
     sync_folder(folder)
@@ -104,26 +133,6 @@ def delete_recording(folder: Path, name: str) -> Recording:
         path.unlink()
     sync_folder(folder)
     return recording
-
-
-def restamp_recording(folder: Path, name: str, part: int, shift_us: int) -> None:
-    """Shift all times of a part's tlog, once the true time is known.
-
-    The new file takes the place of the old one in one step, so a power cut leaves either.
-    """
-    path = folder / f"{part_stem(name, part)}.tlog"
-    if not path.exists() or path.stat().st_size > RESTAMP_LIMIT:
-        return
-    batch = TlogScanner().feed(path.read_bytes(), final=True)
-    shifted = b"".join(
-        encode_record(max(record.time_us + shift_us, 0), record.frame) for record in batch.records()
-    )
-    temporary = path.with_suffix(".tlog.new")
-    with temporary.open("wb") as file:
-        file.write(shifted)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def sync_folder(folder: Path) -> None:

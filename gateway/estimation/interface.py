@@ -24,6 +24,14 @@ class Estimator(Protocol):
         """Take in one GPS fix at its arrival; the latency is the estimator's to compensate."""
         ...
 
+    def snapshot(self) -> bytes:
+        """Write down all that is remembered."""
+        ...
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot to the last bit; raises ValueError if it is not its own."""
+        ...
+
     def reset(self) -> None:
         """Forget everything but the settings."""
         ...

@@ -4,11 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, cast
 
+import msgspec
 import numpy as np
 
 from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
-from gateway.estimation.record import FloatArray, IntArray, copy_record, new_record
-from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.estimation.record import (
+    FloatArray,
+    IntArray,
+    Packed,
+    copy_record,
+    new_record,
+    pack_record,
+    unpack_record,
+)
+from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 State = TypeVar("State")
@@ -135,6 +144,16 @@ class KernelEstimator(Generic[State, Gains]):
         if getattr(state, "dtype", None) != getattr(self._state, "dtype", None):
             raise TypeError(f"not a state of this estimator: {type(state)}")
         self._state = copy_record(state)
+
+    def snapshot(self) -> bytes:
+        """Write down all that is remembered, the place on the Earth included."""
+        return msgspec.msgpack.encode((pack_record(self._state), self._earth.state))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot; raises ValueError if it is none of this estimator."""
+        kind = tuple[Packed, EarthPlace | None]
+        packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
+        self._state = unpack_record(self._kernels.declaration, packed)
 
     def update_imu(self, sample: ImuSample) -> NavState:
         """Advance by one IMU sample.

@@ -36,6 +36,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 
+import msgspec
 import numpy as np
 
 from gateway.estimation import paper_kernels as kernels
@@ -47,8 +48,10 @@ from gateway.estimation.record import (
     copy_record,
     filled_record,
     new_record,
+    pack_record,
+    unpack_record,
 )
-from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
+from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
 from gateway.estimation.rest import RestGains
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import IDENTITY
@@ -178,6 +181,16 @@ class PaperEstimator:
     @state.setter
     def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
         self._s, self._held = replace(state[0]), Held(copy_record(state[1]))
+
+    def snapshot(self) -> bytes:
+        """Write down all that is remembered, the declination included."""
+        return msgspec.msgpack.encode((self._s, pack_record(self._held.record), self._earth.state))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot; raises ValueError if it is none of this estimator."""
+        kind = tuple[PaperState, tuple[str, bytes], EarthPlace | None]
+        self._s, packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
+        self._held = Held(unpack_record(kernels.Memory, packed))
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""

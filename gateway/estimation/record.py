@@ -5,6 +5,7 @@ without conversion. The declaration is a class that is never instantiated: mypy 
 by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
 """
 
+import zlib
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
@@ -89,6 +90,46 @@ def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declar
 def copy_record(record: Declared) -> Declared:
     """Copy a record, for a state that is read out or restored."""
     return cast(Declared, cast(np.void, record).copy())
+
+
+Packed = tuple[int, bytes]
+"""A mark of the layout, and the bytes of a record."""
+
+
+def pack_record(record: object) -> Packed:
+    """Write a record of any declaration as bytes."""
+    void = cast(np.void, record)
+    return (_mark(void.dtype), void.tobytes())
+
+
+def unpack_record(declaration: type[Declared], packed: Packed) -> Declared:
+    """Read a record back.
+
+    Parameters
+    ----------
+    declaration : type
+        See `layout`.
+    packed : Packed
+        From `pack_record`.
+
+    Returns
+    -------
+    Declared
+        The same to the last bit.
+
+    Raises
+    ------
+    ValueError
+        If it was written from another declaration, or is damaged.
+    """
+    wanted, (mark, data) = layout(declaration), packed
+    if mark != _mark(wanted) or len(data) != wanted.itemsize:
+        raise ValueError("a state of another layout")
+    return cast(Declared, np.frombuffer(data, wanted, 1)[0].copy())
+
+
+def _mark(wanted: np.dtype[Any]) -> int:
+    return zlib.crc32(repr(wanted.descr).encode())
 
 
 @compiled

@@ -63,6 +63,10 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
     )
 
 
+EarthPlace = tuple[float, float, MagneticField]
+"""Latitude and longitude in degrees, and the model's field there."""
+
+
 class EarthField:
     """The magnetic reference: looked up once, and again after a long way.
 
@@ -78,16 +82,20 @@ class EarthField:
 
     def reset(self) -> None:
         """Forget the place."""
-        self._place: tuple[float, float] | None = None
-        self.field: MagneticField | None = None
+        self.state: EarthPlace | None = None
+        """The last place that was looked up; None before the first fix. May be set back."""
+
+    @property
+    def field(self) -> MagneticField | None:
         """The model's field at the last place; None before the first fix."""
+        return None if self.state is None else self.state[2]
 
     @property
     def declination_rad(self) -> float:
         """Declination, positive east; NaN as long as it is not known."""
         if self._settings.declination == "fixed":
             return math.radians(self._settings.declination_deg)
-        return math.nan if self.field is None else self.field.declination_rad
+        return math.nan if self.state is None else self.state[2].declination_rad
 
     def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
         """Tell the place.
@@ -104,10 +112,10 @@ class EarthField:
         bool
             Whether the field was looked up anew.
         """
-        if self._place is not None:
-            north_m, east_m = displacement_m(*self._place, lat_deg, lon_deg, alt_m)
+        if self.state is not None:
+            north_m, east_m = displacement_m(*self.state[:2], lat_deg, lon_deg, alt_m)
             if math.hypot(north_m, east_m) < FIELD_RENEWAL_M:
                 return False
-        self._place = (lat_deg, lon_deg)
-        self.field = magnetic_field(lat_deg, lon_deg, alt_m, year_of(utc_us))
+        field = magnetic_field(lat_deg, lon_deg, alt_m, year_of(utc_us))
+        self.state = (lat_deg, lon_deg, field)
         return True

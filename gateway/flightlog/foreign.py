@@ -20,6 +20,8 @@ from gateway.settings import Settings, setting
 
 EXTRA_FIELDS: Final = ("baro_alt_m",)
 """May be mapped though the table has no such column: heights become pressures."""
+NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
+"""Without these there is nothing to fuse."""
 SEA_LEVEL_PA: Final = 101_325.0
 _EXPONENT: Final = 1.0 / 0.190263
 _SCALE_M: Final = 44_330.769
@@ -59,14 +61,19 @@ class ForeignReader:
         What its columns mean.
     vehicle_id : int
         The aircraft it is taken for.
+    lenient : bool
+        Whether the file may lack mapped columns, but those needed to fuse it.
     """
 
-    def __init__(self, column_map: ColumnMap, vehicle_id: int = 1) -> None:
+    def __init__(
+        self, column_map: ColumnMap, vehicle_id: int = 1, *, lenient: bool = False
+    ) -> None:
         self._columns = {
             name: Column(column=column) if isinstance(column, str) else column
             for name, column in column_map.columns.items()
         }
         self._vehicle_id = vehicle_id
+        self._lenient = lenient
         self.faults = 0
         """Lines that could not be read."""
 
@@ -85,17 +92,24 @@ class ForeignReader:
         Raises
         ------
         ValueError
-            If the file lacks a column of the map.
+            If the file lacks a column that it must have.
         """
         table = csv.DictReader(line for line in lines if not line.startswith("#"))
-        missing = {c.column for c in self._columns.values()} - set(table.fieldnames or ())
-        if missing:
-            raise ValueError(f"the file has no column {', '.join(sorted(missing))}")
+        self._check(set(table.fieldnames or ()))
         for cells in table:
             try:
                 yield self._row(cells)
             except (ValueError, TypeError):
                 self.faults += 1
+
+    def _check(self, names: set[str]) -> None:
+        """Compare the map with the file's columns; raises ValueError if one is missed."""
+        found = {ours: theirs for ours, theirs in self._columns.items() if theirs.column in names}
+        absent = self._columns.keys() - found.keys()
+        if absent & set(NEEDED) or (absent and not self._lenient):
+            missing = sorted(self._columns[ours].column for ours in absent)
+            raise ValueError(f"the file has no column {', '.join(missing)}")
+        self._columns = found
 
     def _row(self, cells: Mapping[str, str]) -> TableRow:
         value = {

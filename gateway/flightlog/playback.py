@@ -26,6 +26,7 @@ from gateway.units import US_PER_S
 LEAST_SPEED: Final = 0.1
 GREATEST_SPEED: Final = 100.0
 AS_FAST_AS_POSSIBLE: Final = math.inf
+END_OF_TIME_US: Final = 1 << 64
 CLOCK_JUMP_US: Final = 86_400 * US_PER_S
 """A longer silence is no silence but a clock that was set; it is never waited for."""
 
@@ -83,7 +84,7 @@ class Player:
     ) -> None:
         self._tracks = tracks
         self.begin_us = min(t.first_us for t in tracks) if begin_us is None else begin_us
-        self.end_us = max(t.last_us for t in tracks) if end_us is None else end_us
+        self._end_us = end_us
         self.max_gap_us = max_gap_us
         self.loop = loop
         self.state = PlayState.PLAYING
@@ -93,6 +94,11 @@ class Player:
         self._anchor = (now_us, self.begin_us)
         self._last_us = self.begin_us
         self._context = self._seek_tracks(self.begin_us)
+
+    @property
+    def end_us(self) -> int:
+        """End of the range; may move while a recording that is played comes into being."""
+        return max(t.last_us for t in self._tracks) if self._end_us is None else self._end_us
 
     @property
     def speed(self) -> float:
@@ -149,6 +155,10 @@ class Player:
         self._anchor = (now_us, self._last_us)
         return frames
 
+    def prepare(self, time_us: int) -> bool:
+        """Do a little of what a seek to a time needs; tells whether it can be made at once."""
+        return all(track.prepare(time_us) for track in self._tracks)
+
     def seek(self, time_us: int, now_us: int) -> None:
         """Move to a time of the recordings, held within the range; a pause stays a pause."""
         time_us = min(max(time_us, self.begin_us), self.end_us)
@@ -202,7 +212,7 @@ class Player:
     def _next_track(self) -> Track | None:
         """Find the track whose next frame is the earliest; None at the end of the range."""
         found: Track | None = None
-        earliest_us = self.end_us
+        earliest_us = END_OF_TIME_US if self._end_us is None else self._end_us
         for track in self._tracks:
             time_us = track.peek_us()
             if time_us is not None and (

@@ -3,13 +3,15 @@
     # mavgate table 1
     # header: {"mavgate_version": …, "vehicle_id": …, "settings": {…}, "calibration": {…}, …}
     time_us,node_id,…
+    # state: {"vehicle_id": …, "fits": …, "sensing": …, "estimation": …}
     12000,0,…
     # mark: {"time_us": 12345, "text": "…"}
     # header: {…}
 
-A second header tells that the rows behind it were fused with other settings. Lines that begin with
-`#` hold JSON; spreadsheets and pandas (`comment="#"`) step over them. An empty cell means not
-known, or nothing new.
+A second header tells that the rows behind it were fused with other settings. A state is what
+filters and estimator remembered there, so that a file that begins in flight can be fused again
+from its first row. Lines that begin with `#` hold JSON; spreadsheets and pandas (`comment="#"`)
+step over them. An empty cell means not known, or nothing new.
 """
 
 from dataclasses import dataclass
@@ -18,9 +20,11 @@ from typing import Any, Final
 import msgspec
 
 from gateway.flightlog.row import COLUMNS, TableRow, row_from_cells
+from gateway.records import FusionState
 
 FORMAT_LINE: Final = "# mavgate table 1"
 HEADER_PREFIX: Final = "# header: "
+STATE_PREFIX: Final = "# state: "
 MARK_PREFIX: Final = "# mark: "
 
 MAX_LINE: Final = 1 << 20
@@ -63,7 +67,7 @@ class TableFault:
     reason: str
 
 
-TableEvent = TableRow | TableMark | TableFault | TableHeader
+TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState
 """A header here is one behind rows: the settings were changed."""
 
 
@@ -75,6 +79,11 @@ def encode_head(header: TableHeader) -> str:
 def encode_header(header: TableHeader) -> str:
     """Write a header as a line of its own."""
     return f"{HEADER_PREFIX}{msgspec.json.encode(header).decode()}\n"
+
+
+def encode_state(state: FusionState) -> str:
+    """Write a state as a line of its own."""
+    return f"{STATE_PREFIX}{msgspec.json.encode(state).decode()}\n"
 
 
 def encode_mark(mark: TableMark) -> str:
@@ -111,7 +120,7 @@ class TableReader:
 
         Returns
         -------
-        list of TableRow, TableMark, TableFault or TableHeader
+        list of TableRow, TableMark, TableFault, TableHeader or FusionState
             In the order of the file.
         """
         *lines, rest = (self._rest + data).split(b"\n")
@@ -141,9 +150,11 @@ class TableReader:
         except (ValueError, msgspec.DecodeError) as error:
             return TableFault(self.lines, size, str(error))
 
-    def _take_comment(self, text: str) -> TableMark | TableHeader | None:
+    def _take_comment(self, text: str) -> TableMark | TableHeader | FusionState | None:
         if text.startswith(MARK_PREFIX):
             return msgspec.json.decode(text.removeprefix(MARK_PREFIX), type=TableMark)
+        if text.startswith(STATE_PREFIX):
+            return msgspec.json.decode(text.removeprefix(STATE_PREFIX), type=FusionState)
         if text.startswith(HEADER_PREFIX):
             header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
             if self.header is not None:

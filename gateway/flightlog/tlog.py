@@ -17,7 +17,9 @@ from gateway.flightlog.tlog_scan import (
     crc_extra_table,
     scan,
 )
+from gateway.units import US_PER_S
 
+DAY_US: Final = 86_400 * US_PER_S
 STRIDE: Final = 256
 """Records between two entries of the index: a seek scans at most this many, some 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
@@ -86,6 +88,18 @@ class Batch:
         begin = int(self.starts[index]) + TIME_SIZE
         return self.data[begin : begin + int(self.sizes[index])]
 
+    def shifted(self, shift_us: int) -> bytes:
+        """Return the bytes from the first record to the last, with all times moved."""
+        if not len(self):
+            return b""
+        begin = int(self.starts[0])
+        end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
+        shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
+        times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
+        places = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
+        shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
+        return shifted.tobytes()
+
     def records(self, begin: int = 0) -> Iterator[TlogRecord]:
         """Go through the records from one of them on."""
         data = self.data
@@ -145,10 +159,35 @@ class TlogScanner:
         offset = self._offset
         self._rest = data[end:]
         self._offset += end
+        found = columns[:, :count]
+        if damaged:
+            found = _without_torn_times(found, runs[1, :damaged])
         begins, ends = runs[:, :damaged].tolist()
         damage = tuple(Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True))
-        starts, sizes, times, origins, message_ids = columns[:, :count]
+        starts, sizes, times, origins, message_ids = found
         return Batch(data, offset, starts, sizes, times, origins, message_ids, damage)
+
+
+def _without_torn_times(columns: IntArray, damage_ends: IntArray) -> IntArray:
+    """Leave out records of which the damage before them has taken a part of the time.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (COLUMNS, n)
+        Records from `scan`.
+    damage_ends : ndarray, shape (m,)
+        Where each damage ends; moved behind what is left out.
+    """
+    starts, sizes, times = columns[:3]
+    far = np.abs(np.diff(times)) > DAY_US
+    torn = []
+    for run, end in enumerate(damage_ends.tolist()):
+        i = int(np.searchsorted(starts, end))
+        # The last of a batch has nothing behind it to compare with.
+        if i < len(far) and starts[i] == end and far[i] and (i == 0 or far[i - 1]):
+            torn.append(i)
+            damage_ends[run] = end + TIME_SIZE + sizes[i]
+    return np.delete(columns, torn, axis=1)
 
 
 class TlogIndex:

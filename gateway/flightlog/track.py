@@ -1,9 +1,9 @@
 """One recording that is being played: a place in a tlog that moves on and can be sought."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from gateway.flightlog.tlog import (
 )
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
-Read = Callable[[int, int], bytes]
-"""Reads up to so many bytes at an offset; empty at the end of the file."""
-
 BLOCK_BYTES: Final = 1 << 18
 """Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
 
@@ -34,15 +31,35 @@ PARAM_NAME: Final = slice(18, 34)
 """Where the parameter's name stands in a MAVLink 2 frame; close enough in the older ones."""
 
 
+class Source(Protocol):
+    """A tlog that is there, or comes into being as it is wanted."""
+
+    @property
+    def index(self) -> TlogIndex:
+        """Of what there is by now."""
+        ...
+
+    @property
+    def last_us(self) -> int:
+        """Time of its end, as far as that is known; 0 if there is nothing."""
+        ...
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to so many bytes; nothing at the end."""
+        ...
+
+    def prepare(self, until_us: int) -> bool:
+        """Do a little of what reading up to a time needs; tells whether that is all done."""
+        ...
+
+
 class Track:
     """A tlog being played.
 
     Parameters
     ----------
-    read : callable
-        Reads the file.
-    index : TlogIndex
-        Of the same file.
+    source : Source
+        The tlog.
     shift_us : int
         Added to every time, to lay several recordings over one another.
     system_ids : mapping of int to int
@@ -51,14 +68,12 @@ class Track:
 
     def __init__(
         self,
-        read: Read,
-        index: TlogIndex,
+        source: Source,
         *,
         shift_us: int = 0,
         system_ids: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
-        self._read = read
-        self._index = index
+        self._source = source
         self._shift_us = shift_us
         self._system_ids = system_ids
         self._records = _records_of(self._read_from(0))
@@ -67,17 +82,23 @@ class Track:
     @property
     def first_us(self) -> int:
         """Time of the first record; 0 in an empty recording."""
-        return (self._index.first_us or 0) + self._shift_us
+        return (self._source.index.first_us or 0) + self._shift_us
 
     @property
     def last_us(self) -> int:
         """Time of the last record."""
-        return (self._index.last_us or 0) + self._shift_us
+        return self._source.last_us + self._shift_us
 
     @property
     def systems(self) -> set[int]:
         """Ids of all that send, as they are played."""
-        return {self._system_ids.get(system_id, system_id) for system_id in self._index.systems}
+        return {
+            self._system_ids.get(system_id, system_id) for system_id in self._source.index.systems
+        }
+
+    def prepare(self, time_us: int) -> bool:
+        """Do a little of what a seek to a time needs; tells whether it can be made at once."""
+        return self._source.prepare(time_us - self._shift_us)
 
     def peek_us(self) -> int | None:
         """Tell the time of the next record, None at the end."""
@@ -113,7 +134,7 @@ class Track:
         """
         wanted_us = time_us - self._shift_us
         newest: dict[tuple[int, int, int, bytes], bytes] = {}
-        batches = self._read_from(self._index.offset_before(wanted_us, CONTEXT_RECORDS))
+        batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
         self._records = iter(())
         for batch in batches:
             reached = np.flatnonzero(batch.time_us >= wanted_us)
@@ -137,7 +158,7 @@ class Track:
     def _read_from(self, offset: int) -> Iterator[Batch]:
         scanner = TlogScanner(offset)
         size = SEEK_BYTES
-        while data := self._read(offset, size):
+        while data := self._source.read(offset, size):
             yield scanner.feed(data)
             offset += len(data)
             size = BLOCK_BYTES

@@ -3,6 +3,8 @@
 import math
 from typing import Annotated, Final
 
+import msgspec
+
 from gateway.records import BaroRaw, BaroSample, ImuFlags, ImuRaw, ImuSample, Vec3
 from gateway.sensing.calibration import (
     IDENTITY3,
@@ -15,6 +17,7 @@ from gateway.sensing.calibration import (
 )
 from gateway.sensing.filters import (
     Coefficients,
+    FilterState,
     Kind,
     VectorFilter,
     design_highpass,
@@ -31,6 +34,8 @@ RETUNE_RATIO: Final = 0.1
 """Difference of measured and designed rate that makes a new design worth its small step."""
 
 ICAO_PRESSURE_PA: Final = 101_325.0
+_Memory = tuple[float, FilterState | None, FilterState | None, int | None, tuple[int, int]]
+"""Rate, low-pass, high-pass, time of the last sample, window of the rate."""
 
 
 class SensingSettings(Settings, frozen=True):
@@ -105,6 +110,21 @@ class SensorChain:
         self._highpass = VectorFilter(self._design_highpass, self._rate_hz)
         self._last_us: int | None = None
         self._window: tuple[int, int] = (0, 0)
+
+    def snapshot(self) -> bytes:
+        """Write down all that is remembered."""
+        memory = (self._rate_hz, self._lowpass.state, self._highpass.state)
+        return msgspec.msgpack.encode((*memory, self._last_us, self._window))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot; raises ValueError if it is none."""
+        rate_hz, lowpass, highpass, self._last_us, self._window = msgspec.msgpack.decode(
+            snapshot, type=_Memory
+        )
+        self._rate_hz = rate_hz
+        self._lowpass = VectorFilter(self._design_lowpass, rate_hz)
+        self._highpass = VectorFilter(self._design_highpass, rate_hz)
+        self._lowpass.state, self._highpass.state = lowpass, highpass
 
     @property
     def rate_hz(self) -> float:

@@ -20,6 +20,8 @@ Coefficients = tuple[float, float, float, float, float]
 """`b0, b1, b2, a1, a2` of the difference equation, `a0` being 1."""
 Delays = tuple[float, float, float, float, float, float]
 """The two delay elements of each axis, in transposed direct form II."""
+FilterState = tuple[Delays, Vec3]
+"""Delays and last output."""
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -137,8 +139,8 @@ class VectorFilter:
     def __init__(self, design: Callable[[float], Coefficients], rate_hz: float) -> None:
         self._design = design
         self._coefficients = design(rate_hz)
-        self.state: tuple[Delays, Vec3] | None = None
-        """Delays and last output; None before the first sample. May be read and restored."""
+        self.state: FilterState | None = None
+        """None before the first sample. May be read and restored."""
 
     def reset(self) -> None:
         """Forget the past: the next sample starts the filter afresh."""

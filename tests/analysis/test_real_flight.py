@@ -11,20 +11,17 @@ from gateway.analysis.flight import FusionSettings
 from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_rows
 from gateway.analysis.sweep import with_value
+from gateway.cli.flights import TRACKER_LOG
 from gateway.edges.flight_files import read_chunks
 from gateway.flightlog.foreign import ColumnMap, ForeignReader
 from gateway.sensing.calibration import NodeCalibration
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
     text = b"".join(read_chunks(data_dir / "arduplane_testlog2.csv.gz")).decode()
-    columns = msgspec.toml.decode(
-        (ROOT / "config/columns/tracker-log.toml").read_bytes(), type=ColumnMap
-    )
+    columns = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
     fusion = FusionSettings()
     for name, value in (
         ("gps_latency_s", 0.28), ("declination", "fixed"), ("declination_deg", 11.0)

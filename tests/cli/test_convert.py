@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.cli.convert import pipeline_settings
+from gateway.config import GatewaySettings
 from gateway.flightlog.row import TableRow
 from gateway.flightlog.table import TableFault, TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
@@ -23,7 +23,6 @@ from tests.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 
-ROOT = Path(__file__).resolve().parents[2]
 RECORDS = make_records(500)
 
 
@@ -50,7 +49,7 @@ def tlog(tmp_path: Path) -> Path:
 @pytest.fixture
 def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     path = tmp_path / "flight.csv"
-    path.write_bytes(fly(pipeline_settings(None).default, make_flight(rng, 20))[0])
+    path.write_bytes(fly(GatewaySettings().default_aircraft, make_flight(rng, 20))[0])
     return path
 
 
@@ -127,7 +126,7 @@ def test_positions_on_straight_lines(table: Path, tmp_path: Path) -> None:
     run("convert", table, "-o", out, "--fuse", "--position", "interpolated")
     _, rows = read_table(out)
     fixes = [(row.gps.time_us, row.gps.alt_amsl_m) for row in rows if row.gps]
-    latency_us = round(1e6 * pipeline_settings(None).default.estimation.reference.gps_latency_s)
+    latency_us = round(1e6 * GatewaySettings().default_aircraft.estimation.reference.gps_latency_s)
     times, alts = np.array(fixes).T
     middle = rows[len(rows) // 2].state
     assert middle is not None
@@ -147,6 +146,12 @@ def test_a_track_for_a_map(
     run("convert", path, "-o", out)
     tags = [element.tag.partition("}")[2] for element in ET.parse(out).iter()]
     assert tags.count("coord" if ending == "kml" else "trkpt") > 50
+
+
+def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:
+    text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
+    assert "tells no position" in " ".join(text.split())
+    assert not (tmp_path / "out.kml").exists()
 
 
 def test_an_autopilots_tlog_becomes_a_table_that_is_fused(tmp_path: Path) -> None:
@@ -181,15 +186,21 @@ def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
         lines.append(f"{0.02 * i},0,0,-9.81,0,0,0,20,0,40,430,{gps}")
     source = tmp_path / "log.csv.gz"
     source.write_bytes(gzip.compress("\n".join(lines).encode()))
-    assert "--columns" in run("convert", source, "-o", tmp_path / "x.csv", code=2)
     out = tmp_path / "flight.csv"
-    column_map = ROOT / "config" / "columns" / "tracker-log.toml"
-    run("convert", source, "-o", out, "--columns", column_map)
+    run("convert", source, "-o", out)
     _, rows = read_table(out)
     states = [row.state for row in rows if row.state is not None]
     assert len(states) == 500
     assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
     assert math.isfinite(states[-1].alt_amsl_m)
+    own = tmp_path / "map.toml"
+    own.write_text('[columns]\ntime_us = "t"\naccel_x_b_mps2 = "ax"\ngyro_x_b_radps = "gx"\n')
+    refused = run("convert", source, "-o", tmp_path / "x.csv", "--columns", own, code=2)
+    assert "has no column t" in " ".join(refused.split())
+    own.write_text(own.read_text().replace('"t"', '{ column = "time_s", scale = 1e6 }'))
+    run("convert", source, "-o", tmp_path / "x.csv", "--columns", own)
+    _, rows = read_table(tmp_path / "x.csv")
+    assert (len(rows), rows[-1].gps) == (500, None)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +262,43 @@ def test_recover_a_table(table: Path, tmp_path: Path) -> None:
     assert "line 11" in text
     _, rows = read_table(tmp_path / "flight.recovered.csv")
     assert len(rows) == len(lines) - 4 - 2
+
+
+def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
+    whole = table.read_bytes()
+    table.write_bytes(whole.replace(b"# header: {", b"# header: }", 1))
+    text = run("recover", table)
+    assert "head is lost" in text
+    header, rows = read_table(tmp_path / "flight.recovered.csv")
+    assert header.settings == {}
+    assert len(rows) == whole.count(b"\n") - 3
+    run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
+
+
+def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> None:
+    plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
+    run("convert", table, "-o", plain, "--from", "5", "--to", "10")
+    run("convert", table, "-o", fused, "--from", "5", "--to", "10", "--fuse")
+    assert fused.read_bytes() == plain.read_bytes()
+    header, rows = read_table(fused)
+    assert not header.cold_start
+    assert 0 < len(rows) < len(read_table(table)[1])
+
+
+def test_a_table_tells_what_it_was_fused_with(table: Path, tmp_path: Path) -> None:
+    config = tmp_path / "other.toml"
+    config.write_text('[estimation]\nestimator = "paper"\n')
+    again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
+    run("convert", table, "-o", again, "--fuse", "--settings", "current", "--config", config)
+    run("convert", again, "-o", twice, "--fuse")
+    assert twice.read_bytes() == again.read_bytes() != table.read_bytes()
+
+
+def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.csv"
+    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
+    text = run("convert", table, other, "-o", tmp_path / "x.csv", code=2)
+    assert "aircraft 1 and 2" in " ".join(text.split())
 
 
 def test_recover_of_a_sound_file_says_so(tlog: Path, tmp_path: Path) -> None:

@@ -4,10 +4,15 @@ import csv
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
+from gateway.flightlog.row import row_to_line
+from gateway.flightlog.table import encode_head, encode_state
+from gateway.replay import header_for
+from tests.test_replay import fly_from_the_middle
 
 HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
 
@@ -47,6 +52,20 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
     assert math.degrees(yaw) == pytest.approx(10.0, abs=0.5)
     known = last["pos_std_north_m"] != ""
     assert known == (estimator == "eskf")
+
+
+@pytest.mark.io
+def test_a_recording_gives_its_own_states_also_from_its_middle(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    settings, state, rows = fly_from_the_middle("complementary", rng)
+    path = tmp_path / "flight.csv"
+    head = encode_head(header_for(settings, 1)) + encode_state(state)
+    path.write_text(head + "".join(map(row_to_line, rows)))
+    recorded = [row.state for row in rows if row.state]
+    again = run(path)
+    assert [row["qw"] for row in again] == [f"{known.q_nb[0]:.10g}" for known in recorded]
+    assert [row["lat_deg"] for row in again] == [f"{known.lat_deg:.10g}" for known in recorded]
 
 
 @pytest.mark.io

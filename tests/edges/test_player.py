@@ -11,6 +11,7 @@ from gateway.edges.clock import GatewayClock
 from gateway.edges.player import BATCH, PlayerEdge, TlogFile
 from gateway.flightlog.playback import Player
 from gateway.flightlog.tlog import TlogRecord
+from gateway.flightlog.track import Track
 from tests.conftest import ManualClock
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 
@@ -35,7 +36,7 @@ class Played:
         self.file = TlogFile(path)
         self.frames: list[bytes] = []
         self.ended = asyncio.Event()
-        player = Player([self.file.track()], clock(), **options)  # type: ignore[arg-type]
+        player = Player([Track(self.file)], clock(), **options)  # type: ignore[arg-type]
         self.edge = PlayerEdge(player, self._emit, clock, files=[path.name], on_end=self.ended.set)
 
     def _emit(self, frames: Iterable[bytes]) -> None:
@@ -87,7 +88,7 @@ def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
     file = TlogFile(tlog, seen.append)
     assert sum(seen) == tlog.stat().st_size
     assert file.index.count == COUNT
-    track = file.track(system_ids={1: 5})
+    track = Track(file, system_ids={1: 5})
     track.seek(RECORDS[500].time_us)
     assert track.peek_us() == RECORDS[500].time_us
     file.close()
@@ -95,7 +96,7 @@ def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
 
 def test_a_file_that_shrinks_while_it_plays_just_ends(tlog: Path) -> None:
     file = TlogFile(tlog)
-    track = file.track()
+    track = Track(file)
     tlog.write_bytes(make_tlog(RECORDS[:10]))
     track.seek(START_US)
     found = []

@@ -17,7 +17,7 @@ from gateway.flightlog.row import TableRow
 from gateway.flightlog.session import RETRY_US, RecordingSettings
 from gateway.flightlog.table import TableHeader, TableMark, TableReader
 from gateway.flightlog.tlog import TlogRecord, TlogScanner
-from gateway.records import FusedSample
+from gateway.records import FusedSample, FusionState
 from tests.conftest import ManualClock
 from tests.flightlog.frames import make_frames
 from tests.flightlog.samples import make_baro, make_flight, make_fused
@@ -147,6 +147,33 @@ async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.
     assert not reader.header.cold_start
 
 
+async def test_a_part_begins_with_what_the_fusion_remembers(
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
+) -> None:
+    bench = Bench(tmp_path, clock, rotate_min=1)
+    seen = 0
+    bench.recorder._state_of = lambda vehicle_id: FusionState(vehicle_id, str(seen), b"", b"")
+    await bench.turn()
+    flight = [make_fused(rng, 1000), make_baro(rng, 1500), make_fused(rng, 2000)]
+    for record in flight[:2]:
+        bench.recorder.flight(record)
+    seen = 2
+    await bench.turn(100)
+    seen = 3
+    bench.recorder.settings_changed(3)
+    bench.recorder.flight(flight[2])
+    bench.recorder.close()
+    first, second = (
+        TableReader().feed(path.read_bytes(), final=True) for path in sorted(tmp_path.glob("*.csv"))
+    )
+    # What waited for the next sample was fused before the second part began.
+    assert [type(event) for event in first] == [TableRow, TableRow]
+    assert second[0] == FusionState(3, "2", b"", b"")
+    assert [type(event) for event in second[1:]] == [TableHeader, TableRow]
+    assert isinstance(second[2], TableRow)
+    assert second[2].baro is None
+
+
 async def test_rotation_loses_nothing(tmp_path: Path, clock: ManualClock) -> None:
     bench = Bench(tmp_path, clock, rotate_min=1)
     await bench.turn()
@@ -239,18 +266,28 @@ async def test_a_disk_that_hangs_costs_recording_not_memory(bench: Bench) -> Non
 
 
 async def test_names_and_times_are_put_right_once_gps_tells_them(
-    bench: Bench, rng: np.random.Generator
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
+    bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
     bench.unix_at_zero_us = 1_000_000
     await bench.turn()
-    bench.send(FRAMES[:5])
+    bench.send(FRAMES[:3])
+    await bench.turn(100)
+    bench.send(FRAMES[3:5])
+    bench.recorder.flight(make_fused(rng, 1000))
     await bench.turn()
     bench.recorder._civil.hear_gps(UNIX_US + bench.clock(), bench.clock())
     await bench.turn()
     bench.send(FRAMES[5:])
     bench.recorder.close()
     files = sorted(bench.recorder.folder.iterdir())
-    assert [path.name for path in files] == [f"{NAME}_01.tlog", f"{NAME}_02.tlog"]
+    table = files.pop(2)
+    assert [path.name for path in files] == [f"{NAME}_0{n}.tlog" for n in (1, 2, 3)]
+    assert table.name == f"{NAME}_02_v3.csv"
+    reader = TableReader()
+    reader.feed(table.read_bytes())
+    assert reader.header is not None
+    assert reader.header.unix_us_at_zero == UNIX_US
     records = [record for path in files for record in read_tlog(path)]
     assert [record.frame for record in records] == FRAMES
     times = [record.time_us for record in records]

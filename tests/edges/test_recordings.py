@@ -11,11 +11,9 @@ from gateway.edges.recordings import (
     find_recording,
     free_name,
     list_recordings,
+    parts_together,
     rename_recording,
-    restamp_recording,
 )
-from gateway.flightlog.tlog import TlogScanner
-from tests.flightlog.frames import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 
@@ -62,18 +60,21 @@ def test_delete_takes_its_own_files_only(folder: Path) -> None:
         delete_recording(folder, "b")
 
 
+def test_parts_that_follow_one_another_are_together(tmp_path: Path) -> None:
+    names = ["a_01.tlog", "a_01_v1.csv", "a_02.tlog", "x.tlog", "a_02_v1.csv", "a_02_v2.csv"]
+    found = parts_together([tmp_path / name for name in [*names, "x.tlog", "a_02.tlog"]])
+    assert [[path.name for path in parts] for parts in found] == [
+        ["a_01.tlog", "a_02.tlog"],
+        ["a_01_v1.csv", "a_02_v1.csv"],
+        ["x.tlog"],
+        ["a_02_v2.csv"],
+        ["x.tlog"],
+        ["a_02.tlog"],
+    ]
+
+
 def test_a_free_name_has_a_number_where_needed(folder: Path) -> None:
     assert free_name(folder, "c") == "c"
     assert free_name(folder, "a") == "a-2"
     (folder / "a-2_01.tlog").touch()
     assert free_name(folder, "a") == "a-3"
-
-
-def test_restamp_shifts_the_times_alone(tmp_path: Path) -> None:
-    records = make_records(10)
-    (tmp_path / "a_01.tlog").write_bytes(make_tlog(records))
-    restamp_recording(tmp_path, "a", 1, 5_000_000)
-    (path,) = tmp_path.iterdir()
-    after = list(TlogScanner().feed(path.read_bytes(), final=True).records())
-    assert [record.frame for record in after] == [record.frame for record in records]
-    assert after[0].time_us == START_US + 5_000_000

@@ -1,20 +1,17 @@
 """Other people's columns become our rows."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from gateway.cli.flights import TRACKER_LOG
 from gateway.flightlog.foreign import Column, ColumnMap, ForeignReader
 from gateway.records import GpsFixType, ImuFlags
 from gateway.sensing.chain import pressure_altitude_m
 
-ROOT = Path(__file__).resolve().parent.parent.parent
-TRACKER = msgspec.toml.decode(
-    (ROOT / "config/columns/tracker-log.toml").read_bytes(), type=ColumnMap
-)
+TRACKER = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
 NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"
 NAMES += "gps_vn,gps_ve,gps_vd,note"
 

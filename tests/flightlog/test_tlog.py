@@ -122,6 +122,20 @@ def test_zeros_at_the_end_as_after_a_power_cut_are_damage() -> None:
     assert index.damage == [Damage(len(data), 4096)]
 
 
+@pytest.mark.parametrize("fill", [b"\0", b"\xff"])
+@pytest.mark.parametrize("torn", range(9))
+def test_a_record_that_lost_a_part_of_its_time_goes_too(torn: int, fill: bytes) -> None:
+    records = make_records(100)
+    head, data = make_tlog(records[:50]), make_tlog(records)
+    cut = data[: len(head) - 20] + fill * (20 + torn) + data[len(head) + torn :]
+    batches = scan(cut, strict=True)
+    found = records_of(batches)
+    assert found[:49] == records[:49]
+    assert found[-49:] == records[51:]
+    assert all(abs(record.time_us - START_US) < 3600e6 for record in found)
+    assert index_of(batches).damaged_bytes == len(cut) - len(make_tlog(found))
+
+
 def test_index_finds_each_time() -> None:
     count = 5 * STRIDE + 3
     records = make_records(count)

@@ -9,10 +9,24 @@ from gateway.wire.mavlink_splitter import message_id_of
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 
 
+class Source:
+    """A tlog in memory."""
+
+    def __init__(self, data: bytes, index: TlogIndex) -> None:
+        self.data, self.index = data, index
+        self.last_us = index.last_us or 0
+
+    def read(self, offset: int, size: int) -> bytes:
+        return self.data[offset : offset + size]
+
+    def prepare(self, until_us: int) -> bool:
+        return True
+
+
 def make_track(data: bytes, **options: object) -> Track:
     index = TlogIndex()
     index.add(TlogScanner().feed(data, final=True))
-    return Track(lambda offset, size: data[offset : offset + size], index, **options)  # type: ignore[arg-type]
+    return Track(Source(data, index), **options)  # type: ignore[arg-type]
 
 
 def play_all(track: Track) -> list[TlogRecord]:
