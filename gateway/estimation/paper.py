@@ -45,6 +45,7 @@ from gateway.estimation.paper_kernels import is_finite
 from gateway.estimation.record import (
     FloatArray,
     IntArray,
+    Packed,
     copy_record,
     filled_record,
     new_record,
@@ -188,7 +189,7 @@ class PaperEstimator:
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
-        kind = tuple[PaperState, tuple[str, bytes], EarthPlace | None]
+        kind = tuple[PaperState, Packed, EarthPlace | None]
         self._s, packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
         self._held = Held(unpack_record(kernels.Memory, packed))
 
