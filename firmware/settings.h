@@ -77,11 +77,11 @@
 #define ACCEL_LOWPASS_HZ 10.0
 #endif
 
-// Cutoff of the first-order high-pass on the angular rate. It takes the gyroscope's bias away, and
-// with it, slowly, the rate of a turn that lasts: a turn of 30 s loses 2 % by its end at 0.0001 Hz
-// and 17 % at 0.001 Hz, which on the simulated flight triples the attitude's error.
+// Cutoff of the first-order high-pass on the angular rate; 0 for none. It takes the gyroscope's bias
+// away, and with it, slowly, the rate of a turn that lasts: a turn of 30 s loses 2 % by its end at
+// 0.0001 Hz and 17 % at 0.001 Hz. The gateway learns the bias itself, at rest and from the fixes.
 #ifndef GYRO_HIGHPASS_HZ
-#define GYRO_HIGHPASS_HZ 0.0001
+#define GYRO_HIGHPASS_HZ 0.0
 #endif
 
 // 0 to 3: +-2, 4, 8, 16 g and +-250, 500, 1000, 2000 deg/s.

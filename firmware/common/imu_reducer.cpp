@@ -43,7 +43,10 @@ void give(ImuReducer *reducer, const ImuReducerSettings &settings, WireImu *payl
     }
     payload->flags = reducer->flags;
     if (!settings.raw) {
-        payload->flags |= WIRE_ACCEL_FILTERED | WIRE_GYRO_FILTERED;
+        payload->flags |= WIRE_ACCEL_FILTERED;
+        if (settings.gyro_highpass_gain > 0) {
+            payload->flags |= WIRE_GYRO_FILTERED;
+        }
     }
     reducer->flags = 0;
 }

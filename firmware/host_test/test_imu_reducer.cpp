@@ -63,6 +63,18 @@ TEST(filtered_mode_says_so_and_starts_settled) {
     CHECK(payload.flags == (WIRE_ACCEL_FILTERED | WIRE_GYRO_FILTERED));
 }
 
+TEST(without_a_high_pass_the_rate_passes_and_says_so) {
+    ImuReducer reducer = {};
+    WireImu payload = {};
+    ImuReducerSettings set = settings(100, false);
+    set.gyro_highpass_gain = high_pass_gain(0.0, 100);
+    for (int i = 0; i < 30000; ++i) {
+        imu_reduce(&reducer, set, reading(4096, 500), &payload);
+    }
+    CHECK(payload.gyro[0] == 500);
+    CHECK(payload.flags == WIRE_ACCEL_FILTERED);
+}
+
 TEST(clipping_of_one_reading_is_told_once) {
     ImuReducer reducer = {};
     WireImu payload = {};

@@ -2,7 +2,7 @@
 
 Horizontally the paper's eq. 1, 2, 7 and 8 as recursions; the weights follow from a time constant,
 so they suit any fix rate. Vertically the barometer, offset to the GPS height, blends in the same
-way and also learns the error of the vertical acceleration.
+way and also learns the error of the vertical acceleration; the fixes tell the other two.
 """
 
 import math
@@ -13,7 +13,7 @@ from gateway.estimation.columns import GPS_H_ACC
 from gateway.estimation.complementary.state import Gains, State
 from gateway.estimation.place import BARO_STALE_S
 from gateway.estimation.record import FloatArray, as_quat, put
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -21,6 +21,9 @@ DRIFT_MPS2: Final = 1.0
 """Acceleration error that dead reckoning may have had, for the gates."""
 BLUNDER_H_ACC_M: Final = 30.0
 ACCEL_BIAS_LIMIT_MPS2: Final = 1.0
+TAU_ACCEL_BIAS_S: Final = 60.0
+"""Time in which the accelerometer's bias is learned from the fixes."""
+LEVEL_BIAS_LIMIT_MPS2: Final = 0.5
 REST_DECAY_S: Final = 0.5
 
 
@@ -38,7 +41,9 @@ def dead_reckon(s: State, force_b: Vec3, dt: float) -> None:
         Time step, s.
     """
     force_i = rotate(as_quat(s.q_ib), force_b)
-    north, east, down = rotate(as_quat(s.q_nb), force_b)
+    b = s.accel_bias_b
+    unbiased = (force_b[0] - b[0], force_b[1] - b[1], force_b[2] - b[2])
+    north, east, down = rotate(as_quat(s.q_nb), unbiased)
     accel = (north, east, down + STANDARD_GRAVITY_MPS2 - s.accel_bias_d)
     for k in range(3):
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * accel[k] * dt) * dt
@@ -101,6 +106,8 @@ def blend_fix(
         step = gain_vel * (vel[k] - past[1][k])
         s.pos_n[k] += gain_pos * (pos[k] - past[0][k]) + step * lag
         s.vel_n[k] += step
+    if s.at_rest == 0:
+        learn_accel_bias(s, gain_vel, vel, past[1])
     baro_fresh = s.baro_known == 1 and s.time_s - s.baro_s < BARO_STALE_S
     if baro_fresh:
         gain = 1.0 - math.exp(-dt / p.tau_baro_offset_s)
@@ -111,6 +118,18 @@ def blend_fix(
         step = gain_vel * (vel[2] - past[1][2])
         s.pos_n[2] += gain_pos * (pos[2] - past[0][2]) + step * lag
         s.vel_n[2] += step
+
+
+@compiled
+def learn_accel_bias(s: State, gain_vel: float, vel: Vec3, past_vel: Vec3) -> None:
+    """Take what the fixes keep moving the level velocity by for an error fixed in the body.
+
+    Only dead reckoning is relieved of it: the attitude holds its own against such an error.
+    """
+    off = rotate_inverse(as_quat(s.q_nb), (vel[0] - past_vel[0], vel[1] - past_vel[1], 0.0))
+    for k in range(3):
+        bias = s.accel_bias_b[k] - gain_vel / TAU_ACCEL_BIAS_S * off[k]
+        s.accel_bias_b[k] = max(-LEVEL_BIAS_LIMIT_MPS2, min(LEVEL_BIAS_LIMIT_MPS2, bias))
 
 
 @compiled

@@ -222,6 +222,8 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     """1 if the declination was known or the GPS gave the heading."""
     declination_rad: float
     mag_s: float
+    accel_bias_b: Annotated[FloatArray, (3,)]
+    """Error of the specific force as the fixes' velocities tell it, m/s2."""
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float
