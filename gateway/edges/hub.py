@@ -243,8 +243,9 @@ class Hub:
         if round_trip_us is not None:
             link.round_trip_us = round_trip_us
             return
-        shared = self._table.is_shared(origin, now_us)
-        if shared and self._guard.is_copy(frame, link.client_id, now_us):
+        if self._table.is_shared(origin, now_us) and self._guard.is_copy(
+            frame, link.client_id, self._table.since_us(link.client_id, origin), now_us
+        ):
             self._duplicates += 1
         elif target_of(frame)[0]:
             self._route_addressed(link, frame, now_us)

@@ -87,6 +87,37 @@ async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     assert world.incoming[-1].frame != ours
 
 
+async def test_a_program_started_again_and_again_is_heard_at_its_first_word(world: Any) -> None:
+    port = world.world.listening_ports()[0]
+    for _ in range(4):
+        again = world.station(port)
+        request = again.sender.command(42, 1)
+        again.say(request)
+        assert await world.autopilot.receive() == request
+        again.socket.close()
+        world.clock.us += 100_000
+    assert world.world.counters().duplicates == 0
+
+
+async def test_a_copy_goes_round_a_loop_once_at_most(world: Any) -> None:
+    """Whoever echoes from the start is heard as a second way; then its echoes end here."""
+    port = world.world.listening_ports()[0]
+    echo = world.station(port)
+    said = [world.autopilot.sender.attitude() for _ in range(5)]
+    world.autopilot.say(said[0])
+    assert await world.first.receive() == said[0]
+    world.clock.us += 1000
+    echo.say(said[0])
+    assert [await world.first.receive(), await world.autopilot.receive()] == [said[0], said[0]]
+    for count, frame in enumerate(said[1:], start=1):
+        world.clock.us += 1000
+        world.autopilot.say(frame)
+        assert [await world.first.receive(), await echo.receive()] == [frame, frame]
+        echo.say(frame)
+        await world.until(lambda count=count: world.world.counters().duplicates == count)
+    assert world.first.is_silent()
+
+
 async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     trusted = rig.station()
     hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
