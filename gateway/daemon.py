@@ -164,6 +164,7 @@ class Daemon:
             clients=self._hub.clients(),
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
+            listeners=(*self._hub.listeners(), *self._metrics.listeners()),
         )
 
     def _reload_or_refuse(self) -> str:

@@ -3,17 +3,18 @@
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub_express import Express
 from gateway.edges.hub_group import GroupLink
-from gateway.edges.hub_link import Link, Listener
+from gateway.edges.hub_link import Link
+from gateway.edges.hub_listener import Listener
 from gateway.edges.hub_serial import SerialLink
 from gateway.edges.hub_stream import TcpLink, TcpListener
 from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
@@ -45,7 +46,7 @@ LINKS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Link]]] = {
     EndpointKind.TCP: TcpLink,
     EndpointKind.SERIAL: SerialLink,
 }
-LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener]]] = {
+LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
 }
@@ -91,7 +92,7 @@ class Hub:
         self._guard = LoopGuard()
         self._probe = RoundTrip()
         self._links: dict[int, Link] = {}
-        self._endpoints: dict[str, Link | Listener] = {}
+        self._endpoints: dict[str, Link | Listener[Any]] = {}
         self._next_id = 1
         self._vehicles = OwnVehicles()
         self._ping_us = 0
@@ -198,6 +199,12 @@ class Hub:
             self._links[key].stats(self._table.origins(key)) for key in sorted(self._links)
         )
 
+    def listeners(self) -> tuple[ListenerStats, ...]:
+        """Describe every listening port at this moment, in the order of the settings."""
+        return tuple(
+            opened.stats() for opened in self._endpoints.values() if not isinstance(opened, Link)
+        )
+
     def endpoints(self) -> tuple[str, ...]:
         """Return the URLs of all endpoints."""
         return tuple(opened.endpoint.url for opened in self._endpoints.values())
@@ -215,9 +222,7 @@ class Hub:
 
     def listening_ports(self) -> tuple[int, ...]:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
-        return tuple(
-            endpoint.port for endpoint in self._endpoints.values() if not isinstance(endpoint, Link)
-        )
+        return tuple(listener.port for listener in self.listeners())
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
@@ -355,7 +360,7 @@ class Hub:
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     def _tell_trouble(self, now_us: int) -> None:
-        for text in self._trouble.update(self.clients(), now_us):
+        for text in self._trouble.update(self.clients(), self.listeners(), now_us):
             log.warning("%s", text)
             if self._on_trouble is not None:
                 self._on_trouble(text)

@@ -43,6 +43,25 @@ class ClientStats:
     since_us: int
     heard_us: int | None
     round_trip_us: int | None
+    reason: str = ""
+    """Why nothing goes out, in the words of the operating system; empty if it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerStats:
+    """One listening port at one moment."""
+
+    name: str
+    endpoint: str
+    state: str
+    """`open`, or `closed` while it cannot be bound or can take nobody in."""
+    reason: str
+    """Why it is closed, in the words of the operating system; empty if it is open."""
+    port: int
+    """The port that is bound, or 0."""
+    clients: int
+    turned_away: int
+    """How often somebody came who had no room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +106,6 @@ class ClientTable:
     def __init__(self, max_clients: int, idle_timeout_us: int) -> None:
         self.max_clients = max_clients
         self.idle_timeout_us = idle_timeout_us
-        self.refused = 0
         self._by_address: dict[tuple[str, int], Presence] = {}
 
     def __len__(self) -> int:
@@ -116,7 +134,6 @@ class ClientTable:
         if len(self._by_address) >= self.max_clients:
             leaver = min(self._by_address.values(), key=lambda presence: presence.heard_us)
             if now_us - leaver.heard_us < SILENT_AFTER_US:
-                self.refused += 1
                 return None, None
             self.remove(leaver)
         presence = Presence(client_id, address, now_us)

@@ -1,5 +1,8 @@
 """The hub between many endpoints: routing, loops, changes at run time, round trips."""
 
+import os
+import resource
+import socket
 from typing import Any
 
 import msgspec
@@ -286,3 +289,58 @@ class TestExpress:
             other.say(frame)
         await world.until(lambda: hub.counters().duplicates == 5)
         assert world.first.is_silent()
+
+
+class TestListeningPorts:
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_taken_port_is_shown_and_opens_when_it_is_free(
+        self, rig: Any, kind: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        taken = rig.station(kind=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        if kind == "tcp":
+            taken.socket.listen()
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:{taken.port}?name=here")
+        for tick in range(4):
+            rig.clock.us = tick * 2_000_000
+            rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("closed", "Address already in use", 0)
+        assert caplog.text.count("Address already in use; trying again") == 1
+        taken.socket.close()
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("open", "", taken.port)
+
+    async def test_clients_without_room_are_counted(self, rig: Any) -> None:
+        hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=1)
+        for turned_away in (0, 1, 2):
+            caller = rig.station(hub.listening_ports()[0])
+            caller.say(caller.sender.heartbeat())
+            await rig.until(lambda n=turned_away: hub.listeners()[0].turned_away == n)
+            await rig.until(lambda: hub.listeners()[0].clients == 1)
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(
+        self, rig: Any, kind: str
+    ) -> None:
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        (place,) = hub.listening_ports()
+        caller = rig.station(place, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(os.dup(0), soft), hard))
+        try:
+            if kind == "tcp":
+                caller.socket.connect_ex(caller.target)
+            else:
+                caller.say(caller.sender.heartbeat())
+            await rig.until(lambda: hub.listeners()[0].reason == "Too many open files")
+            assert hub.clients() == ()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        if kind == "udp":
+            caller.say(caller.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 1)
+        assert hub.listeners()[0].state == "open"
