@@ -92,10 +92,11 @@ class Hub:
         self._guard = LoopGuard()
         self._probe = RoundTrip()
         self._links: dict[int, Link] = {}
+        self._express_sources: set[Link] = set()
         self._endpoints: dict[str, Link | Listener[Any]] = {}
         self._next_id = 1
         self._vehicles = OwnVehicles()
-        self._ping_us = 0
+        self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._published = self._forwarded = self._duplicates = 0
         self._looped = self._unroutable = 0
@@ -320,6 +321,7 @@ class Hub:
         if takers is None or key in link.express or len(link.express) >= MAX_EXPRESS:
             return
         links = [self._links[taker] for taker in takers]
+        self._express_sources.add(link)
         link.express[key] = Express(link, message_id_of(frame), links, self._on_foreign)
 
     def _tap(self, frame: bytes) -> None:
@@ -330,11 +332,12 @@ class Hub:
     def _forget_express(self) -> None:
         """Judge every frame anew: somebody came, went or changed."""
         self._settle_express()
-        for link in self._links.values():
+        for link in self._express_sources:
             link.express.clear()
+        self._express_sources.clear()
 
     def _settle_express(self) -> None:
-        for link in self._links.values():
+        for link in self._express_sources:
             for express in link.express.values():
                 self._forwarded += express.settle()
 
@@ -360,6 +363,9 @@ class Hub:
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     def _tell_trouble(self, now_us: int) -> None:
+        if now_us - self._trouble_us < US_PER_S:
+            return
+        self._trouble_us = now_us
         for text in self._trouble.update(self.clients(), self.listeners(), now_us):
             log.warning("%s", text)
             if self._on_trouble is not None:

@@ -5,6 +5,7 @@ port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allow
 only after the bind, so that a second gateway on the same port still fails loudly.
 """
 
+import itertools
 import socket
 import struct
 from typing import Final
@@ -20,6 +21,10 @@ from gateway.wire.mavlink_splitter import origin_of, split_datagram
 IP_PKTINFO: Final = 8
 """Not exported by `socket` before Python 3.14; tells to which of our addresses a client spoke."""
 ANCILLARY_BYTES: Final = 64
+STRANGERS: Final = 4
+"""Taken at one wake-up: to admit one takes as long as to serve the others several times."""
+PARTINGS: Final = 32
+"""From clients that have died, at one tick; they cost nothing until it is their turn."""
 
 Address = tuple[str | int, ...]
 
@@ -74,10 +79,10 @@ class UdpListener(Listener[UdpPeer]):
         self.table.max_clients = settings.max_clients
         self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
         self._note_speakers()
-        for presence in self.table.presences():
-            if self._links[presence.client_id].has_died(now_us):
-                self.table.remove(presence)
-                self._leave(presence)
+        dead = (p for p in self.table.presences() if self._links[p.client_id].has_died(now_us))
+        for presence in itertools.islice(dead, PARTINGS):
+            self.table.remove(presence)
+            self._leave(presence)
         for presence in self.table.expire(now_us):
             self._leave(presence)
 
@@ -90,7 +95,7 @@ class UdpListener(Listener[UdpPeer]):
         return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(READ_BUDGET):
+        for _ in range(STRANGERS):
             try:
                 data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
             except OSError:
@@ -110,6 +115,9 @@ class UdpListener(Listener[UdpPeer]):
         if first is None:
             return None
         now_us = self._context.now_us()
+        if self.table.is_full(now_us):
+            self.turned_away += 1
+            return None
         host, port = str(address[0]), int(address[1])
         self._note_speakers()
         presence, leaver = self.table.admit((host, port), self._context.new_client_id(), now_us)

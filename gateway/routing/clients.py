@@ -107,9 +107,15 @@ class ClientTable:
         self.max_clients = max_clients
         self.idle_timeout_us = idle_timeout_us
         self._by_address: dict[tuple[str, int], Presence] = {}
+        self._full_until_us = 0
+        """Until then nobody in a full table can have been silent for long enough."""
 
     def __len__(self) -> int:
         return len(self._by_address)
+
+    def is_full(self, now_us: int) -> bool:
+        """Tell whether there is no room and nobody has been silent for long; soon told."""
+        return len(self) >= self.max_clients and now_us < self._full_until_us
 
     def presences(self) -> tuple[Presence, ...]:
         """Return all clients."""
@@ -134,6 +140,7 @@ class ClientTable:
         if len(self._by_address) >= self.max_clients:
             leaver = min(self._by_address.values(), key=lambda presence: presence.heard_us)
             if now_us - leaver.heard_us < SILENT_AFTER_US:
+                self._full_until_us = leaver.heard_us + SILENT_AFTER_US
                 return None, None
             self.remove(leaver)
         presence = Presence(client_id, address, now_us)
