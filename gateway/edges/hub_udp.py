@@ -216,7 +216,8 @@ class UdpLink(DatagramLink):
     """A UDP peer at a configured place.
 
     A name may resolve only later, or to another address later: it is looked up again while nothing
-    is heard from there.
+    is heard from there. Of several addresses, as `localhost` has, one that refuses gives way to the
+    next.
     """
 
     _port = 0
@@ -227,6 +228,7 @@ class UdpLink(DatagramLink):
     def __post_init__(self) -> None:
         """Open at once if possible."""
         super().__post_init__()
+        self._places: list[tuple[int, tuple[Any, ...]]] = []
         self.become("resolving")
         self.tick(self.context.now_us())
 
@@ -237,8 +239,12 @@ class UdpLink(DatagramLink):
         self._retry_us = now_us + RETRY_US
         if self.state == "unreachable":
             super().close()
-        if self.refused_us is not None and now_us - self.refused_us >= RETRY_US:
-            self.revive()
+        if self.refused_us is not None:
+            if len(self._places) > 1:
+                self._places.append(self._places.pop(0))
+                self._connect()
+            elif now_us - self.refused_us >= RETRY_US:
+                self.revive()
         if self._task is None and (self._socket is None or self._wants_look_up(now_us)):
             self._resolve_us = now_us + RESOLVE_AGAIN_US
             self._task = self.loop.create_task(self._open())
@@ -261,18 +267,17 @@ class UdpLink(DatagramLink):
             if self._socket is None:
                 self.become("resolving", error)
         else:
-            self._connect_one_of([(family, address) for family, _, _, _, address in found])
+            self._places = [(family, address) for family, _, _, _, address in found]
+            known = {host_and_port(*address[:2]) for _, address in self._places}
+            if self._socket is None or self.remote not in known:
+                self._connect()
         finally:
             self._task = None
 
-    def _connect_one_of(self, places: list[tuple[int, tuple[Any, ...]]]) -> None:
-        """Use the first place that there is a way to, unless one of them is in use."""
-        if self._socket is not None and self.remote in {
-            host_and_port(*address[:2]) for _, address in places
-        }:
-            return
+    def _connect(self) -> None:
+        """Use the first place that there is a way to."""
         super().close()
-        for family, address in places:
+        for family, address in self._places:
             try:
                 sock = self._connected(family, address)
             except OSError as error:
