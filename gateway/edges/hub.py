@@ -21,7 +21,7 @@ from gateway.routing.probe import RoundTrip
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import LoopGuard, Origin, RoutingTable
 from gateway.routing.trouble import TroubleWatch
-from gateway.routing.vehicles import GREETING, HEARTBEAT_ID, OwnVehicles
+from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import (
@@ -124,10 +124,10 @@ class Hub:
         if outgoing.client_id is not None:
             self._fanout.answer(frame, outgoing.client_id)
             return
-        greets = outgoing.message_id in GREETING
-        if greets and self._vehicles.note(frame, outgoing.message_id, self.now_us()):
+        now_us = self.now_us()
+        if self._vehicles.note(frame, outgoing.message_id, now_us):
             self._forget_express()
-        self._fanout.publish(frame, self.now_us())
+        self._fanout.publish(frame, now_us)
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
@@ -237,7 +237,7 @@ class Hub:
     def deliver(self, link: Link, frame: bytes, now_us: int) -> None:
         """Take one frame that a link received, and pass it on to whom it concerns."""
         origin = origin_of(frame)
-        if self._vehicles.is_own(origin, now_us):
+        if self._vehicles.is_own(origin, now_us) or origin == self._probe.origin:
             self._looped += 1
             return
         if self._table.hear(link.client_id, origin, now_us):
@@ -250,7 +250,7 @@ class Hub:
             link.round_trip_us = round_trip_us
             return
         if self._table.is_shared(origin, now_us) and self._guard.is_copy(
-            frame, link.client_id, self._table.since_us(link.client_id, origin), now_us
+            frame, self._table.since_us(link.client_id, origin), now_us
         ):
             self._duplicates += 1
         elif target_of(frame)[0]:

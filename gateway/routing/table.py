@@ -2,10 +2,11 @@
 
 Routing follows the MAVLink guide: a frame that names nobody goes to everybody but its sender; a
 frame that names a system goes only where that system (and component, if it was ever heard) speaks.
-Two ways to one system, or a cable that leads back, bring the same bytes twice; the second copy is
-dropped if it comes from elsewhere. Memory of frames is kept only for systems that are heard by more
-than one way; a copy of what was said before its way was there passes, for there is no telling it
-from a program that was started again and repeats its first frames from another port.
+Two ways to one system, or a cable that leads back, bring the same bytes twice; all but the first
+are dropped, from wherever they come, or they would run round a ring for ever. Memory of frames is
+kept only for systems that are heard by more than one way; a copy of what was said before its way
+was there passes, for there is no telling it from a program that was started again and repeats its
+first frames from another port.
 
 One deviation: what a ground station says to everybody goes only where there are vehicles. Stations
 have nothing to tell each other, and scripts take the first heartbeat they hear for the vehicle's.
@@ -25,7 +26,7 @@ ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A way on which a system has spoken so lately is preferred to ways on which it fell silent."""
 MAX_STATIONS: Final = 256
 MEMORY_US: Final = US_PER_S
-"""Copies on a second way come within a radio's delay; sequence numbers recur later than this."""
+"""Copies come within a radio's delay; most links take longer to use up the sequence numbers."""
 MEMORY_FRAMES: Final = 8192
 """Per generation: a second of a fast link, at most 2.3 MB."""
 
@@ -131,24 +132,22 @@ class RoutingTable:
 
 
 class LoopGuard:
-    """Remember the frames of the last second and tell copies from elsewhere."""
+    """Remember the frames of the last second and tell copies."""
 
     def __init__(self) -> None:
-        self._recent: dict[bytes, tuple[int, int]] = {}
-        self._older: dict[bytes, tuple[int, int]] = {}
+        self._recent: dict[bytes, int] = {}
+        self._older: dict[bytes, int] = {}
         self._turned_us = 0
 
-    def is_copy(self, frame: bytes, client_id: int, since_us: int, now_us: int) -> bool:
-        """Note a frame; tell whether another client has brought the same bytes before.
+    def is_copy(self, frame: bytes, since_us: int, now_us: int) -> bool:
+        """Note a frame; tell whether the same bytes have come before.
 
         Parameters
         ----------
         frame : bytes
             A complete frame.
-        client_id : int
-            Who brings it.
         since_us : int
-            Since when this client brings frames of that system; older ones are no copies.
+            Since when its sender brings frames of that system; older ones are no copies.
         now_us : int
             Gateway time.
 
@@ -159,8 +158,8 @@ class LoopGuard:
         if now_us - self._turned_us >= MEMORY_US or len(self._recent) >= MEMORY_FRAMES:
             self._older, self._recent = self._recent, {}
             self._turned_us = now_us
-        first = self._recent.get(frame) or self._older.get(frame)
-        if first is not None and first[0] != client_id and first[1] >= since_us:
+        known_us = self._recent.get(frame, self._older.get(frame))
+        if known_us is not None and known_us >= since_us:
             return True
-        self._recent[frame] = client_id, now_us
+        self._recent[frame] = now_us
         return False

@@ -129,6 +129,11 @@ class Rig:
             while not condition():
                 await asyncio.sleep(0)
 
+    async def quiet(self) -> None:
+        """Let everything go where it goes: on loopback each step takes one turn of the loop."""
+        for _ in range(200):
+            await asyncio.sleep(0)
+
     async def until_open(self, hub: Hub) -> None:
         await self.until(lambda: all(client.state == "open" for client in hub.clients()))
 

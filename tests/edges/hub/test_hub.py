@@ -121,6 +121,43 @@ async def test_a_copy_goes_round_a_loop_once_at_most(world: Any) -> None:
     assert world.first.is_silent()
 
 
+async def test_nothing_runs_round_a_ring(rig: Any) -> None:
+    """Two hubs joined by two cables; a vehicle of its own behind each, and both ask for trips."""
+    first = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0", ping_interval_s=1.0)
+    here, there = first.listening_ports()
+    cables = (f"udp:127.0.0.1:{here}", f"udp:127.0.0.2:{there}")
+    second = rig.hub("udp-listen:127.0.0.1:0", *cables)
+    await rig.until_open(second)
+    autopilot = rig.station(second.listening_ports()[0])
+    autopilot.sender = rig.sender(42, 1)
+    for _ in range(5):
+        rig.clock.us += 1_000_000
+        autopilot.say(autopilot.sender.heartbeat())
+        first.send(rig.out(rig.vehicle.heartbeat()))
+        for _ in range(10):
+            autopilot.say(autopilot.sender.attitude())
+            first.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(first)
+        await rig.quiet()
+    passed = [first.counters().forwarded, second.counters().forwarded]
+    assert passed < [3 * 55, 3 * 110]
+    assert first.counters().looped > 50
+    await rig.quiet()
+    assert [first.counters().forwarded, second.counters().forwarded] == passed
+
+
+async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> None:
+    echo, other = rig.station(), rig.station()
+    hub = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
+    await rig.until_open(hub)
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame))
+    assert [await echo.receive(), await other.receive()] == [frame, frame]
+    echo.socket.sendto(frame, ("127.0.0.1", hub._links[1]._port))
+    await rig.until(lambda: hub.counters().looped == 1)
+    assert other.is_silent()
+
+
 async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     trusted = rig.station()
     hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")

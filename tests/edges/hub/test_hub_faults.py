@@ -143,7 +143,7 @@ async def test_odd_datagrams_rain(rig: Any) -> None:
 
 @pytest.mark.parametrize("room", [16, 100])
 async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
-    flight = Healthy(rig, max_clients=room)
+    flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
     await flight.start()
     target = ("127.0.0.1", flight.hub.listening_ports()[0])
     for visit in range(1000):

@@ -336,7 +336,8 @@ async def test_a_second_gateway_on_the_same_port_waits(rig: Any) -> None:
 
 
 async def test_a_thousand_come_and_go(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=8, idle_timeout_s=1000.0)
+    settings = {"max_clients": 8, "idle_timeout_s": 1000.0, "ping_interval_s": 0.0}
+    hub = rig.hub("udp-listen:127.0.0.1:0", **settings)
     steady = rig.station(hub.listening_ports()[0])
     steady.say(steady.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 1)
