@@ -58,6 +58,10 @@ def add(
 ) -> None:
     """Add a client or a source until the gateway ends."""
     _show_endpoints(ask("clients.add", {"url": url}))
+    snapshot = ask("status")
+    for added in (*snapshot["listeners"], *snapshot["clients"]):
+        if added["endpoint"] == url and added["reason"]:
+            print(f"{added['name']}: {added['reason']}; trying again until it works")
 
 
 @group.command()

@@ -43,7 +43,9 @@ CLIENT = ClientStats(
 )
 RADIO = dataclasses.replace(CLIENT, name="radio", state="unreachable", reason="No such device")
 OPEN = ListenerStats("udp-listen:0.0.0.0:14551", "", "open", "", 14551, 1, 0)
-CLOSED = ListenerStats("observers", "", "closed", "Address already in use", 0, 0, 8)
+CLOSED = ListenerStats(
+    "observers", "tcp-listen:[::]:5760?name=observers", "closed", "Address already in use", 0, 0, 8
+)
 NODE = NodeLink(NodeId(1, 2), 0, 100, 7, 0, 0, 1, 60.0, 0, 0.0)
 SNAPSHOT = Snapshot(
     time_us=3_723_000_000,
@@ -147,6 +149,8 @@ def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
     assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
     assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
     assert gateway.asked == [Url("udp:10.0.0.8:14550")]
+    told = "observers: Address already in use; trying again until it works"
+    assert told in run("clients", "add", CLOSED.endpoint).output
     refused = run("clients", "remove", "phone")
     assert refused.exit_code == 2
     assert "no endpoint is called 'phone'" in refused.output
