@@ -106,7 +106,8 @@ class Daemon:
 
     def start(self) -> None:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
-        set_realtime_priority(self._settings.hub.realtime_priority)
+        if self._settings.hub.realtime_priority:
+            set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
         self._recorder.start()
         self._metrics.listen(self._settings.hub.metrics_port)
@@ -135,10 +136,11 @@ class Daemon:
         settings = self._read()
         self._notifier.reloading()
         later = msgspec.structs.replace(settings, hub=self._settings.hub) != self._settings
+        if settings.hub.realtime_priority != self._settings.hub.realtime_priority:
+            set_realtime_priority(settings.hub.realtime_priority)
         self._settings = msgspec.structs.replace(self._settings, hub=settings.hub)
         self._hub.apply(settings.hub)
         self._metrics.listen(settings.hub.metrics_port)
-        set_realtime_priority(settings.hub.realtime_priority)
         self._notifier.ready()
         told = f"settings of the hub applied{'; others need a new start' if later else ''}"
         log.info(told)
@@ -169,6 +171,7 @@ class Daemon:
             clients=self._hub.clients(),
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
+            listeners=(*self._hub.listeners(), *self._metrics.listeners()),
         )
 
     def _reload_or_refuse(self) -> str:

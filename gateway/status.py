@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gateway.records import LinkReport, NavState
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,3 +18,4 @@ class Snapshot:
     sent: tuple[tuple[int, int], ...]
     """MAVLink message id and how many were sent since the start."""
     hub: HubCounters
+    listeners: tuple[ListenerStats, ...] = ()

@@ -40,7 +40,7 @@ def status(*, json: JsonOption = False) -> None:
     console.print(_summary(snapshot), highlight=False)
     if nodes := snapshot["report"]["nodes"]:
         console.print(_nodes(nodes))
-    console.print(_clients(snapshot["clients"], snapshot["time_us"]))
+    _print_clients(console, snapshot)
 
 
 @group.command("list")
@@ -49,8 +49,7 @@ def list_clients(*, json: JsonOption = False) -> None:
     if json:
         print(msgspec.json.encode(ask("clients.list")).decode())
         return
-    snapshot = ask("status")
-    Console().print(_clients(snapshot["clients"], snapshot["time_us"]))
+    _print_clients(Console(), ask("status"))
 
 
 @group.command()
@@ -59,6 +58,10 @@ def add(
 ) -> None:
     """Add a client or a source until the gateway ends."""
     _show_endpoints(ask("clients.add", {"url": url}))
+    snapshot = ask("status")
+    for added in (*snapshot["listeners"], *snapshot["clients"]):
+        if added["endpoint"] == url and added["reason"]:
+            print(f"{added['name']}: {added['reason']}; trying again until it works")
 
 
 @group.command()
@@ -118,6 +121,23 @@ def _nodes(nodes: Sequence[Record]) -> Table:
             _number(node["rate_hz"], ".0f"),
             *(str(node[key]) for key in ("received", "lost", "restarts")),
         )
+    return table
+
+
+def _print_clients(console: Console, snapshot: Record) -> None:
+    if listeners := snapshot["listeners"]:
+        console.print(_listeners(listeners))
+    console.print(_clients(snapshot["clients"], snapshot["time_us"]))
+    for client in snapshot["clients"]:
+        if client["reason"]:
+            console.print(f"{client['name']}: {client['reason']}", style="yellow", markup=False)
+
+
+def _listeners(listeners: Sequence[Record]) -> Table:
+    table = _table("listening", "state", "clients", "turned away")
+    for port in listeners:
+        figures = (str(port[key]) for key in ("clients", "turned_away"))
+        table.add_row(port["name"], port["reason"] or port["state"], *figures)
     return table
 
 

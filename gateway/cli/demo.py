@@ -3,6 +3,7 @@
 import asyncio
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,6 @@ from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.edges.flight_file import FlightFileError, read_flight
-from gateway.flightlog.session import Mode
 from gateway.pipeline import AircraftSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import Aircraft
@@ -76,11 +76,14 @@ def demo(
         refuse(str(error))
     # What a ground station has the demo save must not become the real aircraft's calibration.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
-        # Nor is a flight that goes round and round worth a disk, unless it is asked for.
-        mode: Mode = "always" if record else "manual"
-        recording = replace(settings.recording, mode=mode)
-        settings = replace(settings, aircraft_folder=folder, recording=recording)
-        asyncio.run(serve(lambda: Daemon(settings, aircraft, read, line), plain=plain))
+
+        def apart(settings: GatewaySettings) -> GatewaySettings:
+            # Nor is a flight that goes round and round worth a disk, unless it is asked for.
+            recording = replace(settings.recording, mode="always" if record else "manual")
+            return replace(settings, aircraft_folder=folder, recording=recording)
+
+        daemon = partial(Daemon, apart(settings), aircraft, lambda: apart(read()), line)
+        asyncio.run(serve(daemon, plain=plain))
 
 
 def recorded_line(

@@ -3,24 +3,25 @@
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub_express import Express
 from gateway.edges.hub_group import GroupLink
-from gateway.edges.hub_link import Link, Listener
+from gateway.edges.hub_link import Link
+from gateway.edges.hub_listener import Listener
 from gateway.edges.hub_serial import SerialLink
 from gateway.edges.hub_stream import TcpLink, TcpListener
 from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import LoopGuard, Origin, RoutingTable
 from gateway.routing.trouble import TroubleWatch
-from gateway.routing.vehicles import GREETING, HEARTBEAT_ID, OwnVehicles
+from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import (
@@ -45,7 +46,7 @@ LINKS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Link]]] = {
     EndpointKind.TCP: TcpLink,
     EndpointKind.SERIAL: SerialLink,
 }
-LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener]]] = {
+LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
 }
@@ -91,10 +92,11 @@ class Hub:
         self._guard = LoopGuard()
         self._probe = RoundTrip()
         self._links: dict[int, Link] = {}
-        self._endpoints: dict[str, Link | Listener] = {}
+        self._express_sources: set[Link] = set()
+        self._endpoints: dict[str, Link | Listener[Any]] = {}
         self._next_id = 1
         self._vehicles = OwnVehicles()
-        self._ping_us = 0
+        self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._published = self._forwarded = self._duplicates = 0
         self._looped = self._unroutable = 0
@@ -122,10 +124,10 @@ class Hub:
         if outgoing.client_id is not None:
             self._fanout.answer(frame, outgoing.client_id)
             return
-        greets = outgoing.message_id in GREETING
-        if greets and self._vehicles.note(frame, outgoing.message_id, self.now_us()):
+        now_us = self.now_us()
+        if self._vehicles.note(frame, outgoing.message_id, now_us):
             self._forget_express()
-        self._fanout.publish(frame, self.now_us())
+        self._fanout.publish(frame, now_us)
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
@@ -198,6 +200,12 @@ class Hub:
             self._links[key].stats(self._table.origins(key)) for key in sorted(self._links)
         )
 
+    def listeners(self) -> tuple[ListenerStats, ...]:
+        """Describe every listening port at this moment, in the order of the settings."""
+        return tuple(
+            opened.stats() for opened in self._endpoints.values() if not isinstance(opened, Link)
+        )
+
     def endpoints(self) -> tuple[str, ...]:
         """Return the URLs of all endpoints."""
         return tuple(opened.endpoint.url for opened in self._endpoints.values())
@@ -215,9 +223,7 @@ class Hub:
 
     def listening_ports(self) -> tuple[int, ...]:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
-        return tuple(
-            endpoint.port for endpoint in self._endpoints.values() if not isinstance(endpoint, Link)
-        )
+        return tuple(listener.port for listener in self.listeners())
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
@@ -231,7 +237,7 @@ class Hub:
     def deliver(self, link: Link, frame: bytes, now_us: int) -> None:
         """Take one frame that a link received, and pass it on to whom it concerns."""
         origin = origin_of(frame)
-        if self._vehicles.is_own(origin, now_us):
+        if self._vehicles.is_own(origin, now_us) or origin == self._probe.origin:
             self._looped += 1
             return
         if self._table.hear(link.client_id, origin, now_us):
@@ -243,8 +249,9 @@ class Hub:
         if round_trip_us is not None:
             link.round_trip_us = round_trip_us
             return
-        shared = self._table.is_shared(origin, now_us)
-        if shared and self._guard.is_copy(frame, link.client_id, now_us):
+        if self._table.is_shared(origin, now_us) and self._guard.is_copy(
+            frame, self._table.since_us(link.client_id, origin), now_us
+        ):
             self._duplicates += 1
         elif target_of(frame)[0]:
             self._route_addressed(link, frame, now_us)
@@ -314,6 +321,7 @@ class Hub:
         if takers is None or key in link.express or len(link.express) >= MAX_EXPRESS:
             return
         links = [self._links[taker] for taker in takers]
+        self._express_sources.add(link)
         link.express[key] = Express(link, message_id_of(frame), links, self._on_foreign)
 
     def _tap(self, frame: bytes) -> None:
@@ -324,11 +332,12 @@ class Hub:
     def _forget_express(self) -> None:
         """Judge every frame anew: somebody came, went or changed."""
         self._settle_express()
-        for link in self._links.values():
+        for link in self._express_sources:
             link.express.clear()
+        self._express_sources.clear()
 
     def _settle_express(self) -> None:
-        for link in self._links.values():
+        for link in self._express_sources:
             for express in link.express.values():
                 self._forwarded += express.settle()
 
@@ -354,7 +363,10 @@ class Hub:
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     def _tell_trouble(self, now_us: int) -> None:
-        for text in self._trouble.update(self.clients(), now_us):
+        if now_us - self._trouble_us < US_PER_S:
+            return
+        self._trouble_us = now_us
+        for text in self._trouble.update(self.clients(), self.listeners(), now_us):
             log.warning("%s", text)
             if self._on_trouble is not None:
                 self._on_trouble(text)

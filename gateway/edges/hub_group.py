@@ -9,9 +9,9 @@ import socket
 import struct
 from typing import Any, Final
 
-from gateway.edges.hub_link import HubContext
-from gateway.edges.hub_udp import MAX_DATAGRAM, READ_BUDGET, RETRY_US, DatagramLink
-from gateway.routing.endpoint import Endpoint, EndpointKind
+from gateway.edges.hub_listener import RETRY_US
+from gateway.edges.hub_udp import MAX_DATAGRAM, READ_BUDGET, DatagramLink
+from gateway.routing.endpoint import EndpointKind
 
 MULTICAST_HOPS: Final = 1
 """The own network; telemetry has no business beyond it."""
@@ -20,19 +20,14 @@ MULTICAST_HOPS: Final = 1
 class GroupLink(DatagramLink):
     """A broadcast address or a multicast group as one client."""
 
-    __slots__ = ("_address", "_ear", "_own_address", "_retry_us")
+    _ear: socket.socket | None = None
+    _own_address = ("", 0)
+    _retry_us = 0
 
-    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
-        super().__init__(
-            context,
-            client_id,
-            endpoint,
-            remote=f"{endpoint.host}:{endpoint.port}",
-        )
-        self._ear: socket.socket | None = None
-        self._own_address = ("", 0)
-        self._retry_us = 0
-        self.tick(context.now_us())
+    def __post_init__(self) -> None:
+        """Open at once if possible."""
+        super().__post_init__()
+        self.tick(self.context.now_us())
 
     def tick(self, now_us: int) -> None:
         """Open the sockets again if they failed."""
@@ -71,11 +66,11 @@ class GroupLink(DatagramLink):
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             host, _, *scope = _route_source(family, address)
             sock.bind((host, 0, *scope))
-        except OSError:
+        except OSError as error:
             if sock is not None:
                 sock.close()
             self.close()
-            self.state = "unreachable"
+            self.become("unreachable", error)
             return
         self._own_address = sock.getsockname()[:2]
         opened = sock

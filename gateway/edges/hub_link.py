@@ -2,6 +2,7 @@
 
 import asyncio
 import ipaddress
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,6 +15,12 @@ from gateway.routing.table import Origin
 from gateway.wire.mavlink_splitter import SplitFault
 
 Write = Callable[[bytes], object]
+
+
+def reason_of(error: OSError | ValueError) -> str:
+    """Say what went wrong, in the words of the operating system if it has some."""
+    number = getattr(error, "errno", None) or 0
+    return os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
 
 
 def not_open(data: bytes) -> int:
@@ -33,16 +40,18 @@ class LinkCounters:
     bytes_garbage: int = 0
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class Link:
     """One peer that frames are sent to; the base of every transport."""
 
+    context: "HubContext"
     client_id: int
     endpoint: Endpoint
-    remote: str
-    context: "HubContext"
+    remote: str = ""
+    """Where the peer is; by default where the endpoint says."""
     name: str = ""
-    state: str = "open"
+    state: str = "connecting"
+    reason: str = ""
     trusted: bool = False
     since_us: int = 0
     heard_us: int | None = None
@@ -56,9 +65,15 @@ class Link:
 
     def __post_init__(self) -> None:
         """Take the rest from the surroundings."""
+        self.remote = self.remote or self.endpoint.address
         self.trusted = _is_trusted(self.endpoint, self.remote)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
+
+    def become(self, state: str, error: OSError | ValueError | None = None) -> None:
+        """Take on a state, and remember what led to it."""
+        self.state = state
+        self.reason = "" if error is None else reason_of(error)
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Send one frame now or queue it; never block, never raise."""
@@ -113,6 +128,7 @@ class Link:
             endpoint=self.endpoint.url,
             remote=self.remote,
             state=self.state,
+            reason=self.reason,
             trusted=self.trusted,
             systems=systems,
             sent=counters.sent,
@@ -160,31 +176,12 @@ class HubContext(Protocol):
         """Forget a link and close it."""
 
 
-class Listener(Protocol):
-    """An endpoint that makes a link of everyone who calls."""
-
-    endpoint: Endpoint
-
-    @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-
-    def tick(self, now_us: int) -> None:
-        """Do what is due a few times a second."""
-
-    def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options of the same place, for the clients that are there too."""
-
-    def close(self) -> None:
-        """Part from all clients and close the port."""
-
-
 def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
     """Tell whether a peer may change state: as the URL says, else if named or on this machine."""
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:
-        return _is_loopback(remote.rpartition(":")[0])
+        return _is_loopback(remote.rpartition(":")[0].strip("[]"))
     return True
 
 

@@ -12,9 +12,8 @@ from typing import Final
 
 import serial
 
-from gateway.edges.hub_link import HubContext, Link
-from gateway.edges.hub_udp import RETRY_US
-from gateway.routing.endpoint import Endpoint
+from gateway.edges.hub_link import Link
+from gateway.edges.hub_listener import RETRY_US
 from gateway.routing.outbox import BITS_PER_BYTE, Numbering, Outbox, Pacer
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavlinkSplitter
@@ -32,22 +31,20 @@ MIN_QUEUE_BYTES: Final = 2048
 class SerialLink(Link):
     """A peer on a serial port that may come and go."""
 
-    __slots__ = (
-        "_numbering", "_outbox", "_pacer", "_partial", "_port", "_retry_us", "_splitter", "_timer",
-    )  # fmt: skip
+    _partial = b""
+    _port: serial.Serial | None = None
+    _retry_us = 0
+    _timer: asyncio.TimerHandle | None = None
 
-    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
-        super().__init__(client_id, endpoint, endpoint.host, context, state="connecting")
-        line_bytes = round(QUEUE_S * endpoint.port / BITS_PER_BYTE)
-        self._outbox = Outbox(max(MIN_QUEUE_BYTES, line_bytes))
-        self._pacer = Pacer(endpoint.port, AHEAD_US)
-        self._numbering = Numbering(context.is_own)
+    def __post_init__(self) -> None:
+        """Open at once if possible."""
+        super().__post_init__()
+        baud = self.endpoint.port
+        self._outbox = Outbox(max(MIN_QUEUE_BYTES, round(QUEUE_S * baud / BITS_PER_BYTE)))
+        self._pacer = Pacer(baud, AHEAD_US)
+        self._numbering = Numbering(self.context.is_own)
         self._splitter = MavlinkSplitter()
-        self._partial = b""
-        self._port: serial.Serial | None = None
-        self._retry_us = 0
-        self._timer: asyncio.TimerHandle | None = None
-        self.tick(context.now_us())
+        self.tick(self.context.now_us())
 
     @property
     def queued(self) -> int:
@@ -74,12 +71,11 @@ class SerialLink(Link):
                 self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True
             )
         except (OSError, ValueError) as error:
-            self.state = "unreachable"
-            log.debug("cannot open %s: %s", self.endpoint.host, error)
+            self.become("unreachable", error)
             return
         self._port = port
         self._splitter.reset()
-        self.state = "open"
+        self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)
         self.context.greet(self)
 
@@ -103,7 +99,7 @@ class SerialLink(Link):
     def _broke(self, error: OSError) -> None:
         log.warning("%s is gone: %s", self.endpoint.host, error)
         self.close()
-        self.state = "unreachable"
+        self.become("unreachable", error)
 
     def _pump(self) -> None:
         """Write until the line is busy for a while or nothing waits."""

@@ -5,17 +5,16 @@ connection when nothing was acknowledged for long.
 """
 
 import asyncio
-import logging
 import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gateway.edges.hub_link import HubContext, Link
-from gateway.edges.hub_udp import RETRY_US
-from gateway.routing.endpoint import Endpoint
+from gateway.edges.hub_link import Link
+from gateway.edges.hub_listener import RETRY_US, Listener
+from gateway.routing.endpoint import host_and_port
 from gateway.routing.outbox import Numbering, Outbox
 from gateway.wire.mavlink_splitter import MavlinkSplitter
-
-log = logging.getLogger(__name__)
 
 CHUNK_BYTES: Final = 4096
 """Joined into one write while a queue drains; and read at once."""
@@ -31,23 +30,15 @@ ACCEPT_BACKLOG: Final = 16
 class StreamLink(Link):
     """A peer behind a byte stream."""
 
-    __slots__ = ("_numbering", "_outbox", "_partial", "_socket", "_splitter")
+    _partial = b""
+    _socket: socket.socket | None = None
 
-    def __init__(
-        self,
-        context: HubContext,
-        client_id: int,
-        endpoint: Endpoint,
-        *,
-        remote: str,
-        name: str = "",
-    ) -> None:
-        super().__init__(client_id, endpoint, remote, context, name, state="connecting")
-        self._outbox = Outbox(context.settings.queue_bytes)
-        self._numbering = Numbering(context.is_own)
+    def __post_init__(self) -> None:
+        """Begin without a connection."""
+        super().__post_init__()
+        self._outbox = Outbox(self.context.settings.queue_bytes)
+        self._numbering = Numbering(self.context.is_own)
         self._splitter = MavlinkSplitter()
-        self._partial = b""
-        self._socket: socket.socket | None = None
 
     @property
     def queued(self) -> int:
@@ -76,7 +67,7 @@ class StreamLink(Link):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         self._socket = sock
         self._splitter.reset()
-        self.state = "open"
+        self.become("open")
         self.loop.add_reader(sock, self._on_readable, sock)
         self.context.greet(self)
 
@@ -147,18 +138,13 @@ class StreamLink(Link):
 class TcpLink(StreamLink):
     """A connection that the gateway makes, and makes again when it breaks."""
 
-    __slots__ = ("_retry_us", "_task")
+    _retry_us = 0
+    _task: asyncio.Task[None] | None = None
 
-    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
-        super().__init__(
-            context,
-            client_id,
-            endpoint,
-            remote=f"{endpoint.host}:{endpoint.port}",
-        )
-        self._retry_us = 0
-        self._task: asyncio.Task[None] | None = None
-        self.tick(context.now_us())
+    def __post_init__(self) -> None:
+        """Connect at once if possible."""
+        super().__post_init__()
+        self.tick(self.context.now_us())
 
     def tick(self, now_us: int) -> None:
         """Connect if there is no connection and the last attempt is long enough ago."""
@@ -175,7 +161,7 @@ class TcpLink(StreamLink):
     def broke(self) -> None:
         """Let the next tick connect again."""
         super().close()
-        self.state = "connecting"
+        self.become("connecting")
 
     async def _connect(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
@@ -184,8 +170,8 @@ class TcpLink(StreamLink):
             for family, _, _, _, address in found:
                 if await self._connect_to(family, address):
                     break
-        except OSError:
-            self.state = "resolving"
+        except OSError as error:
+            self.become("resolving", error)
         finally:
             self._task = None
 
@@ -199,97 +185,45 @@ class TcpLink(StreamLink):
                 raise ConnectionRefusedError
         except OSError as error:
             sock.close()
-            refused = isinstance(error, ConnectionRefusedError)
-            self.state = "refused" if refused else "unreachable"
+            if isinstance(error, ConnectionRefusedError):
+                self.become("refused")
+            else:
+                self.become("unreachable", error)
             return False
         except asyncio.CancelledError:
             sock.close()
             raise
-        self.remote = f"{address[0]}:{address[1]}"
+        self.remote = host_and_port(*address[:2])
         self.adopt(sock)
         return True
 
 
+@dataclass(eq=False)
 class TcpPeer(StreamLink):
     """A connection that a client made."""
 
-    __slots__ = ("_listener",)
-
-    def __init__(
-        self, context: HubContext, client_id: int, listener: "TcpListener", peer: str
-    ) -> None:
-        super().__init__(context, client_id, listener.endpoint, remote=peer, name=peer)
-        self._listener = listener
+    leave: Callable[["TcpPeer"], None] = field(kw_only=True)
 
     def broke(self) -> None:
         """Leave for good; the client may connect again."""
-        self._listener.leave(self)
+        self.leave(self)
 
 
-class TcpListener:
+class TcpListener(Listener[TcpPeer]):
     """A TCP port and its clients."""
 
-    def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
-        self.refused = 0
-        self._context = context
-        self._loop = asyncio.get_running_loop()
-        self._links: dict[int, TcpPeer] = {}
-        self._socket: socket.socket | None = None
-        self._retry_us = 0
-        self._failed = False
-        self.tick(context.now_us())
-
-    @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-        return self._socket.getsockname()[1] if self._socket else 0
-
-    def tick(self, now_us: int) -> None:
-        """Bind or accept again if that failed."""
-        if now_us < self._retry_us:
-            return
-        self._retry_us = now_us + RETRY_US
-        if self._socket is not None:
-            self._loop.add_reader(self._socket, self._on_readable, self._socket)
-            return
+    def _bind(self) -> socket.socket:
         host, port = self.endpoint.host, self.endpoint.port
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        sock = socket.socket(family, socket.SOCK_STREAM)
+        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
         try:
             sock.setblocking(False)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind((host, port))
             sock.listen(ACCEPT_BACKLOG)
-        except OSError as error:
+        except OSError:
             sock.close()
-            if not self._failed:
-                log.warning("cannot listen at %s yet: %s", self.endpoint.name, error)
-            self._failed = True
-            return
-        self._failed = False
-        self._socket = sock
-        self._loop.add_reader(sock, self._on_readable, sock)
-
-    def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options of the same place, for the clients that are there too."""
-        self.endpoint = endpoint
-        for link in self._links.values():
-            link.reconfigure(endpoint)
-
-    def close(self) -> None:
-        """Part from all clients and close the port."""
-        for link in list(self._links.values()):
-            self.leave(link)
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def leave(self, link: TcpPeer) -> None:
-        """Part from one client."""
-        self._links.pop(link.client_id, None)
-        self._context.vanish(link)
+            raise
+        return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
         for _ in range(READ_BUDGET):
@@ -298,16 +232,16 @@ class TcpListener:
             except BlockingIOError:
                 return
             except OSError as error:
-                log.warning("cannot accept a client: %s", error)
                 # Out of descriptors: the waiting client would wake us for ever.
+                self._complain(error)
                 self._loop.remove_reader(sock)
                 return
             if len(self._links) >= self._context.settings.max_clients:
-                self.refused += 1
+                self.turned_away += 1
                 connection.close()
                 continue
-            client_id = self._context.new_client_id()
-            link = TcpPeer(self._context, client_id, self, f"{address[0]}:{address[1]}")
+            client_id, peer = self._context.new_client_id(), host_and_port(*address[:2])
+            link = TcpPeer(self._context, client_id, self.endpoint, peer, peer, leave=self.leave)
             self._links[client_id] = link
             self._context.appear(link)
             link.adopt(connection)

@@ -10,8 +10,9 @@ import socket
 from collections import deque
 from typing import Any, Final
 
-from gateway.edges.hub_link import HubContext, Link, Write, not_open
-from gateway.routing.endpoint import Endpoint, is_numeric
+from gateway.edges.hub_link import Link, Write, not_open
+from gateway.edges.hub_listener import RETRY_US
+from gateway.routing.endpoint import Endpoint, host_and_port, is_numeric
 from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_frame, split_datagram
@@ -19,8 +20,6 @@ from gateway.wire.mavlink_splitter import is_frame, split_datagram
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
 """Datagrams taken at one wake-up, so that one flooding peer cannot starve the others."""
-RETRY_US: Final = US_PER_S
-"""Between attempts to open a socket again: soon for a person, never spinning."""
 RESOLVE_AGAIN_US: Final = 60 * US_PER_S
 """Names of home networks change their address at most some times a day."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
@@ -34,32 +33,16 @@ PACK_DELAY_S: Final = 0.02
 class DatagramLink(Link):
     """A peer behind a datagram socket; what is common to unicast, broadcast and multicast."""
 
-    __slots__ = (
-        "_backlog",
-        "_direct",
-        "_flush_timer",
-        "_packer",
-        "_socket",
-        "_write",
-        "refused_us",
-    )
+    refused_us: int | None = None
+    _socket: socket.socket | None = None
+    _direct: Write = staticmethod(not_open)
+    _flush_timer: asyncio.TimerHandle | None = None
 
-    def __init__(
-        self,
-        context: HubContext,
-        client_id: int,
-        endpoint: Endpoint,
-        *,
-        remote: str,
-        name: str = "",
-    ) -> None:
-        super().__init__(client_id, endpoint, remote, context, name, state="resolving")
-        self.refused_us: int | None = None
-        self._socket: socket.socket | None = None
-        self._direct: Write = not_open
+    def __post_init__(self) -> None:
+        """Begin without a socket."""
+        super().__post_init__()
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
-        self._packer = Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
-        self._flush_timer: asyncio.TimerHandle | None = None
+        self._packer = _packer(self.endpoint)
 
     @property
     def is_direct(self) -> bool:
@@ -102,15 +85,14 @@ class DatagramLink(Link):
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Take over changed options, packing included."""
         self._flush()
-        self._packer = Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
+        self._packer = _packer(endpoint)
         super().reconfigure(endpoint)
 
     def adopt(self, sock: socket.socket, write: Write) -> None:
         """Use an open socket from now on."""
         self._socket = sock
         self.write = self._direct = write
-        self.state = "open"
-        self.refused_us = None
+        self.revive()
         self.loop.add_reader(sock, self._on_readable, sock)
 
     def accept(self, data: bytes, now_us: int) -> None:
@@ -130,7 +112,7 @@ class DatagramLink(Link):
 
     def revive(self) -> None:
         """Note that the peer is there after all."""
-        self.state = "open"
+        self.become("open")
         self.refused_us = None
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
@@ -176,7 +158,7 @@ class DatagramLink(Link):
             self._count_sent(frames, len(data))
             return
         if self._socket is not None and not isinstance(error, ConnectionRefusedError):
-            self.state = "unreachable"
+            self.become("unreachable", error)
         self.counters.dropped += frames
 
     def _sends_after_refusal(self, data: bytes) -> bool:
@@ -189,7 +171,7 @@ class DatagramLink(Link):
         return True
 
     def _note_refusal(self) -> None:
-        self.state = "refused"
+        self.become("refused")
         self.refused_us = self.context.now_us()
 
     def _wait(self, data: bytes) -> None:
@@ -222,8 +204,8 @@ class DatagramLink(Link):
             except ConnectionRefusedError:
                 self._note_refusal()
                 return
-            except OSError:
-                self.state = "unreachable"
+            except OSError as error:
+                self.become("unreachable", error)
                 return
             self.accept(data, now_us)
             if self._socket is not sock:
@@ -234,23 +216,21 @@ class UdpLink(DatagramLink):
     """A UDP peer at a configured place.
 
     A name may resolve only later, or to another address later: it is looked up again while nothing
-    is heard from there.
+    is heard from there. Of several addresses, as `localhost` has, one that refuses gives way to the
+    next.
     """
 
-    __slots__ = ("_port", "_resolve_us", "_retry_us", "_task")
+    _port = 0
+    _retry_us = 0
+    _resolve_us = 0
+    _task: asyncio.Task[None] | None = None
 
-    def __init__(self, context: HubContext, client_id: int, endpoint: Endpoint) -> None:
-        super().__init__(
-            context,
-            client_id,
-            endpoint,
-            remote=f"{endpoint.host}:{endpoint.port}",
-        )
-        self._port = 0
-        self._retry_us = 0
-        self._resolve_us = 0
-        self._task: asyncio.Task[None] | None = None
-        self.tick(context.now_us())
+    def __post_init__(self) -> None:
+        """Open at once if possible."""
+        super().__post_init__()
+        self._places: list[tuple[int, tuple[Any, ...]]] = []
+        self.become("resolving")
+        self.tick(self.context.now_us())
 
     def tick(self, now_us: int) -> None:
         """Open the socket or look the name up again; forget a refusal that was not repeated."""
@@ -259,9 +239,12 @@ class UdpLink(DatagramLink):
         self._retry_us = now_us + RETRY_US
         if self.state == "unreachable":
             super().close()
-        if self.refused_us is not None and now_us - self.refused_us >= RETRY_US:
-            self.refused_us = None
-            self.state = "open"
+        if self.refused_us is not None:
+            if len(self._places) > 1:
+                self._places.append(self._places.pop(0))
+                self._connect()
+            elif now_us - self.refused_us >= RETRY_US:
+                self.revive()
         if self._task is None and (self._socket is None or self._wants_look_up(now_us)):
             self._resolve_us = now_us + RESOLVE_AGAIN_US
             self._task = self.loop.create_task(self._open())
@@ -280,26 +263,27 @@ class UdpLink(DatagramLink):
         host, port = self.endpoint.host, self.endpoint.port
         try:
             found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        except OSError:
+        except OSError as error:
             if self._socket is None:
-                self.state = "resolving"
+                self.become("resolving", error)
         else:
-            self._connect_one_of([(family, address) for family, _, _, _, address in found])
+            self._places = [(family, address) for family, _, _, _, address in found]
+            known = {host_and_port(*address[:2]) for _, address in self._places}
+            if self._socket is None or self.remote not in known:
+                self._connect()
         finally:
             self._task = None
 
-    def _connect_one_of(self, places: list[tuple[int, tuple[Any, ...]]]) -> None:
-        """Use the first place that there is a way to, unless one of them is in use."""
-        if self._socket is not None and self.remote in {_text(address) for _, address in places}:
-            return
+    def _connect(self) -> None:
+        """Use the first place that there is a way to."""
         super().close()
-        for family, address in places:
+        for family, address in self._places:
             try:
                 sock = self._connected(family, address)
-            except OSError:
-                self.state = "unreachable"
+            except OSError as error:
+                self.become("unreachable", error)
                 continue
-            self.remote = _text(address)
+            self.remote = host_and_port(*address[:2])
             self.adopt(sock, sock.send)
             return
 
@@ -319,5 +303,5 @@ class UdpLink(DatagramLink):
         return sock
 
 
-def _text(address: tuple[Any, ...]) -> str:
-    return f"{address[0]}:{address[1]}"
+def _packer(endpoint: Endpoint) -> Packer | None:
+    return Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None

@@ -5,41 +5,32 @@ port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allow
 only after the bind, so that a second gateway on the same port still fails loudly.
 """
 
-import asyncio
-import logging
+import itertools
 import socket
 import struct
 from typing import Final
 
 from gateway.edges.hub_link import HubContext
-from gateway.edges.hub_udp import (
-    MAX_DATAGRAM,
-    READ_BUDGET,
-    RECEIVE_BUFFER_BYTES,
-    RETRY_US,
-    DatagramLink,
-)
+from gateway.edges.hub_listener import RETRY_US, Listener
+from gateway.edges.hub_udp import MAX_DATAGRAM, READ_BUDGET, RECEIVE_BUFFER_BYTES, DatagramLink
 from gateway.routing.clients import SILENT_AFTER_US, ClientTable, Presence
-from gateway.routing.endpoint import Endpoint
+from gateway.routing.endpoint import Endpoint, host_and_port
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
-
-log = logging.getLogger(__name__)
 
 IP_PKTINFO: Final = 8
 """Not exported by `socket` before Python 3.14; tells to which of our addresses a client spoke."""
 ANCILLARY_BYTES: Final = 64
+STRANGERS: Final = 4
+"""Taken at one wake-up: to admit one takes as long as to serve the others several times."""
+PARTINGS: Final = 32
+"""From clients that have died, at one tick; they cost nothing until it is their turn."""
 
 Address = tuple[str | int, ...]
 
 
 class UdpPeer(DatagramLink):
     """A client of a listening port."""
-
-    __slots__ = ()
-
-    def __init__(self, context: HubContext, client_id: int, listener: Endpoint, peer: str) -> None:
-        super().__init__(context, client_id, listener, remote=peer, name=peer)
 
     def revive(self) -> None:
         """Note that the client is there after all."""
@@ -50,7 +41,7 @@ class UdpPeer(DatagramLink):
         """Call trouble off that was not repeated; try a client again that refused."""
         self._end_hold()
         if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
-            self.state = "open"
+            self.become("open")
 
     def _note_refusal(self) -> None:
         """Hold back until the next tick: a client that is dead costs more than one that lives."""
@@ -73,75 +64,38 @@ class UdpPeer(DatagramLink):
         return self.refused_us is not None and now_us - heard_us >= SILENT_AFTER_US
 
 
-class UdpListener:
+class UdpListener(Listener[UdpPeer]):
     """The listening port and its clients."""
 
     def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
         settings = context.settings
         self.table = ClientTable(settings.max_clients, round(settings.idle_timeout_s * US_PER_S))
-        self._context = context
-        self._loop = asyncio.get_running_loop()
-        self._links: dict[int, UdpPeer] = {}
-        self._socket: socket.socket | None = None
-        self._retry_us = 0
-        self._failed = False
-        self.tick(context.now_us())
-
-    @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-        return self._socket.getsockname()[1] if self._socket else 0
+        super().__init__(context, endpoint)
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and part from clients that have gone."""
+        super().tick(now_us)
         settings = self._context.settings
         self.table.max_clients = settings.max_clients
         self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
-        if self._socket is None and now_us >= self._retry_us:
-            self._retry_us = now_us + RETRY_US
-            self._bind()
         self._note_speakers()
-        for presence in self.table.presences():
-            if self._links[presence.client_id].has_died(now_us):
-                self.table.remove(presence)
-                self._leave(presence)
+        dead = (p for p in self.table.presences() if self._links[p.client_id].has_died(now_us))
+        for presence in itertools.islice(dead, PARTINGS):
+            self.table.remove(presence)
+            self._leave(presence)
         for presence in self.table.expire(now_us):
             self._leave(presence)
 
-    def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options of the same place, for the clients that are there too."""
-        self.endpoint = endpoint
-        for link in self._links.values():
-            link.reconfigure(endpoint)
-
-    def close(self) -> None:
-        """Part from all clients and close the port."""
-        for link in self._links.values():
-            self._context.vanish(link)
-        self._links.clear()
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def _bind(self) -> None:
+    def _bind(self) -> socket.socket:
         sock = _bound((self.endpoint.host, self.endpoint.port), shared=False)
-        if sock is None:
-            if not self._failed:
-                log.warning("cannot listen at %s yet", self.endpoint.name)
-            self._failed = True
-            return
-        self._failed = False
         if sock.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_RECVPKTINFO, 1)
         else:
             sock.setsockopt(socket.IPPROTO_IP, IP_PKTINFO, 1)
-        self._socket = sock
-        self._loop.add_reader(sock, self._on_readable, sock)
+        return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(READ_BUDGET):
+        for _ in range(STRANGERS):
             try:
                 data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
             except OSError:
@@ -161,21 +115,34 @@ class UdpListener:
         if first is None:
             return None
         now_us = self._context.now_us()
+        if self.table.is_full(now_us):
+            self.turned_away += 1
+            return None
         host, port = str(address[0]), int(address[1])
         self._note_speakers()
         presence, leaver = self.table.admit((host, port), self._context.new_client_id(), now_us)
         if leaver is not None:
             self._leave(leaver)
         if presence is None:
+            self.turned_away += 1
             return None
-        sock = _bound((local_host, self.port), shared=True)
-        if sock is None:
+        try:
+            sock = _bound((local_host, self.port), shared=True)
+        except OSError as error:
+            self._complain(error)
+            self.table.remove(presence)
+            return None
+        try:
+            sock.connect(address)
+        except OSError:
+            # It claims to come from where there is no way to.
+            sock.close()
             self.table.remove(presence)
             return None
         presence.identity = origin_of(first)
-        link = UdpPeer(self._context, presence.client_id, self.endpoint, f"{host}:{port}")
+        peer = host_and_port(host, port)
+        link = UdpPeer(self._context, presence.client_id, self.endpoint, peer, peer)
         self._links[presence.client_id] = link
-        sock.connect(address)
         link.adopt(sock, sock.send)
         self._context.appear(link)
         self._context.greet(link)
@@ -197,10 +164,10 @@ class UdpListener:
             self._take(data, address or peer, local_host)
 
     def _leave(self, presence: Presence) -> None:
-        self._context.vanish(self._links.pop(presence.client_id))
+        self.leave(self._links[presence.client_id])
 
 
-def _bound(place: tuple[str, int], *, shared: bool) -> socket.socket | None:
+def _bound(place: tuple[str, int], *, shared: bool) -> socket.socket:
     family = socket.AF_INET6 if ":" in place[0] else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_DGRAM)
     try:
@@ -212,7 +179,7 @@ def _bound(place: tuple[str, int], *, shared: bool) -> socket.socket | None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
     except OSError:
         sock.close()
-        return None
+        raise
     return sock
 
 

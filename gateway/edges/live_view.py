@@ -13,7 +13,7 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.records import LinkReport, NavFlags, NavState, NodeLink
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 
@@ -83,6 +83,7 @@ class LiveView:
         if snapshot.sent:
             parts.append(_rates(snapshot, previous))
         parts.append(_clients(snapshot))
+        parts += _troubles(snapshot)
         parts += [Text(line, style=style) for line, style in self.log.lines]
         return Group(*parts)
 
@@ -207,6 +208,11 @@ def _clients(snapshot: Snapshot) -> Table:
     for client in snapshot.clients:
         table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
     return table
+
+
+def _troubles(snapshot: Snapshot) -> list[Text]:
+    found: list[ListenerStats | ClientStats] = [*snapshot.listeners, *snapshot.clients]
+    return [Text(f"{one.name}: {one.reason}", style="red") for one in found if one.reason]
 
 
 def _client_cells(client: ClientStats) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from gateway.routing.clients import ClientStats
+from gateway.edges.hub_link import reason_of
+from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 
@@ -16,6 +17,8 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 REQUEST_LIMIT_S: Final = 5.0
 MAX_REQUEST_BYTES: Final = 8192
 MAX_CONNECTIONS: Final = 8
+RETRY_S: Final = 5.0
+"""Between attempts to bind a port that is taken: whoever scrapes it asks about as often."""
 
 Sample = tuple[dict[str, str], float]
 
@@ -31,7 +34,10 @@ class MetricsServer:
 
     def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
         self._snapshot = snapshot
+        self._wanted = 0
+        self._reason = ""
         self._socket: socket.socket | None = None
+        self._retry: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
     @property
@@ -40,22 +46,50 @@ class MetricsServer:
         return self._socket.getsockname()[1] if self._socket else 0
 
     def listen(self, port: int) -> None:
-        """Serve on a loopback port; 0 ends it. Another port replaces the former one."""
-        if port == self.port:
-            return
-        self.close()
-        if not port:
-            return
-        try:
-            self._socket = socket.create_server(("127.0.0.1", port))
-        except OSError as error:
-            log.warning("no metrics: %s", error)
-            return
-        self._socket.setblocking(False)
-        asyncio.get_running_loop().add_reader(self._socket, self._on_readable, self._socket)
+        """Serve on a loopback port, now or as soon as it is free; 0 ends it."""
+        if port != self._wanted:
+            self.close()
+            self._wanted = port
+            if port:
+                self._bind()
 
     def close(self) -> None:
         """Stop serving."""
+        self._wanted, self._reason = 0, ""
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        self._release()
+
+    def listeners(self) -> tuple[ListenerStats, ...]:
+        """Describe the port, if one is wanted."""
+        if not self._wanted:
+            return ()
+        url = f"http://127.0.0.1:{self._wanted}/metrics"
+        state = "closed" if self._reason else "open"
+        count = len(self._tasks)
+        return (ListenerStats("metrics", url, state, self._reason, self.port, count, 0),)
+
+    def _bind(self) -> None:
+        try:
+            self._socket = socket.create_server(("127.0.0.1", self._wanted))
+        except OSError as error:
+            self._fail(error)
+            return
+        self._reason = ""
+        self._socket.setblocking(False)
+        asyncio.get_running_loop().add_reader(self._socket, self._on_readable, self._socket)
+
+    def _fail(self, error: OSError) -> None:
+        """Begin anew later."""
+        reason = reason_of(error)
+        if reason != self._reason:
+            log.warning("no metrics on port %d yet: %s", self._wanted, reason)
+        self._reason = reason
+        self._release()
+        self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._bind)
+
+    def _release(self) -> None:
         if self._socket is not None:
             asyncio.get_running_loop().remove_reader(self._socket)
             self._socket.close()
@@ -68,8 +102,7 @@ class MetricsServer:
             return
         except OSError as error:
             # Out of descriptors: the waiting connection would wake us for ever.
-            log.warning("no more metrics: %s", error)
-            self.close()
+            self._fail(error)
             return
         if len(self._tasks) >= MAX_CONNECTIONS:
             connection.close()
@@ -150,6 +183,11 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
         yield f"node_{field}{suffix}", kind, meaning, nodes
     for field in ("published", "forwarded", "duplicates", "looped", "unroutable"):
         yield f"hub_{field}_total", "counter", f"Frames {field}.", [({}, getattr(hub, field))]
+    ports = [({"name": port.name, "endpoint": port.endpoint}, port) for port in snapshot.listeners]
+    is_open: list[Sample] = [(labels, float(port.state == "open")) for labels, port in ports]
+    yield "listener_open", "gauge", "A listening port takes clients.", is_open
+    away: list[Sample] = [(labels, float(port.turned_away)) for labels, port in ports]
+    yield "listener_turned_away_total", "counter", "Clients that found no room.", away
     yield from _client_families(snapshot.clients, now_us)
 
 

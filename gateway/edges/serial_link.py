@@ -9,6 +9,7 @@
 
 import asyncio
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -204,17 +205,25 @@ class SerialLink:
     def _read(self) -> None:
         assert self._port is not None
         try:
-            data = self._port.read(READ_SIZE)
-        except (serial.SerialException, OSError, TypeError) as error:
-            # pyserial raises TypeError when the descriptor vanishes inside a read.
-            device = str(self._port.port)
-            self._complain(f"{device} is gone: {error}")
-            self._release()
-            self._on_lost(device)
-            self._try_later()
+            # pyserial's own read asks the kernel twice more, on the way of every sample.
+            data = os.read(self._port.fileno(), READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._broke(error)
             return
         if data:
             self._on_bytes(data, self._now_us())
+        else:
+            self._broke(OSError("the device hung up"))
+
+    def _broke(self, error: OSError) -> None:
+        assert self._port is not None
+        device = str(self._port.port)
+        self._complain(f"{device} is gone: {error}")
+        self._release()
+        self._on_lost(device)
+        self._try_later()
 
     def _release(self) -> None:
         if self._port is None:

@@ -43,6 +43,25 @@ class ClientStats:
     since_us: int
     heard_us: int | None
     round_trip_us: int | None
+    reason: str = ""
+    """Why nothing goes out, in the words of the operating system; empty if it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerStats:
+    """One listening port at one moment."""
+
+    name: str
+    endpoint: str
+    state: str
+    """`open`, or `closed` while it cannot be bound or can take nobody in."""
+    reason: str
+    """Why it is closed, in the words of the operating system; empty if it is open."""
+    port: int
+    """The port that is bound, or 0."""
+    clients: int
+    turned_away: int
+    """How often somebody came who had no room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +106,16 @@ class ClientTable:
     def __init__(self, max_clients: int, idle_timeout_us: int) -> None:
         self.max_clients = max_clients
         self.idle_timeout_us = idle_timeout_us
-        self.refused = 0
         self._by_address: dict[tuple[str, int], Presence] = {}
+        self._full_until_us = 0
+        """Until then nobody in a full table can have been silent for long enough."""
 
     def __len__(self) -> int:
         return len(self._by_address)
+
+    def is_full(self, now_us: int) -> bool:
+        """Tell whether there is no room and nobody has been silent for long; soon told."""
+        return len(self) >= self.max_clients and now_us < self._full_until_us
 
     def presences(self) -> tuple[Presence, ...]:
         """Return all clients."""
@@ -116,7 +140,7 @@ class ClientTable:
         if len(self._by_address) >= self.max_clients:
             leaver = min(self._by_address.values(), key=lambda presence: presence.heard_us)
             if now_us - leaver.heard_us < SILENT_AFTER_US:
-                self.refused += 1
+                self._full_until_us = leaver.heard_us + SILENT_AFTER_US
                 return None, None
             self.remove(leaver)
         presence = Presence(client_id, address, now_us)

@@ -78,6 +78,12 @@ class Endpoint:
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers may."""
 
+    @property
+    def address(self) -> str:
+        """Where it is: `HOST:PORT`, or the device of a serial port."""
+        serial = self.kind is EndpointKind.SERIAL
+        return self.host if serial else host_and_port(self.host, self.port)
+
     def passes(self, message_id: int) -> bool:
         """Tell whether the lists let a message out to this endpoint."""
         return message_id not in self.deny and (not self.allow or message_id in self.allow)
@@ -126,6 +132,11 @@ def parse_endpoint(url: str) -> Endpoint:
         )
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
+
+
+def host_and_port(host: object, port: object) -> str:
+    """Write a place as in a URL, an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
 
 
 def message_id_from(text: str) -> int:

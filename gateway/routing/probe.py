@@ -17,18 +17,19 @@ PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to anything older is none."""
 NS_PER_US: Final = 1000
+NOBODY: Final = 0
 
 
 class RoundTrip:
     """Ask for round trips and read the answers."""
 
     def __init__(self) -> None:
-        self._sender = dialect.MAVLink(None, 1, PROBE_COMPONENT)
+        self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
 
     @property
     def origin(self) -> Origin:
-        """System and component that the questions come from."""
+        """System and component that the questions come from; system 0 before the first."""
         return self._sender.srcSystem, PROBE_COMPONENT
 
     def ask(self, system: int, now_us: int) -> list[tuple[bytes, int]]:

@@ -1,8 +1,8 @@
-"""Trouble with clients, in words for whoever flies: once when it comes, once when it has passed."""
+"""Trouble with clients and ports, told in words: once when it comes, once when it has passed."""
 
 from typing import Final
 
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.units import US_PER_S
 
 PATIENCE_US: Final = 5 * US_PER_S
@@ -13,23 +13,34 @@ TROUBLED_STATES: Final = frozenset({"unreachable", "resolving", "connecting"})
 """`refused` is not among them: a ground station that is not running is nothing unusual."""
 
 
+Key = int | str
+"""Id of a client, or URL of a listening port."""
+
+
 class TroubleWatch:
-    """Tell trouble from the clients' figures."""
+    """Tell trouble from the figures of clients and listening ports."""
 
     def __init__(self) -> None:
-        self._away_since_us: dict[int, int] = {}
-        self._away_told: set[int] = set()
+        self._away_since_us: dict[Key, int] = {}
+        self._away_told: set[Key] = set()
         self._dropped: dict[int, int] = {}
         """Drops at the last look, of clients that were open then."""
         self._slow_until_us: dict[int, int] = {}
 
-    def update(self, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
-        """Look at all clients; return what is new to tell.
+    def update(
+        self,
+        clients: tuple[ClientStats, ...],
+        listeners: tuple[ListenerStats, ...],
+        now_us: int,
+    ) -> list[str]:
+        """Look at all; return what is new to tell.
 
         Parameters
         ----------
         clients : tuple of ClientStats
             All clients at this moment.
+        listeners : tuple of ListenerStats
+            All listening ports at this moment.
         now_us : int
             Gateway time.
 
@@ -38,26 +49,29 @@ class TroubleWatch:
         list of str
             Short texts.
         """
-        self._forget_all_but({client.client_id for client in clients})
+        ids = {client.client_id for client in clients}
+        self._forget_all_but(ids, {listener.endpoint for listener in listeners})
         texts = []
+        for listener in listeners:
+            texts += self._away(listener.endpoint, listener.name, listener.reason, now_us)
         for client in clients:
-            texts += self._away(client, now_us)
+            trouble = client.reason or client.state if client.state in TROUBLED_STATES else ""
+            texts += self._away(client.client_id, client.name, trouble, now_us)
             texts += self._slow(client, now_us)
         return texts
 
-    def _away(self, client: ClientStats, now_us: int) -> list[str]:
-        key = client.client_id
-        if client.state not in TROUBLED_STATES:
+    def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[str]:
+        if not trouble:
             self._away_since_us.pop(key, None)
             if key in self._away_told:
                 self._away_told.remove(key)
-                return [f"{client.name} is back"]
+                return [f"{name} is back"]
             return []
         since_us = self._away_since_us.setdefault(key, now_us)
         if key in self._away_told or now_us - since_us < PATIENCE_US:
             return []
         self._away_told.add(key)
-        return [f"{client.name}: {client.state}"]
+        return [f"{name}: {trouble}"]
 
     def _slow(self, client: ClientStats, now_us: int) -> list[str]:
         key = client.client_id
@@ -72,8 +86,11 @@ class TroubleWatch:
         self._slow_until_us[key] = now_us + QUIET_US
         return [] if was_slow else [f"{client.name} is too slow: telemetry dropped"]
 
-    def _forget_all_but(self, there: set[int]) -> None:
-        for known in (self._away_since_us, self._dropped, self._slow_until_us):
-            for key in known.keys() - there:
-                del known[key]
+    def _forget_all_but(self, clients: set[int], listeners: set[str]) -> None:
+        for known in (self._dropped, self._slow_until_us):
+            for client_id in known.keys() - clients:
+                del known[client_id]
+        there = clients | listeners
+        for key in self._away_since_us.keys() - there:
+            del self._away_since_us[key]
         self._away_told &= there

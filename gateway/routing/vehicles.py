@@ -32,14 +32,16 @@ class OwnVehicles:
         return bool(self._newcomers)
 
     def note(self, frame: bytes, message_id: int, now_us: int) -> bool:
-        """Remember a frame of ours that belongs to the greeting; tell whether a vehicle is new."""
+        """Note a frame of ours, for greetings if it belongs there; tell if its vehicle is new."""
         origin = origin_of(frame)
         is_new = not self.is_own(origin, now_us)
-        self._seen_us[origin] = now_us
         if is_new:
             # What an earlier playback said of this system holds no more.
             self._frames[origin] = {}
-        self._frames[origin][message_id] = frame
+        if is_new or message_id in GREETING:
+            self._seen_us[origin] = now_us
+        if message_id in GREETING:
+            self._frames[origin][message_id] = frame
         return is_new
 
     def is_own(self, origin: Origin, now_us: int) -> bool:

@@ -1,6 +1,7 @@
 """The commands about clients, against a control socket with canned answers."""
 
 import asyncio
+import dataclasses
 import json
 import threading
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from gateway.cli import clients
 from gateway.cli.app import app
 from gateway.edges.control_socket import ControlError, ControlServer, NoParams, socket_path
 from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 from gateway.status import Snapshot
 
 pytestmark = pytest.mark.io
@@ -40,6 +41,11 @@ CLIENT = ClientStats(
     heard_us=1_000_000,
     round_trip_us=1500,
 )
+RADIO = dataclasses.replace(CLIENT, name="radio", state="unreachable", reason="No such device")
+OPEN = ListenerStats("udp-listen:0.0.0.0:14551", "", "open", "", 14551, 1, 0)
+CLOSED = ListenerStats(
+    "observers", "tcp-listen:[::]:5760?name=observers", "closed", "Address already in use", 0, 0, 8
+)
 NODE = NodeLink(NodeId(1, 2), 0, 100, 7, 0, 0, 1, 60.0, 0, 0.0)
 SNAPSHOT = Snapshot(
     time_us=3_723_000_000,
@@ -62,9 +68,10 @@ SNAPSHOT = Snapshot(
             ),
         ),
     ),
-    clients=(CLIENT,),
+    clients=(CLIENT, RADIO),
     sent=((30, 9),),
     hub=HubCounters(published=9, looped=1),
+    listeners=(OPEN, CLOSED),
 )
 
 
@@ -124,6 +131,10 @@ def test_status_for_people(gateway: Gateway) -> None:
     assert "9 published, 1 looped" in text
     assert "tablet" in text
     assert "255.190" in text
+    assert "radio: No such device" in text
+    rows = [line.split() for line in text.splitlines()]
+    assert ["udp-listen:0.0.0.0:14551", "open", "1", "0"] in rows
+    assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
 
 
 def test_status_for_programs(gateway: Gateway) -> None:
@@ -138,6 +149,8 @@ def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
     assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
     assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
     assert gateway.asked == [Url("udp:10.0.0.8:14550")]
+    told = "observers: Address already in use; trying again until it works"
+    assert told in run("clients", "add", CLOSED.endpoint).output
     refused = run("clients", "remove", "phone")
     assert refused.exit_code == 2
     assert "no endpoint is called 'phone'" in refused.output

@@ -20,7 +20,7 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 from gateway.status import Snapshot
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
@@ -101,6 +101,14 @@ def test_rates_are_those_since_the_previous_view() -> None:
     assert "ATTITUDE_QUATERNION" in text
     assert "50.0" in text
     assert "1.0" in text
+
+
+def test_what_stands_in_the_way_is_told() -> None:
+    closed = ListenerStats("udp-listen:[::]:5760", "", "closed", "Address already in use", 0, 0, 0)
+    radio = replace(CLIENT, name="radio", state="unreachable", reason="Permission denied")
+    text = text_of(replace(SNAPSHOT, listeners=(closed,), clients=(CLIENT, radio)))
+    assert "udp-listen:[::]:5760: Address already in use" in text
+    assert "radio: Permission denied" in text
 
 
 @pytest.mark.parametrize("word", ["nan", "None"])

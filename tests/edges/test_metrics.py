@@ -5,9 +5,10 @@ import socket
 
 import pytest
 
+from gateway.edges import metrics
 from gateway.edges.metrics import MetricsServer, prometheus_text
 from gateway.records import LinkReport, NodeId, NodeLink
-from gateway.routing.clients import ClientStats, HubCounters
+from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
 from gateway.status import Snapshot
 
 NODE = NodeLink(
@@ -59,7 +60,11 @@ SNAPSHOT = Snapshot(
     clients=(CLIENT,),
     sent=(),
     hub=HubCounters(published=9),
+    listeners=(
+        ListenerStats("here", "tcp-listen:0.0.0.0:1?name=here", "closed", "taken", 0, 0, 4),
+    ),
 )
+PORT = '{name="here",endpoint="tcp-listen:0.0.0.0:1?name=here"}'
 LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
 
 
@@ -76,6 +81,8 @@ LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
         f"mavgate_client_round_trip_seconds{LABELS} 0.0015",
         f"mavgate_client_silent_seconds{LABELS} 2",
         f"mavgate_client_open{LABELS} 1",
+        f"mavgate_listener_open{PORT} 0",
+        f"mavgate_listener_turned_away_total{PORT} 4",
     ],
 )
 def test_samples(line: str) -> None:
@@ -117,17 +124,28 @@ class TestServer:
         with pytest.raises(ConnectionRefusedError):
             await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
 
-    async def test_zero_serves_none_and_a_taken_port_is_told(
-        self, caplog: pytest.LogCaptureFixture
+    async def test_zero_serves_none(self) -> None:
+        server = MetricsServer(lambda: SNAPSHOT)
+        server.listen(0)
+        assert (server.port, server.listeners()) == (0, ())
+
+    async def test_a_taken_port_is_told_and_used_when_it_is_free(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        first, second = MetricsServer(lambda: SNAPSHOT), MetricsServer(lambda: SNAPSHOT)
-        first.listen(0)
-        assert first.port == 0
-        first.listen(_free_port())
-        second.listen(first.port)
-        assert second.port == 0
-        assert "no metrics" in caplog.text
-        first.close()
+        monkeypatch.setattr(metrics, "RETRY_S", 0.0)
+        server = MetricsServer(lambda: SNAPSHOT)
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+            server.listen(port)
+            await asyncio.sleep(0)
+            (stats,) = server.listeners()
+            assert (stats.state, stats.reason) == ("closed", "Address already in use")
+        while not server.port:
+            await asyncio.sleep(0)
+        assert (server.port, server.listeners()[0].state) == (port, "open")
+        assert caplog.text.count("no metrics") == 1
+        server.close()
+        assert server.listeners() == ()
 
 
 def _free_port() -> int:

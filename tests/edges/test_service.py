@@ -3,6 +3,8 @@
 import asyncio
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -78,8 +80,37 @@ def test_realtime_is_asked_for_or_told(
         asked.append((policy, param.sched_priority))
 
     monkeypatch.setattr(os, "sched_setscheduler", schedule)
-    set_realtime_priority(0)
     set_realtime_priority(1)
-    assert asked == [(os.SCHED_RR, 1)]
+    set_realtime_priority(0)
+    assert [(policy & ~os.SCHED_RESET_ON_FORK, level) for policy, level in asked] == [
+        (os.SCHED_RR, 1),
+        (os.SCHED_OTHER, 0),
+    ]
     set_realtime_priority(99)
     assert "CAP_SYS_NICE" in caplog.text
+
+
+REAL_TIME = """
+import os, threading
+from gateway.edges.service import set_realtime_priority
+policies = []
+note = lambda: policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+set_realtime_priority(1)
+note()
+thread = threading.Thread(target=note)
+thread.start()
+thread.join()
+set_realtime_priority(0)
+note()
+print(policies == [os.SCHED_RR, os.SCHED_OTHER, os.SCHED_OTHER])
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may have real-time priority")
+def test_the_kernel_grants_real_time_to_the_one_thread() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", REAL_TIME], capture_output=True, text=True, check=True
+    )
+    if "not permitted" in run.stderr:
+        pytest.skip("this machine forbids real-time priority")
+    assert run.stdout == "True\n"

@@ -32,8 +32,12 @@ def test_silence_ends_it() -> None:
 
 def test_full_table_refuses_while_all_are_alive() -> None:
     table = table_of(1, 2, 3)
+    assert not table.is_full(0)
     assert table.admit(("10.0.0.9", 9), 9, SILENT_AFTER_US - 1) == (None, None)
-    assert table.refused == 1
+    assert table.is_full(SILENT_AFTER_US - 1)
+    assert not table.is_full(SILENT_AFTER_US)
+    table.remove(table.presences()[0])
+    assert not table.is_full(SILENT_AFTER_US - 1)
 
 
 def test_full_table_gives_the_place_of_the_most_silent() -> None:

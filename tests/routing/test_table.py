@@ -66,28 +66,40 @@ def test_stations_are_told_from_vehicles(table: RoutingTable) -> None:
     assert table.ways_to_vehicles(1) == [2, 3, 4]
 
 
-class TestLoopGuard:
-    def test_a_copy_from_elsewhere_is_known(self) -> None:
-        guard = LoopGuard()
-        assert not guard.is_copy(b"frame", 1, 0)
-        assert guard.is_copy(b"frame", 2, 10)
-        assert not guard.is_copy(b"other", 2, 20)
+def test_a_way_is_as_old_as_its_last_long_silence(table: RoutingTable) -> None:
+    later_us = ROUTE_FRESH_US
+    assert not table.hear(1, (10, 1), later_us)
+    assert table.since_us(1, (10, 1)) == 0
+    assert table.hear(1, (10, 1), 2 * later_us + 1)
+    assert table.since_us(1, (10, 1)) == 2 * later_us + 1
+    assert table.since_us(9, (10, 1)) == 0
 
-    def test_the_same_client_may_repeat_itself(self) -> None:
+
+class TestLoopGuard:
+    def test_a_copy_is_known_wherever_it_comes_from(self) -> None:
         guard = LoopGuard()
-        assert not guard.is_copy(b"frame", 1, 0)
-        assert not guard.is_copy(b"frame", 1, 10)
+        assert not guard.is_copy(b"frame", 0, 0)
+        assert guard.is_copy(b"frame", 0, 10)
+        assert guard.is_copy(b"frame", 0, 20)
+        assert not guard.is_copy(b"other", 0, 20)
+
+    def test_a_newcomer_repeats_nothing(self) -> None:
+        guard = LoopGuard()
+        assert not guard.is_copy(b"frame", 0, 10)
+        assert not guard.is_copy(b"frame", 11, 11)
+        assert guard.is_copy(b"frame", 0, 12)
+        assert guard.is_copy(b"frame", 11, 12)
 
     def test_across_the_turn_of_generations_and_forgotten_after_two(self) -> None:
         guard = LoopGuard()
-        guard.is_copy(b"frame", 1, MEMORY_US)
-        guard.is_copy(b"other", 1, 2 * MEMORY_US)
-        assert guard.is_copy(b"frame", 2, 2 * MEMORY_US + 1)
-        guard.is_copy(b"other", 1, 3 * MEMORY_US)
-        assert not guard.is_copy(b"frame", 2, 3 * MEMORY_US)
+        guard.is_copy(b"frame", 0, MEMORY_US)
+        guard.is_copy(b"other", 0, 2 * MEMORY_US)
+        assert guard.is_copy(b"frame", 0, 2 * MEMORY_US + 1)
+        guard.is_copy(b"third", 0, 3 * MEMORY_US)
+        assert not guard.is_copy(b"frame", 0, 3 * MEMORY_US)
 
     def test_memory_is_bounded(self) -> None:
         guard = LoopGuard()
         for n in range(5 * MEMORY_FRAMES):
-            guard.is_copy(n.to_bytes(4, "little"), 1, 1)
+            guard.is_copy(n.to_bytes(4, "little"), 0, 1)
         assert len(guard._recent) + len(guard._older) <= 2 * MEMORY_FRAMES

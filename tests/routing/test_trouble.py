@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gateway.routing.clients import ClientStats
+from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.routing.trouble import PATIENCE_US, QUIET_US, TroubleWatch
 
 S = 1_000_000
@@ -32,49 +32,72 @@ def client(**changes: object) -> tuple[ClientStats, ...]:
     return (dataclasses.replace(CLIENT, **changes),)
 
 
+def look(watch: TroubleWatch, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
+    return watch.update(clients, (), now_us)
+
+
 def test_a_short_absence_is_not_told() -> None:
     watch = TroubleWatch()
-    assert watch.update(client(state="unreachable"), 0) == []
-    assert watch.update(client(state="unreachable"), PATIENCE_US - 1) == []
-    assert watch.update(client(), PATIENCE_US) == []
-    assert watch.update(client(state="unreachable"), PATIENCE_US + 1) == []
+    assert look(watch, client(state="unreachable"), 0) == []
+    assert look(watch, client(state="unreachable"), PATIENCE_US - 1) == []
+    assert look(watch, client(), PATIENCE_US) == []
+    assert look(watch, client(state="unreachable"), PATIENCE_US + 1) == []
 
 
 def test_a_long_absence_is_told_once_and_so_is_the_return() -> None:
     watch = TroubleWatch()
-    texts = [text for n in range(20) for text in watch.update(client(state="unreachable"), n * S)]
+    texts = [text for n in range(20) for text in look(watch, client(state="unreachable"), n * S)]
     assert texts == ["tablet: unreachable"]
-    assert watch.update(client(), 21 * S) == ["tablet is back"]
-    assert watch.update(client(), 22 * S) == []
+    assert look(watch, client(), 21 * S) == ["tablet is back"]
+    assert look(watch, client(), 22 * S) == []
+
+
+def test_the_reason_is_told_if_it_is_known() -> None:
+    watch = TroubleWatch()
+    away = client(state="unreachable", reason="Permission denied")
+    texts = [text for n in range(20) for text in look(watch, away, n * S)]
+    assert texts == ["tablet: Permission denied"]
+
+
+def test_a_port_that_cannot_be_bound_is_told_until_it_can() -> None:
+    watch, taken = TroubleWatch(), "Address already in use"
+    closed = ListenerStats("here", "udp-listen:0.0.0.0:14550", "closed", taken, 0, 0, 0)
+    texts = [text for n in range(20) for text in watch.update((), (closed,), n * S)]
+    assert texts == [f"here: {taken}"]
+    opened = dataclasses.replace(closed, state="open", reason="", port=14550)
+    assert watch.update((), (opened,), 21 * S) == ["here is back"]
+    watch.update((), (closed,), 22 * S)
+    assert watch.update((), (), 23 * S) == []
+    assert not watch._away_since_us
 
 
 def test_a_station_that_is_not_running_is_no_trouble() -> None:
     watch = TroubleWatch()
-    assert all(not watch.update(client(state="refused"), n * S) for n in range(20))
+    assert all(not look(watch, client(state="refused"), n * S) for n in range(20))
 
 
 def test_drops_are_told_once_until_they_have_ceased() -> None:
     watch = TroubleWatch()
-    texts = [text for n in range(10) for text in watch.update(client(dropped=n * 10), n * S)]
+    texts = [text for n in range(10) for text in look(watch, client(dropped=n * 10), n * S)]
     assert texts == ["tablet is too slow: telemetry dropped"]
     for n in range(40):
-        assert watch.update(client(dropped=90), 10 * S + n * S) == []
+        assert look(watch, client(dropped=90), 10 * S + n * S) == []
     assert QUIET_US < 40 * S
-    assert len(watch.update(client(dropped=91), 60 * S)) == 1
+    assert len(look(watch, client(dropped=91), 60 * S)) == 1
 
 
 def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
     watch = TroubleWatch()
-    watch.update(client(state="unreachable", dropped=10), 0)
-    assert watch.update(client(dropped=20), S) == []
-    assert watch.update(client(dropped=20), 2 * S) == []
+    look(watch, client(state="unreachable", dropped=10), 0)
+    assert look(watch, client(dropped=20), S) == []
+    assert look(watch, client(dropped=20), 2 * S) == []
 
 
 def test_a_client_that_left_is_forgotten() -> None:
     watch = TroubleWatch()
     for n in range(10):
-        watch.update(client(state="unreachable", dropped=n), n * S)
-        watch.update(client(dropped=n), n * S)
-    assert watch.update((), 11 * S) == []
+        look(watch, client(state="unreachable", dropped=n), n * S)
+        look(watch, client(dropped=n), n * S)
+    assert look(watch, (), 11 * S) == []
     assert not watch._away_told
     assert not watch._dropped

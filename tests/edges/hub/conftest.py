@@ -118,10 +118,21 @@ class Rig:
     def out(self, frame: bytes, client_id: int | None = None) -> Outgoing:
         return Outgoing(frame, message_id_of(frame), client_id)
 
+    def tick(self, hub: Hub) -> None:
+        """Let the hub do what it does a few times a second, now."""
+        assert hub._timer
+        hub._timer.cancel()
+        hub._tick()
+
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(10):
             while not condition():
                 await asyncio.sleep(0)
+
+    async def quiet(self) -> None:
+        """Let everything go where it goes: on loopback each step takes one turn of the loop."""
+        for _ in range(200):
+            await asyncio.sleep(0)
 
     async def until_open(self, hub: Hub) -> None:
         await self.until(lambda: all(client.state == "open" for client in hub.clients()))

@@ -1,5 +1,8 @@
 """The hub between many endpoints: routing, loops, changes at run time, round trips."""
 
+import os
+import resource
+import socket
 from typing import Any
 
 import msgspec
@@ -85,6 +88,74 @@ async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     await world.until(lambda: hub.counters().looped == 1)
     assert world.second.is_silent()
     assert world.incoming[-1].frame != ours
+
+
+async def test_a_program_started_again_and_again_is_heard_at_its_first_word(world: Any) -> None:
+    port = world.world.listening_ports()[0]
+    for _ in range(4):
+        again = world.station(port)
+        request = again.sender.command(42, 1)
+        again.say(request)
+        assert await world.autopilot.receive() == request
+        again.socket.close()
+        world.clock.us += 100_000
+    assert world.world.counters().duplicates == 0
+
+
+async def test_a_copy_goes_round_a_loop_once_at_most(world: Any) -> None:
+    """Whoever echoes from the start is heard as a second way; then its echoes end here."""
+    port = world.world.listening_ports()[0]
+    echo = world.station(port)
+    said = [world.autopilot.sender.attitude() for _ in range(5)]
+    world.autopilot.say(said[0])
+    assert await world.first.receive() == said[0]
+    world.clock.us += 1000
+    echo.say(said[0])
+    assert [await world.first.receive(), await world.autopilot.receive()] == [said[0], said[0]]
+    for count, frame in enumerate(said[1:], start=1):
+        world.clock.us += 1000
+        world.autopilot.say(frame)
+        assert [await world.first.receive(), await echo.receive()] == [frame, frame]
+        echo.say(frame)
+        await world.until(lambda count=count: world.world.counters().duplicates == count)
+    assert world.first.is_silent()
+
+
+async def test_nothing_runs_round_a_ring(rig: Any) -> None:
+    """Two hubs joined by two cables; a vehicle of its own behind each, and both ask for trips."""
+    first = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0", ping_interval_s=1.0)
+    here, there = first.listening_ports()
+    cables = (f"udp:127.0.0.1:{here}", f"udp:127.0.0.2:{there}")
+    second = rig.hub("udp-listen:127.0.0.1:0", *cables)
+    await rig.until_open(second)
+    autopilot = rig.station(second.listening_ports()[0])
+    autopilot.sender = rig.sender(42, 1)
+    for _ in range(5):
+        rig.clock.us += 1_000_000
+        autopilot.say(autopilot.sender.heartbeat())
+        first.send(rig.out(rig.vehicle.heartbeat()))
+        for _ in range(10):
+            autopilot.say(autopilot.sender.attitude())
+            first.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(first)
+        await rig.quiet()
+    passed = [first.counters().forwarded, second.counters().forwarded]
+    assert passed < [3 * 55, 3 * 110]
+    assert first.counters().looped > 50
+    await rig.quiet()
+    assert [first.counters().forwarded, second.counters().forwarded] == passed
+
+
+async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> None:
+    echo, other = rig.station(), rig.station()
+    hub = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
+    await rig.until_open(hub)
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame))
+    assert [await echo.receive(), await other.receive()] == [frame, frame]
+    echo.socket.sendto(frame, ("127.0.0.1", hub._links[1]._port))
+    await rig.until(lambda: hub.counters().looped == 1)
+    assert other.is_silent()
 
 
 async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
@@ -255,3 +326,58 @@ class TestExpress:
             other.say(frame)
         await world.until(lambda: hub.counters().duplicates == 5)
         assert world.first.is_silent()
+
+
+class TestListeningPorts:
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_taken_port_is_shown_and_opens_when_it_is_free(
+        self, rig: Any, kind: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        taken = rig.station(kind=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        if kind == "tcp":
+            taken.socket.listen()
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:{taken.port}?name=here")
+        for tick in range(4):
+            rig.clock.us = tick * 2_000_000
+            rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("closed", "Address already in use", 0)
+        assert caplog.text.count("Address already in use; trying again") == 1
+        taken.socket.close()
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("open", "", taken.port)
+
+    async def test_clients_without_room_are_counted(self, rig: Any) -> None:
+        hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=1)
+        for turned_away in (0, 1, 2):
+            caller = rig.station(hub.listening_ports()[0])
+            caller.say(caller.sender.heartbeat())
+            await rig.until(lambda n=turned_away: hub.listeners()[0].turned_away == n)
+            await rig.until(lambda: hub.listeners()[0].clients == 1)
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(
+        self, rig: Any, kind: str
+    ) -> None:
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        (place,) = hub.listening_ports()
+        caller = rig.station(place, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(os.dup(0), soft), hard))
+        try:
+            if kind == "tcp":
+                caller.socket.connect_ex(caller.target)
+            else:
+                caller.say(caller.sender.heartbeat())
+            await rig.until(lambda: hub.listeners()[0].reason == "Too many open files")
+            assert hub.clients() == ()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        if kind == "udp":
+            caller.say(caller.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 1)
+        assert hub.listeners()[0].state == "open"

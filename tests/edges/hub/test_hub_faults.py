@@ -141,8 +141,9 @@ async def test_odd_datagrams_rain(rig: Any) -> None:
     assert len(flight.hub.clients()) == 3
 
 
-async def test_a_thousand_clients_appear_and_vanish(rig: Any) -> None:
-    flight = Healthy(rig, max_clients=16)
+@pytest.mark.parametrize("room", [16, 100])
+async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
+    flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
     await flight.start()
     target = ("127.0.0.1", flight.hub.listening_ports()[0])
     for visit in range(1000):
@@ -154,7 +155,8 @@ async def test_a_thousand_clients_appear_and_vanish(rig: Any) -> None:
             caller.say(caller.sender.heartbeat())
         await flight.fly(1)
     assert await flight.lost() == 0
-    assert len(flight.hub.clients()) <= 2 + 16
+    assert len(flight.hub.clients()) <= 2 + room
+    assert flight.hub.listeners()[0].clients >= min(room, 16)
 
 
 async def test_settings_are_reloaded_under_load(rig: Any) -> None:

@@ -173,9 +173,14 @@ class TestSerial:
         device.unlink()
         rig.clock.us = 2_000_000
         hub.send(rig.out(rig.vehicle.attitude()))
-        assert (hub.clients()[0].state, hub.clients()[0].dropped) == ("unreachable", 1)
+        rig.tick(hub)
+        (client,) = hub.clients()
+        assert (client.state, client.dropped) == ("unreachable", 1)
+        assert client.reason == "No such file or directory"
         device.symlink_to(os.ttyname(far))
+        rig.clock.us = 4_000_000
         await rig.until_open(hub)
+        assert hub.clients()[0].reason == ""
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))
         assert len(os.read(near, 100)) == len(frame)

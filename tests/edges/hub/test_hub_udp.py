@@ -209,6 +209,30 @@ async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPa
     assert await station.receive() == frame
 
 
+async def test_of_two_addresses_the_one_that_does_not_refuse(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `localhost` has, whose first address is often not the one that a station listens at."""
+    station = rig.station()
+
+    async def resolve(host: str, port: int, **_: object) -> list[object]:
+        addresses = (("127.0.0.2", port), ("127.0.0.1", port))
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", address) for address in addresses]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    hub = rig.hub(f"udp:here.example:{station.port}")
+    await rig.until_open(hub)
+    assert hub.clients()[0].remote == f"127.0.0.2:{station.port}"
+    hub.send(rig.out(rig.vehicle.attitude()))
+    await rig.until(lambda: hub.clients()[0].state == "refused")
+    for second in range(1, 5):
+        rig.clock.us = second * 1_000_000
+        rig.tick(hub)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients()[0].remote == f"127.0.0.1:{station.port}"
+        assert (await station.receive())[7] == 30
+
+
 async def test_a_name_moves_to_another_address(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     old, new = rig.station(), rig.station()
     ports = [old.port]
@@ -312,7 +336,8 @@ async def test_a_second_gateway_on_the_same_port_waits(rig: Any) -> None:
 
 
 async def test_a_thousand_come_and_go(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=8, idle_timeout_s=1000.0)
+    settings = {"max_clients": 8, "idle_timeout_s": 1000.0, "ping_interval_s": 0.0}
+    hub = rig.hub("udp-listen:127.0.0.1:0", **settings)
     steady = rig.station(hub.listening_ports()[0])
     steady.say(steady.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 1)
