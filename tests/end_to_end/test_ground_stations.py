@@ -114,7 +114,7 @@ async def test_mavsdk_telemetry(gateway: Gateway) -> None:
         norm = math.hypot(quaternion.w, quaternion.x, quaternion.y, quaternion.z)
         assert norm == pytest.approx(1.0, abs=1e-5)
         metrics = await anext(telemetry.subscribe_fixedwing_metrics())
-        assert math.isnan(metrics.airspeed_m_s), "nothing measures it"
+        assert metrics.airspeed_m_s == metrics.groundspeed_m_s, "nothing measures the airspeed"
         assert math.isfinite(metrics.climb_rate_m_s)
 
     await with_mavsdk(gateway, use)
@@ -217,6 +217,7 @@ def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
         mavproxy.type("wp load way.txt")
         mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
         mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
+        mavproxy.until(r"airspeed : \d\S*, groundspeed : \d", asking="status VFR_HUD")
         mavproxy.until(r"link 1 OK", asking="link")
         assert "breach" not in mavproxy.output
     finally:
