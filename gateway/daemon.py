@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from gateway.config import ConfigError, GatewaySettings, save_aircraft
+from gateway.config import ConfigError, GatewaySettings, load_aircraft, save_aircraft
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
@@ -113,9 +113,9 @@ class Daemon:
         self._notifier.ready()
 
     def reload(self) -> str:
-        """Take over changed settings of the hub; clients that stay notice nothing.
+        """Take over changed settings of the hub, and signing; clients that stay notice nothing.
 
-        The other sections hold from the next start on.
+        All others hold from the next start on: ground stations may have changed them meanwhile.
 
         Returns
         -------
@@ -128,14 +128,20 @@ class Daemon:
             If the settings are wrong; nothing has changed then.
         """
         settings = self._read()
+        passphrase = settings.vehicle.signing_passphrase
+        now = self._settings
+        vehicle = msgspec.structs.replace(now.vehicle, signing_passphrase=passphrase)
+        now = msgspec.structs.replace(now, hub=settings.hub, vehicle=vehicle)
+        own = {k: a.vehicle.signing_passphrase for k, a in load_aircraft(now).items()}
         self._notifier.reloading()
-        later = msgspec.structs.replace(settings, hub=self._settings.hub) != self._settings
-        self._settings = msgspec.structs.replace(self._settings, hub=settings.hub)
+        self._settings = now
         self._hub.apply(settings.hub)
+        self._perform(self._pipeline.sign_by(passphrase, own, self.now_us()))
         self._metrics.listen(settings.hub.metrics_port)
         set_realtime_priority(settings.hub.realtime_priority)
         self._notifier.ready()
-        told = f"settings of the hub applied{'; others need a new start' if later else ''}"
+        later = "; others need a new start" if settings != now else ""
+        told = f"settings of the hub and of signing applied{later}"
         log.info(told)
         return told
 

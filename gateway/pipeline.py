@@ -11,7 +11,7 @@ who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import msgspec
@@ -196,6 +196,12 @@ class Aircraft:
             if wanted != getattr(self.settings, section):
                 self._change(section, wanted)
 
+    def sign_by(self, passphrase: str, now_us: int) -> list[Action]:
+        """Sign, and check signatures, by another passphrase from now on."""
+        self.settings = _with_passphrase(self.settings, passphrase)
+        vehicle = self.settings.vehicle
+        return self.perform(self.vehicle.take_settings("vehicle", vehicle, now_us), now_us)
+
     def _change(self, section: str, settings: Settings) -> list[Action]:
         """Rebuild the stage whose settings changed; the others go on undisturbed."""
         self.settings = msgspec.structs.replace(self.settings, **{section: settings})
@@ -206,6 +212,11 @@ class Aircraft:
         else:
             return []
         return [SettingsChanged(self.vehicle_id)]
+
+
+def _with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSettings:
+    vehicle = msgspec.structs.replace(settings.vehicle, signing_passphrase=passphrase)
+    return msgspec.structs.replace(settings, vehicle=vehicle)
 
 
 def _succeed(old: Estimator, new: Estimator) -> Estimator:
@@ -254,6 +265,34 @@ class Pipeline:
         """Let an aircraft go on with other settings, as it did when it was recorded."""
         if vehicle_id in self.aircraft:
             self.aircraft[vehicle_id].change(settings)
+
+    def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> list[Action]:
+        """Sign, and check signatures, by other passphrases from now on.
+
+        Parameters
+        ----------
+        common : str
+            Of every aircraft that has none of its own; empty for none.
+        own : mapping of int to str
+            By vehicle id.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Action
+        """
+        known = self._settings
+        aircraft = {
+            key: _with_passphrase(known.aircraft.get(key, known.default), own.get(key, common))
+            for key in {*known.aircraft, *own}
+        }
+        default = _with_passphrase(known.default, common)
+        self._settings = replace(known, default=default, aircraft=aircraft)
+        actions: list[Action] = []
+        for key, each in self.aircraft.items():
+            actions += each.sign_by(own.get(key, common), now_us)
+        return actions
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""

@@ -58,7 +58,8 @@ class VehicleSettings(Settings, frozen=True):
         str,
         setting(
             "MAVLink 2 signing: the same passphrase as in the ground station. Everything sent is "
-            "signed then, and nobody changes anything without a signature. Empty for none."
+            "signed then, and nobody changes anything without a signature. Empty for none. "
+            "`mavgate reload` takes over another."
         ),
     ] = ""
     node_silent_s: Annotated[

@@ -105,11 +105,11 @@ class Vehicle:
         """Requests to change something that were refused."""
         self.health = Health(self.vehicle_id, settings.node_silent_s)
         self.telemetry = Telemetry(settings, self.health)
-        passphrase = settings.signing_passphrase
-        key = key_from_passphrase(passphrase) if passphrase else None
-        clock = SigningClock(unix_us_at_zero)
-        self._encoder = Encoder(system_id, key, clock)
-        self._reader = RequestReader(system_id, Verifier(key, clock) if key else None)
+        self._clock = SigningClock(unix_us_at_zero)
+        self._encoder = Encoder(system_id, clock=self._clock)
+        self._reader = RequestReader(system_id)
+        self._passphrase = ""
+        self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
         # On its own, so that strangers cannot use up what is kept for events.
         self._refusal_texts = Announcer()
@@ -288,6 +288,16 @@ class Vehicle:
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
         self.telemetry.reconfigure(settings)
+        self._sign_by(settings.signing_passphrase)
+
+    def _sign_by(self, passphrase: str) -> None:
+        """Sign and check by another key; what the present one has seen guards against replays."""
+        if passphrase == self._passphrase:
+            return
+        self._passphrase = passphrase
+        key = key_from_passphrase(passphrase) if passphrase else None
+        self._encoder.set_key(key)
+        self._reader.verifier = Verifier(key, self._clock) if key else None
 
     def _replies(self, messages: Iterable[Any]) -> list[Answer]:
         return [Reply(message) for message in messages]

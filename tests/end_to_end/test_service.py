@@ -72,6 +72,28 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert "settings not reloaded" in gateway.log.read_text()
 
 
+def test_a_reload_changes_the_signing(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
+) -> None:
+    gateway = start_gateway("demo")
+    client = connect(gateway.port)
+
+    def until_signed(wanted: bool) -> None:
+        client.until(
+            lambda seen: "ATTITUDE" in seen and bool(seen["ATTITUDE"].get_msgbuf()[2] & 1) is wanted
+        )
+
+    until_signed(False)
+    settings = tmp_path / "gateway.toml"
+    plain = settings.read_text()
+    settings.write_text(f'{plain}\n[vehicle]\nsigning_passphrase = "correct horse"\n')
+    gateway.process.send_signal(signal.SIGHUP)
+    until_signed(True)
+    settings.write_text(plain)
+    gateway.process.send_signal(signal.SIGHUP)
+    until_signed(False)
+
+
 def test_orders_reach_the_hub(
     start_gateway: Callable[..., Gateway],
     connect: Callable[..., Client],
