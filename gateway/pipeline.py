@@ -346,10 +346,13 @@ class Pipeline:
         """Whether an aircraft flies."""
         return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
 
-    def set_recording(self, recording: bool) -> None:
-        """Note whether a recording runs; ground stations are told."""
-        for aircraft in self.aircraft.values():
-            aircraft.vehicle.set_recording(recording)
+    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
+        """Note whether a recording runs, or why not; ground stations are told."""
+        actions: list[Action] = []
+        for each in self.aircraft.values():
+            told = each.vehicle.on_recorder(trouble, now_us, recording=recording)
+            actions += each.perform(told, now_us)
+        return actions
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""

@@ -194,6 +194,12 @@ class Recorder:
         """Whether a recording runs."""
         return self._session.state is SessionState.RECORDING
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing is recorded although it should be; empty if nothing hinders it."""
+        blocked = self._session.state is SessionState.BLOCKED
+        return self._session.reason if blocked else ""
+
     def frame(self, frame: bytes) -> None:
         """Keep a MAVLink frame that was sent or received."""
         part = self._part

@@ -39,6 +39,7 @@ from gateway.vehicle.parameter_service import ParameterService
 from gateway.vehicle.parameters import ParameterTable
 from gateway.vehicle.places import PlaceService
 from gateway.vehicle.reader import RequestReader
+from gateway.vehicle.recording import RecordingService
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry import Telemetry
@@ -137,6 +138,8 @@ class Vehicle:
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         self.places.register(commands)
+        self._recording = RecordingService(self._explain)
+        self._recording.register(commands)
         services: tuple[Service, ...] = (
             commands,
             self._intervals,
@@ -152,6 +155,7 @@ class Vehicle:
             self.places.missions,
             self._ftp,
             self._calibrator,
+            self._recording,
         )
 
     @property
@@ -249,10 +253,13 @@ class Vehicle:
         self._parameters.forget_client(client_id)
         self.places.missions.forget_client(client_id)
         self._ftp.forget_client(client_id)
+        self._recording.forget_client(client_id)
 
-    def set_recording(self, recording: bool) -> None:
-        """Note whether a recording runs; the armed bit may follow it."""
+    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
+        """Note whether a recording runs, or why not; the armed bit may follow it."""
         self.health.recording = recording
+        answers = self._recording.update(trouble, now_us, recording=recording)
+        return self._finish(answers, now_us) if answers else []
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
         """Mark a place (its height may be NaN), or clear the mark.

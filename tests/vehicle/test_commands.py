@@ -3,7 +3,6 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import RecordingRequest
 from gateway.vehicle.home import Place
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
@@ -55,12 +54,6 @@ def test_home_cannot_be_nowhere(station: GroundStation, place: tuple[float, ...]
 def test_a_local_frame_is_no_place(station: GroundStation) -> None:
     command = mavlink.MAVLink_command_int_message(1, 1, 1, SET_HOME, 0, 0, 0, 0, 0, 0, 1, 2, 3)
     assert results(station.send(command)) == [DENIED]
-
-
-def test_logging_starts_and_stops_the_recording(station: GroundStation) -> None:
-    assert results(station.command(mavlink.MAV_CMD_LOGGING_START)) == [ACCEPTED]
-    assert results(station.command(mavlink.MAV_CMD_LOGGING_STOP)) == [ACCEPTED]
-    assert station.of(RecordingRequest) == [RecordingRequest(True), RecordingRequest(False)]
 
 
 @pytest.mark.parametrize(

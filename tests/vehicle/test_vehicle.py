@@ -140,7 +140,7 @@ def test_the_armed_bit_follows_the_rule(
     rule: str, recording: bool, speed: float, armed: bool
 ) -> None:
     vehicle = make(armed_when=rule)
-    vehicle.set_recording(recording)
+    vehicle.on_recorder("", 0, recording=recording)
     found = fly(vehicle, 0, 4, vel_n_mps=(speed, 0.0, 0.0), alt_amsl_m=521.0)
     last = [m for m in decode(found) if m.get_type() == "HEARTBEAT"][-1]
     assert bool(last.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED) is armed
