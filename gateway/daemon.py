@@ -8,18 +8,32 @@ from typing import Final
 
 import msgspec
 
-from gateway.config import ConfigError, GatewaySettings, load_aircraft, save_aircraft
+from gateway.config import (
+    ConfigError,
+    GatewaySettings,
+    aircraft_folder,
+    load_aircraft,
+    save_aircraft,
+)
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
 from gateway.edges.hub import Hub
 from gateway.edges.metrics import MetricsServer
+from gateway.edges.place_files import PlaceFiles
 from gateway.edges.pty_port import PtyPort
 from gateway.edges.recorder import Recorder
 from gateway.edges.serial_link import SerialLink
 from gateway.edges.service import ServiceNotifier, set_realtime_priority
 from gateway.flightlog.table import TableHeader
-from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
+from gateway.pipeline import (
+    Action,
+    Aircraft,
+    AircraftSettings,
+    Pipeline,
+    PipelineSettings,
+    SettingsChanged,
+)
 from gateway.records import (
     BaroRaw,
     ClientInterval,
@@ -32,7 +46,7 @@ from gateway.replay import header_for
 from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import RecordingRequest, SaveSettings
+from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
 from gateway.vehicle.events import NOTICE, WARNING, Told
 from gateway.vehicle.home import Place
 
@@ -72,8 +86,14 @@ class Daemon:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
         self._read = read
+        self._places = PlaceFiles(aircraft_folder(settings), self._tell_unkept)
         self._pipeline = Pipeline(
-            PipelineSettings(settings.default_aircraft, aircraft, unix_time_us() - self.now_us())
+            PipelineSettings(
+                settings.default_aircraft,
+                aircraft,
+                unix_time_us() - self.now_us(),
+                places=self._places.load(),
+            )
         )
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
@@ -157,6 +177,7 @@ class Daemon:
             self._opening.cancel()
         self._control.close()
         self._recorder.close()
+        self._places.close()
         self._metrics.close()
         self._hub.close()
 
@@ -170,6 +191,7 @@ class Daemon:
             clients=self._hub.clients(),
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
+            places_not_kept=self._places.failures,
         )
 
     def _reload_or_refuse(self) -> str:
@@ -240,6 +262,8 @@ class Daemon:
                     self._hub.set_interval(action)
                 case SaveSettings():
                     self._save(action.vehicle_id)
+                case SavePlaces():
+                    self._places.save(action.vehicle_id, action.places)
                 case RecordingRequest():
                     (self._recorder.record if action.start else self._recorder.stop)()
                 case FusedSample() | BaroRaw() | GpsFix():
@@ -258,5 +282,12 @@ class Daemon:
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, file)
             told = Told(NOTICE, f"Settings saved: {file.name}")
+        self._tell_of(aircraft, told)
+
+    def _tell_unkept(self, vehicle_id: int, reason: str) -> None:
+        told = Told(WARNING, f"Mission, mark and home not kept: {reason}")
+        self._tell_of(self._pipeline.aircraft[vehicle_id], told)
+
+    def _tell_of(self, aircraft: Aircraft, told: Told) -> None:
         now_us = self.now_us()
         self._perform(aircraft.perform(aircraft.vehicle.say(told, now_us), now_us))

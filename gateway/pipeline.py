@@ -48,12 +48,14 @@ from gateway.vehicle.actions import (
     CalibrationKind,
     CalibrationMeasured,
     RecordingRequest,
+    SavePlaces,
     SaveSettings,
     SettingsChange,
 )
 from gateway.vehicle.events import Told
 from gateway.vehicle.home import Place
 from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
 
@@ -68,7 +70,7 @@ class SettingsChanged:
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | SettingsChanged
-Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | Recorded
+Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
 """Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
 
 ABSORB: Final = {
@@ -99,6 +101,8 @@ class PipelineSettings:
     """Civil time at the gateway clock's zero, as well as it is known."""
     correct: Callable[[NavState], NavState] | None = None
     """Changes the states before they are told: for a playback that knows what comes."""
+    places: Mapping[int, StoredPlaces] = field(default_factory=dict)
+    """Missions, marks and homes kept of an earlier run, by vehicle id."""
 
 
 class Aircraft:
@@ -116,6 +120,7 @@ class Aircraft:
             vehicle_id,
             sections=sections,
             unix_us_at_zero=common.unix_us_at_zero,
+            stored=common.places.get(vehicle_id),
         )
         self._chain = SensorChain(settings.sensing, settings.calibration)
         self._estimator: Estimator = make_estimator(settings.estimation)

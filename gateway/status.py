@@ -18,3 +18,5 @@ class Snapshot:
     sent: tuple[tuple[int, int], ...]
     """MAVLink message id and how many were sent since the start."""
     hub: HubCounters
+    places_not_kept: int = 0
+    """Changes of missions, marks and homes that could not be written since the start."""

@@ -150,6 +150,8 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
         yield f"node_{field}{suffix}", kind, meaning, nodes
     for field in ("published", "forwarded", "duplicates", "looped", "unroutable"):
         yield f"hub_{field}_total", "counter", f"Frames {field}.", [({}, getattr(hub, field))]
+    unkept: list[Sample] = [({}, float(snapshot.places_not_kept))]
+    yield "places_not_kept_total", "counter", "Missions, marks or homes not written.", unkept
     yield from _client_families(snapshot.clients, now_us)
 
 

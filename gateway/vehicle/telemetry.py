@@ -148,6 +148,10 @@ class Telemetry:
         self._reference_alt_m = home.place.alt_amsl_m
         return [messages.home_position(home)]
 
+    def forget_home(self) -> None:
+        """Let the next good fix set home; heights stay relative to the old one until then."""
+        self.home = None
+
     def poll(self, now_us: int) -> list[Any]:
         """Tell what is due by time."""
         due = [m for m in TIMED_MESSAGES if self.streams[m].tick(now_us)]

@@ -42,10 +42,12 @@ from gateway.vehicle.reader import RequestReader
 from gateway.vehicle.recording import RecordingService
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
+from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry import Telemetry
 from gateway.vehicle.timing import TimingService
 
 OWN_SECTION: Final = "vehicle"
+HOME_SECTION: Final = "home"
 
 
 class Service(Protocol):
@@ -83,6 +85,7 @@ class Vehicle:
         *,
         sections: Mapping[str, Settings] | None = None,
         unix_us_at_zero: int = 0,
+        stored: StoredPlaces | None = None,
     ) -> None:
         """Begin with nothing known.
 
@@ -99,6 +102,8 @@ class Vehicle:
             key under which the change comes back.
         unix_us_at_zero : int, optional
             Unix time when the gateway clock was zero; needed for signing only.
+        stored : StoredPlaces, optional
+            What was kept of an earlier run.
         """
         self.system_id = system_id
         self.vehicle_id = system_id if vehicle_id is None else vehicle_id
@@ -114,17 +119,24 @@ class Vehicle:
         self._announcements = Announcements(self.health)
         # On its own, so that strangers cannot use up what is kept for events.
         self._refusal_texts = Announcer()
-        self._make_services({OWN_SECTION: settings, **(sections or {})})
+        self.places = PlaceService(
+            self.vehicle_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
+        )
+        self._told_home = self.telemetry.home
+        home = self.places.home.parameters()
+        self._make_services({OWN_SECTION: settings, **(sections or {}), HOME_SECTION: home})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
-        self.places = PlaceService(self.telemetry, self._announcements.say)
         self._intervals = IntervalService(self.system_id, self.telemetry)
-        self._parameters = ParameterService(self.vehicle_id, ParameterTable(sections))
+        self._parameters = ParameterService(
+            self.vehicle_id, ParameterTable(sections), {HOME_SECTION: self.places}
+        )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService(
             {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
         )
         self._calibrator = Calibrator(self.vehicle_id)
+        self._recording = RecordingService(self._explain)
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
                 self.system_id
@@ -138,8 +150,11 @@ class Vehicle:
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         self.places.register(commands)
-        self._recording = RecordingService(self._explain)
         self._recording.register(commands)
+        self._route(commands)
+
+    def _route(self, commands: CommandService) -> None:
+        """Tell who takes which message, and who is polled."""
         services: tuple[Service, ...] = (
             commands,
             self._intervals,
@@ -187,11 +202,12 @@ class Vehicle:
         """Take in one GPS fix."""
         self.health.on_gps(fix)
         had_home = self.telemetry.home is not None
-        found = self.telemetry.on_gps(fix)
+        found = self._replies(self.telemetry.on_gps(fix))
         if self.telemetry.home is not None and not had_home:
-            found += self._announcements.say(Told(INFO, "Home set by GPS"), now_us)
-        found += self._announcements.on_fix(now_us)
-        return self._finish(self._replies(found), now_us)
+            found += self._replies(self._announcements.say(Told(INFO, "Home set by GPS"), now_us))
+        found += self.places.on_fix(fix, now_us)
+        found += self._replies(self._announcements.on_fix(now_us))
+        return self._finish(found, now_us)
 
     def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
@@ -313,6 +329,10 @@ class Vehicle:
         """Encode what is still a message, and take over what concerns the vehicle itself."""
         self._encoder.set_time(now_us)
         actions: list[Action] = []
+        if self.telemetry.home is not self._told_home:
+            self._told_home = self.telemetry.home
+            home = self._parameters.take(HOME_SECTION, self.places.home.parameters())
+            answers = [*answers, *home]
         for answer in answers:
             if isinstance(answer, Reply):
                 actions.append(self._encoder.encode(answer.message, answer.client_id))

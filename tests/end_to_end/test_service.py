@@ -102,9 +102,8 @@ def test_a_recording_is_accepted_only_when_it_runs(
     in_the_way.write_text("a file where the folder should be")
     config = f'{CONFIG}\n[recording]\nfolder = "{in_the_way}/today"\n'
     gateway = start_gateway("demo", config=config)
-    client = connect(gateway.port)
-    client.until(lambda seen: "ATTITUDE" in seen)
-
+    connect(gateway.port).until(lambda seen: "ATTITUDE" in seen)
+    client = connect()
     in_progress = mavlink.MAV_RESULT_IN_PROGRESS
 
     def order() -> list[int]:

@@ -19,7 +19,8 @@ def results(messages: list) -> list[int]:
 
 def test_home_is_set_to_a_place_and_told_to_all(station: GroundStation) -> None:
     found = station.command(SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
-    assert kinds(found) == ["COMMAND_ACK", "HOME_POSITION", "STATUSTEXT"]
+    assert kinds(found)[:3] == ["COMMAND_ACK", "HOME_POSITION", "STATUSTEXT"]
+    assert {m.param_id for m in found[3:]} == {"HOME_SOURCE", "HOME_LAT", "HOME_LON", "HOME_ALT"}
     assert (found[1].latitude, found[1].altitude) == (475_000_000, 400_000)
     [_, position] = station.request(33)
     assert position.relative_alt == pytest.approx(123_456, abs=1)

@@ -145,7 +145,7 @@ def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
 
 
 TOLD_TO_ALL = {
-    "command/int": {"HOME_POSITION", "STATUSTEXT"},
+    "command/int": {"HOME_POSITION", "STATUSTEXT", "PARAM_VALUE"},
     "command/denied": {"STATUSTEXT"},
     "command/long-running": {"STATUSTEXT"},
     "parameter/set": {"PARAM_VALUE"},
