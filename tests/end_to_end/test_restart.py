@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.cli.prepare import compile_everything
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.routing.settings import HubSettings
@@ -17,6 +18,7 @@ from tests.vehicle.test_mission import RALLY, content, download, item, upload
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 ITEMS = [item(seq) for seq in range(30)]
+START_UNIX_US = 1_781_187_930_000_000
 RALLY_ITEMS = [item(seq, RALLY) for seq in range(3)]
 
 
@@ -46,6 +48,7 @@ def find(port: int) -> tuple[int, int, int]:
 async def test_missions_and_home_survive_a_restart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    compile_everything()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -54,7 +57,7 @@ async def test_missions_and_home_survive_a_restart(
         aircraft_folder=str(tmp_path / "aircraft"),
     )
     for use in (store, find):
-        line = simulate(settings.simulator, 0).frames()
+        line = simulate(settings.simulator, START_UNIX_US).frames()
         daemon = Daemon(settings, {}, lambda: settings, line)
         daemon.start()
         try:

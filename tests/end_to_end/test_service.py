@@ -102,7 +102,8 @@ def test_a_recording_is_accepted_only_when_it_runs(
     in_the_way.write_text("a file where the folder should be")
     config = f'{CONFIG}\n[recording]\nfolder = "{in_the_way}/today"\n'
     gateway = start_gateway("demo", config=config)
-    connect(gateway.port).until(lambda seen: "ATTITUDE" in seen)
+    # Commands reach a vehicle from its first heartbeat on.
+    connect(gateway.port).until(lambda seen: "HOME_POSITION" in seen)
     client = connect()
     in_progress = mavlink.MAV_RESULT_IN_PROGRESS
 
