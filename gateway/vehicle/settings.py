@@ -95,7 +95,8 @@ class VehicleSettings(Settings, frozen=True):
     takeoff_height_m: Annotated[
         float,
         setting(
-            "Height above home above which, held for two seconds, the vehicle is in the air.",
+            "Height above the first good fix above which, held for two seconds, the vehicle is in "
+            "the air.",
             "m",
             ge=1.0,
             le=100.0,

@@ -6,7 +6,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming, NavFlags, Outgoing
+from gateway.vehicle.home import Place
 from gateway.vehicle.settings import RateSettings, VehicleSettings
+from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
 from tests.vehicle.samples import (
     BARO,
@@ -113,6 +115,14 @@ def test_home_is_the_first_good_fix() -> None:
     assert "Home set by GPS" in texts(found)
     found = vehicle.on_gps(fix_at(800_000, lat_dege7=0), 800_000)
     assert "HOME_POSITION" not in names(found)
+
+
+def test_a_home_elsewhere_does_not_make_it_fly() -> None:
+    """One that was kept of another field, two hundred metres lower."""
+    stored = StoredPlaces(home=Place(46.0, 8.0, 300.0))
+    vehicle = Vehicle(VehicleSettings(), 1, stored=stored)
+    fly(vehicle, 0, 10, vel_n_mps=(0.0, 0.0, 0.0))
+    assert vehicle.telemetry.motion.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
 
 
 def test_relative_altitude_refers_to_home() -> None:
