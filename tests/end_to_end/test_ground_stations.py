@@ -163,6 +163,24 @@ async def test_mavsdk_parameters(gateway: Gateway) -> None:
     await with_mavsdk(gateway, use)
 
 
+async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        param = ParamAsync(system)
+        homes = TelemetryAsync(system).subscribe_home()
+        before = await anext(homes)
+        await param.set_param_float("HOME_ALT", 432.5)
+        async for home in homes:
+            if home.absolute_altitude_m == pytest.approx(432.5, abs=0.01):
+                break
+        assert home.latitude_deg == before.latitude_deg
+        await param.set_param_float("HOME_SOURCE", 0.0)
+        async for home in homes:
+            if home.absolute_altitude_m != pytest.approx(432.5, abs=1.0):
+                break
+
+    await with_mavsdk(gateway, use)
+
+
 async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -> None:
     async def use(system: System) -> None:
         metadata = ComponentMetadataAsync(system)
