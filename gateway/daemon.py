@@ -242,9 +242,9 @@ class Daemon:
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
         self._recorder.set_in_flight(self._pipeline.in_flight)
-        told = self._pipeline.on_recorder(
-            self._recorder.trouble, now_us, recording=self._recorder.recording
-        )
+        status = self._recorder.status()
+        trouble = status.reason if status.state == "blocked" else ""
+        told = self._pipeline.on_recorder(trouble, now_us, recording=self._recorder.recording)
         self._perform(told)
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)

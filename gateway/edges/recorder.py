@@ -194,12 +194,6 @@ class Recorder:
         """Whether a recording runs, and the disk has taken its first bytes."""
         return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
 
-    @property
-    def trouble(self) -> str:
-        """Why nothing is recorded although it should be; empty if nothing hinders it."""
-        blocked = self._session.state is SessionState.BLOCKED
-        return self._session.reason if blocked else ""
-
     def frame(self, frame: bytes) -> None:
         """Keep a MAVLink frame that was sent or received."""
         part = self._part
