@@ -14,10 +14,10 @@ from typing import Annotated, Any, Final
 import msgspec
 import tomlkit
 
+from gateway.aircraft import AircraftSettings
 from gateway.edges.serial_link import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.session import RecordingSettings
-from gateway.pipeline import AircraftSettings
 from gateway.routing.settings import HubSettings
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
@@ -43,7 +43,8 @@ class GatewaySettings(Settings, frozen=True):
         setting(
             "Folder of what differs between aircraft: one file each, named by its vehicle id "
             '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
-            "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too."
+            "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
+            'Missions, mark and home are kept beside it ("1.places.json").'
         ),
     ] = "~/.config/mavgate/aircraft"
 
@@ -145,7 +146,12 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
 
 def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:
     """Name the file of one aircraft."""
-    return Path(settings.aircraft_folder).expanduser() / f"{vehicle_id}.toml"
+    return aircraft_folder(settings) / f"{vehicle_id}.toml"
+
+
+def aircraft_folder(settings: GatewaySettings) -> Path:
+    """Name the folder of what differs between aircraft."""
+    return Path(settings.aircraft_folder).expanduser()
 
 
 def render(settings: GatewaySettings) -> str:

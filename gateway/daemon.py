@@ -8,18 +8,26 @@ from typing import Final
 
 import msgspec
 
-from gateway.config import ConfigError, GatewaySettings, save_aircraft
+from gateway.aircraft import Action, Aircraft, AircraftSettings, SettingsChanged
+from gateway.config import (
+    ConfigError,
+    GatewaySettings,
+    aircraft_folder,
+    load_aircraft,
+    save_aircraft,
+)
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
 from gateway.edges.hub import Hub
 from gateway.edges.metrics import MetricsServer
+from gateway.edges.place_files import PlaceFiles
 from gateway.edges.pty_port import PtyPort
 from gateway.edges.recorder import Recorder
 from gateway.edges.serial_link import SerialLink
 from gateway.edges.service import ServiceNotifier, set_realtime_priority
 from gateway.flightlog.table import TableHeader
-from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
     ClientInterval,
@@ -32,7 +40,7 @@ from gateway.replay import header_for
 from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import RecordingRequest, SaveSettings
+from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
 from gateway.vehicle.events import NOTICE, WARNING, Told
 from gateway.vehicle.home import Place
 
@@ -72,8 +80,14 @@ class Daemon:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
         self._read = read
+        self._places = PlaceFiles(aircraft_folder(settings), self._tell_unkept)
         self._pipeline = Pipeline(
-            PipelineSettings(settings.default_aircraft, aircraft, unix_time_us() - self.now_us())
+            PipelineSettings(
+                settings.default_aircraft,
+                aircraft,
+                unix_time_us() - self.now_us(),
+                places=self._places.load(),
+            )
         )
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
@@ -119,9 +133,9 @@ class Daemon:
         self._notifier.ready()
 
     def reload(self) -> str:
-        """Take over changed settings of the hub; clients that stay notice nothing.
+        """Take over changed settings of the hub, and signing; clients that stay notice nothing.
 
-        The other sections hold from the next start on.
+        All others hold from the next start on: ground stations may have changed them meanwhile.
 
         Returns
         -------
@@ -134,15 +148,21 @@ class Daemon:
             If the settings are wrong; nothing has changed then.
         """
         settings = self._read()
+        passphrase = settings.vehicle.signing_passphrase
+        now = self._settings
+        vehicle = msgspec.structs.replace(now.vehicle, signing_passphrase=passphrase)
+        now = msgspec.structs.replace(now, hub=settings.hub, vehicle=vehicle)
+        own = {k: a.vehicle.signing_passphrase for k, a in load_aircraft(now).items()}
         self._notifier.reloading()
-        later = msgspec.structs.replace(settings, hub=self._settings.hub) != self._settings
         if settings.hub.realtime_priority != self._settings.hub.realtime_priority:
             set_realtime_priority(settings.hub.realtime_priority)
-        self._settings = msgspec.structs.replace(self._settings, hub=settings.hub)
+        self._settings = now
         self._hub.apply(settings.hub)
+        self._perform(self._pipeline.sign_by(passphrase, own, self.now_us()))
         self._metrics.listen(settings.hub.metrics_port)
         self._notifier.ready()
-        told = f"settings of the hub applied{'; others need a new start' if later else ''}"
+        later = "; others need a new start" if settings != now else ""
+        told = f"settings of the hub and of signing applied{later}"
         log.info(told)
         return told
 
@@ -158,6 +178,7 @@ class Daemon:
             self._opening.cancel()
         self._control.close()
         self._recorder.close()
+        self._places.close()
         self._metrics.close()
         self._hub.close()
 
@@ -172,6 +193,7 @@ class Daemon:
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
             listeners=(*self._hub.listeners(), *self._metrics.listeners()),
+            places_not_kept=self._places.failures,
         )
 
     def _reload_or_refuse(self) -> str:
@@ -222,7 +244,10 @@ class Daemon:
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
         self._recorder.set_in_flight(self._pipeline.in_flight)
-        self._pipeline.set_recording(self._recorder.recording)
+        status = self._recorder.status()
+        trouble = status.reason if status.state == "blocked" else ""
+        told = self._pipeline.on_recorder(trouble, now_us, recording=self._recorder.recording)
+        self._perform(told)
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
         self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
@@ -239,6 +264,8 @@ class Daemon:
                     self._hub.set_interval(action)
                 case SaveSettings():
                     self._save(action.vehicle_id)
+                case SavePlaces():
+                    self._places.save(action.vehicle_id, action.places)
                 case RecordingRequest():
                     (self._recorder.record if action.start else self._recorder.stop)()
                 case FusedSample() | BaroRaw() | GpsFix():
@@ -257,5 +284,12 @@ class Daemon:
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, file)
             told = Told(NOTICE, f"Settings saved: {file.name}")
+        self._tell_of(aircraft, told)
+
+    def _tell_unkept(self, vehicle_id: int, reason: str) -> None:
+        told = Told(WARNING, f"Mission, mark and home not kept: {reason}")
+        self._tell_of(self._pipeline.aircraft[vehicle_id], told)
+
+    def _tell_of(self, aircraft: Aircraft, told: Told) -> None:
         now_us = self.now_us()
         self._perform(aircraft.perform(aircraft.vehicle.say(told, now_us), now_us))

@@ -1,4 +1,4 @@
-"""The one place where the stages meet: `wire → sensing → estimation → vehicle`.
+"""From the receiver's bytes to the aircraft they are of: `wire → sensing → estimation → vehicle`.
 
     receiver's bytes ─ Link ─ raw records ─┬─ Aircraft 1: SensorChain ─ Estimator ─ Vehicle ─┐
                                            └─ Aircraft 2: …                                  │
@@ -10,85 +10,26 @@ order. An aircraft comes into being with its first payload. Live, demo and playb
 who calls `feed` (bytes) or `take` (raw records of a recording).
 """
 
-import zlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import astuple, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-import msgspec
-
-from gateway import __version__
-from gateway.estimation.interface import Estimator
-from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.aircraft import Action, Aircraft, AircraftSettings, with_passphrase
 from gateway.records import (
-    BaroRaw,
-    ClientInterval,
-    FusedSample,
     FusionState,
-    GpsFix,
     ImuCalibrated,
-    ImuRaw,
-    ImuSample,
     Incoming,
     LinkReport,
     NavState,
-    NodeStatus,
-    Outgoing,
     RawRecord,
 )
-from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain
-from gateway.sensing.recalibration import (
-    absorb_accel_error,
-    absorb_gyro_error,
-    absorb_mag_error,
-    absorb_tilt,
-)
-from gateway.settings import Settings
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import Action as VehicleAction
-from gateway.vehicle.actions import (
-    CalibrationKind,
-    CalibrationMeasured,
-    RecordingRequest,
-    SaveSettings,
-    SettingsChange,
-)
 from gateway.vehicle.events import Told
-from gateway.vehicle.home import Home, Place
-from gateway.vehicle.settings import VehicleSettings
-from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.home import Place
+from gateway.vehicle.stored import StoredPlaces
 from gateway.wire.link import Link
 
 REPORT_INTERVAL_US: Final = US_PER_S
-
-
-@dataclass(frozen=True, slots=True)
-class SettingsChanged:
-    """What comes from here on was fused with other settings."""
-
-    vehicle_id: int
-
-
-Recorded = FusedSample | BaroRaw | GpsFix | SettingsChanged
-Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | Recorded
-"""Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
-
-ABSORB: Final = {
-    CalibrationKind.GYRO: absorb_gyro_error,
-    CalibrationKind.ACCEL: absorb_accel_error,
-    CalibrationKind.LEVEL: absorb_tilt,
-    CalibrationKind.MAG: absorb_mag_error,
-}
-
-
-class AircraftSettings(Settings, frozen=True):
-    """The settings of one aircraft's stages; ground stations may change them as parameters."""
-
-    vehicle: VehicleSettings = VehicleSettings()
-    sensing: SensingSettings = SensingSettings()
-    estimation: EstimationSettings = EstimationSettings()
-    calibration: NodeCalibration = NodeCalibration()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,180 +43,8 @@ class PipelineSettings:
     """Civil time at the gateway clock's zero, as well as it is known."""
     correct: Callable[[NavState], NavState] | None = None
     """Changes the states before they are told: for a playback that knows what comes."""
-
-
-class Aircraft:
-    """The stages of one aircraft, from its raw records on."""
-
-    def __init__(self, vehicle_id: int, common: PipelineSettings) -> None:
-        self.vehicle_id = vehicle_id
-        self.settings = settings = common.aircraft.get(vehicle_id, common.default)
-        self.state: NavState | None = None
-        sections = {
-            name: getattr(settings, name) for name in ("sensing", "estimation", "calibration")
-        }
-        self.vehicle = Vehicle(
-            settings.vehicle,
-            vehicle_id,
-            sections=sections,
-            unix_us_at_zero=common.unix_us_at_zero,
-        )
-        self._chain, self._estimator = make_fusion(settings)
-        self._correct = common.correct
-
-    @property
-    def fusion_state(self) -> FusionState:
-        """All that filters and estimator remember now, and where home is."""
-        home = self.vehicle.telemetry.home
-        return FusionState(
-            vehicle_id=self.vehicle_id,
-            fits=_fits(self.settings),
-            sensing=self._chain.snapshot(),
-            estimation=self._estimator.snapshot(),
-            home=None if home is None else (*astuple(home.place), home.set_time_us),
-        )
-
-    def restore(self, state: FusionState) -> None:
-        """Go on from a state to the last bit; raises ValueError as `make_fusion`.
-
-        Home is where it was also if the rest does not fit.
-        """
-        if state.home is not None:
-            *place, since_us = state.home
-            self.vehicle.telemetry.set_home(Home(Place(*place), since_us))
-        self._chain, self._estimator = make_fusion(self.settings, state)
-
-    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
-        """Let one raw record run through the stages."""
-        match record:
-            case ImuRaw():
-                return self._take_imu(record, self._chain.imu(record), now_us)
-            case ImuCalibrated():
-                return self._take_imu(None, self._filter(record), now_us)
-            case BaroRaw():
-                baro = self._chain.baro(record)
-                self._estimator.update_baro(baro)
-                return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
-            case GpsFix():
-                self._estimator.update_gps(record)
-                return self._recorded(record, self.vehicle.on_gps(record, now_us), now_us)
-            case NodeStatus():
-                return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
-
-    def _filter(self, imu: ImuCalibrated) -> ImuSample:
-        return self._chain.imu_si(
-            imu.time_us,
-            imu.accel_b_mps2,
-            imu.gyro_b_radps,
-            imu.mag_b_ut,
-            imu.temperature_degc,
-            imu.flags,
-        )
-
-    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
-        state = self._estimator.update_imu(sample)
-        self.state = state if self._correct is None else self._correct(state)
-        fused = FusedSample(self.vehicle_id, raw, sample, self.state)
-        return self._recorded(fused, self.vehicle.on_state(self.state, sample, now_us), now_us)
-
-    def _recorded(
-        self, record: FusedSample | BaroRaw | GpsFix, wanted: Iterable[VehicleAction], now_us: int
-    ) -> list[Action]:
-        """Put what is recorded behind the frames, which it may not delay, but before a change."""
-        actions = self.perform(wanted, now_us)
-        changed = [action for action in actions if isinstance(action, SettingsChanged)]
-        others = [action for action in actions if not isinstance(action, SettingsChanged)]
-        return [*others, record, *changed]
-
-    def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
-        """Carry out what the vehicle asks of the other stages; hand the rest on.
-
-        Parameters
-        ----------
-        wanted : iterable of VehicleAction
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        list of Action
-        """
-        actions: list[Action] = []
-        for action in wanted:
-            if isinstance(action, SettingsChange):
-                actions += self._change(action.section, action.settings)
-            elif isinstance(action, CalibrationMeasured):
-                calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
-                actions += self._change("calibration", calibration)
-                told = self.vehicle.take_settings("calibration", calibration, now_us)
-                actions += self.perform(told, now_us)
-            else:
-                actions.append(action)
-        return actions
-
-    def change(self, settings: AircraftSettings) -> None:
-        """Take over what differs between these settings and those that hold."""
-        for section in ("sensing", "calibration", "estimation"):
-            wanted = getattr(settings, section)
-            if wanted != getattr(self.settings, section):
-                self._change(section, wanted)
-
-    def _change(self, section: str, settings: Settings) -> list[Action]:
-        """Rebuild the stage whose settings changed; the others go on undisturbed."""
-        self.settings = msgspec.structs.replace(self.settings, **{section: settings})
-        if section in ("sensing", "calibration"):
-            self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
-        elif section == "estimation":
-            self._estimator = _succeed(self._estimator, make_estimator(self.settings.estimation))
-        else:
-            return []
-        return [SettingsChanged(self.vehicle_id)]
-
-
-def make_fusion(
-    settings: AircraftSettings, state: FusionState | None = None
-) -> tuple[SensorChain, Estimator]:
-    """Build the two stages that make navigation states of raw records.
-
-    Parameters
-    ----------
-    settings : AircraftSettings
-        Of the aircraft.
-    state : FusionState, optional
-        To go on from; else they begin afresh.
-
-    Returns
-    -------
-    chain : SensorChain
-    estimator : Estimator
-
-    Raises
-    ------
-    ValueError
-        If the state is of another version or other settings, or damaged.
-    """
-    chain = SensorChain(settings.sensing, settings.calibration)
-    estimator = make_estimator(settings.estimation)
-    if state is not None:
-        if state.fits != _fits(settings):
-            raise ValueError("it is of another version or other settings")
-        chain.restore(state.sensing)
-        estimator.restore(state.estimation)
-    return chain, estimator
-
-
-def _fits(settings: AircraftSettings) -> str:
-    """Tell version and settings apart from all others, in a few letters."""
-    fused_with = (settings.sensing, settings.estimation, settings.calibration)
-    return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
-
-
-def _succeed(old: Estimator, new: Estimator) -> Estimator:
-    """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
-    state = getattr(old, "state", None)
-    if state is not None and type(new) is type(old):
-        new.state = state  # type: ignore[attr-defined]
-    return new
+    places: Mapping[int, StoredPlaces] = field(default_factory=dict)
+    """Missions, marks and homes kept of an earlier run, by vehicle id."""
 
 
 class Pipeline:
@@ -311,7 +80,14 @@ class Pipeline:
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
-            aircraft = self.aircraft[vehicle_id] = Aircraft(vehicle_id, self._settings)
+            known = self._settings
+            aircraft = self.aircraft[vehicle_id] = Aircraft(
+                vehicle_id,
+                known.aircraft.get(vehicle_id, known.default),
+                unix_us_at_zero=known.unix_us_at_zero,
+                stored=known.places.get(vehicle_id),
+                correct=known.correct,
+            )
         return aircraft
 
     def change(self, vehicle_id: int, settings: AircraftSettings) -> None:
@@ -322,6 +98,34 @@ class Pipeline:
     def restore(self, state: FusionState) -> None:
         """Let an aircraft's fusion go on from a state; raises ValueError as `make_fusion`."""
         self._aircraft_of(state.vehicle_id).restore(state)
+
+    def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> list[Action]:
+        """Sign, and check signatures, by other passphrases from now on.
+
+        Parameters
+        ----------
+        common : str
+            Of every aircraft that has none of its own; empty for none.
+        own : mapping of int to str
+            By vehicle id.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Action
+        """
+        known = self._settings
+        aircraft = {
+            key: with_passphrase(known.aircraft.get(key, known.default), own.get(key, common))
+            for key in {*known.aircraft, *own}
+        }
+        default = with_passphrase(known.default, common)
+        self._settings = replace(known, default=default, aircraft=aircraft)
+        actions: list[Action] = []
+        for key, each in self.aircraft.items():
+            actions += each.sign_by(own.get(key, common), now_us)
+        return actions
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""
@@ -375,10 +179,13 @@ class Pipeline:
         """Whether an aircraft flies."""
         return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
 
-    def set_recording(self, recording: bool) -> None:
-        """Note whether a recording runs; ground stations are told."""
-        for aircraft in self.aircraft.values():
-            aircraft.vehicle.set_recording(recording)
+    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
+        """Note whether a recording runs, or why not; ground stations are told."""
+        actions: list[Action] = []
+        for each in self.aircraft.values():
+            told = each.vehicle.on_recorder(trouble, now_us, recording=recording)
+            actions += each.perform(told, now_us)
+        return actions
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""

@@ -7,9 +7,10 @@ from typing import Any, Final
 import msgspec
 
 from gateway import __version__
+from gateway.aircraft import Action, AircraftSettings
 from gateway.flightlog.row import TableRow
 from gateway.flightlog.table import TableHeader
-from gateway.pipeline import Action, AircraftSettings, Pipeline
+from gateway.pipeline import Pipeline
 from gateway.records import (
     BaroRaw,
     FusionState,

@@ -25,6 +25,7 @@ def setting(
     ge: float | None = None,
     le: float | None = None,
     pattern: str | None = None,
+    rotation: bool = False,
 ) -> msgspec.Meta:
     """Describe one setting: meaning, unit and what is allowed.
 
@@ -38,13 +39,15 @@ def setting(
         Least and greatest allowed number.
     pattern : str, optional
         Regular expression that a text must match.
+    rotation : bool
+        Whether the value is the matrix of a rotation, for which people rather give angles.
 
     Returns
     -------
     msgspec.Meta
         To be used as `Annotated[float, setting(...)]`.
     """
-    extra = {"unit": unit}
+    extra = {"unit": unit, "rotation": rotation}
     if pattern is not None:
         return msgspec.Meta(description=meaning, pattern=pattern, extra=extra)
     return msgspec.Meta(description=meaning, ge=_exact(ge), le=_exact(le), extra=extra)
@@ -69,6 +72,8 @@ class Field:
     """The allowed texts, if it is one of a few."""
     meaning: str
     unit: str
+    is_rotation: bool
+    """Whether the value is the matrix of a rotation."""
     bounds: tuple[float | None, float | None]
     """Least and greatest allowed number, None where there is no bound."""
 
@@ -86,6 +91,7 @@ def fields_of(kind: type[Settings]) -> list[Field]:
 def _field(name: str, kind: Any, default: Any) -> Field:
     plain = _plain(kind)
     meta = next(_metas(kind), msgspec.Meta())
+    extra = meta.extra or {}
     return Field(
         name=name,
         type=kind,
@@ -93,7 +99,8 @@ def _field(name: str, kind: Any, default: Any) -> Field:
         section=plain if isinstance(plain, type) and issubclass(plain, Settings) else None,
         choices=get_args(plain) if get_origin(plain) is Literal else (),
         meaning=meta.description or "",
-        unit=(meta.extra or {}).get("unit", ""),
+        unit=extra.get("unit", ""),
+        is_rotation=extra.get("rotation", False),
         bounds=(meta.ge, meta.le),
     )
 

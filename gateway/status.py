@@ -19,3 +19,5 @@ class Snapshot:
     """MAVLink message id and how many were sent since the start."""
     hub: HubCounters
     listeners: tuple[ListenerStats, ...] = ()
+    places_not_kept: int = 0
+    """Changes of missions, marks and homes that could not be written since the start."""

@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent / "gateway"
 
 FOUNDATION = {"records", "units", "settings", "compiled", "geometry"}
 STAGES = {"wire", "sensing", "estimation", "vehicle", "flightlog", "routing", "simulator"}
+JOINED = {"aircraft", "pipeline"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "records": set(),
@@ -23,20 +24,22 @@ MAY_IMPORT: dict[str, set[str]] = {
     "flightlog": FOUNDATION | {"wire"},
     "routing": FOUNDATION | {"wire"},
     "simulator": FOUNDATION | {"wire"},
-    "pipeline": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
-    "replay": FOUNDATION | STAGES | {"pipeline"},
+    "aircraft": FOUNDATION | {"sensing", "estimation", "vehicle"},
+    "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
+    "replay": FOUNDATION | STAGES | JOINED,
     "status": FOUNDATION | {"routing"},
     "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "routing", "simulator", "status"},
-    "analysis": FOUNDATION | STAGES | {"pipeline", "replay"},
-    "config": FOUNDATION | STAGES | {"pipeline", "edges"},
-    "daemon": FOUNDATION | STAGES | {"pipeline", "replay", "status", "edges", "config"},
+    "analysis": FOUNDATION | STAGES | JOINED | {"replay"},
+    "config": FOUNDATION | STAGES | JOINED | {"edges"},
+    "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
     "cli": FOUNDATION
     | STAGES
-    | {"pipeline", "replay", "status", "edges", "config", "daemon", "analysis"},
+    | JOINED
+    | {"replay", "status", "edges", "config", "daemon", "analysis"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
-PURE = FOUNDATION | STAGES | {"pipeline", "replay", "status"}
+PURE = FOUNDATION | STAGES | JOINED | {"replay", "status"}
 
 IMPURE_MODULES = {
     "asyncio", "fcntl", "glob", "io", "logging", "multiprocessing", "os", "pathlib", "pty",

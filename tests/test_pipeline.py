@@ -6,8 +6,9 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.aircraft import Action, AircraftSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.pipeline import Action, AircraftSettings, Pipeline, PipelineSettings
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, NodeId, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.home import Place
@@ -159,3 +160,23 @@ def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> No
     assert pipeline.aircraft == {}
     assert pipeline.poll(1_000_000) == []
     assert dict(pipeline.report.faults)
+
+
+def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipeline) -> None:
+    trackers = {vehicle_id: Tracker(vehicle_id) for vehicle_id in (1, 2, 3)}
+
+    def signers(time_us: int) -> dict[int, bool]:
+        actions = []
+        for tracker in trackers.values():
+            actions += pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
+        found = [a for a in actions if isinstance(a, Outgoing)]
+        return {action.frame[5]: bool(action.frame[2] & 1) for action in found}
+
+    pipeline.feed(trackers[1].frame(0, LEVEL), 0)
+    pipeline.sign_by("", {1: "mine", 3: "theirs"}, 1_000_000)
+    assert signers(2_000_000) == {1: True, 2: False, 3: True}
+    pipeline.sign_by("all", {}, 3_000_000)
+    assert signers(4_000_000) == {1: True, 2: True, 3: True}
+    assert {a.settings.vehicle.signing_passphrase for a in pipeline.aircraft.values()} == {"all"}
+    pipeline.sign_by("", {}, 5_000_000)
+    assert signers(6_000_000) == {1: False, 2: False, 3: False}

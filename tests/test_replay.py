@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from gateway.aircraft import AircraftSettings, SettingsChanged
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
 from gateway.flightlog.table import (
@@ -16,7 +17,7 @@ from gateway.flightlog.table import (
     encode_header,
     encode_state,
 )
-from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings, SettingsChanged
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
     FusedSample,

@@ -87,7 +87,7 @@ def mark(
 
 
 def reload() -> None:
-    """Apply changed settings of the hub; clients that stay notice nothing."""
+    """Apply changed settings of the hub and of signing; clients that stay notice nothing."""
     print(ask("reload"))
 
 

@@ -11,6 +11,7 @@ import msgspec
 import typer
 from msgspec.structs import replace
 
+from gateway.aircraft import AircraftSettings
 from gateway.cli.bench import BenchError, firmware_line
 from gateway.cli.errors import refuse
 from gateway.cli.prepare import compile_everything
@@ -27,7 +28,6 @@ from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.edges.flight_file import FlightFileError, read_flight
-from gateway.pipeline import AircraftSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import Aircraft
 from gateway.simulator.receiver import TimedFrame, simulate

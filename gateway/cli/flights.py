@@ -11,6 +11,7 @@ from typing import Final, Literal, TypeVar
 
 import msgspec
 
+from gateway.aircraft import AircraftSettings
 from gateway.edges.flight_files import (
     FileKind,
     Progress,
@@ -27,7 +28,7 @@ from gateway.flightlog.stamps import JUMP_US
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table import TableHeader, TableReader
 from gateway.flightlog.tlog import TlogRecord
-from gateway.pipeline import AircraftSettings, PipelineSettings
+from gateway.pipeline import PipelineSettings
 from gateway.records import (
     BaroRaw,
     FusionState,

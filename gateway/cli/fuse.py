@@ -13,6 +13,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from gateway.aircraft import AircraftSettings, make_fusion
 from gateway.cli.flights import (
     FlightError,
     SettingsChoice,
@@ -45,7 +46,6 @@ from gateway.estimation.columns import (
 from gateway.estimation.interface import Estimator
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName
-from gateway.pipeline import AircraftSettings, make_fusion
 from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
 from gateway.sensing.chain import SensorChain

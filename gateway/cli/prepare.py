@@ -4,8 +4,9 @@ import logging
 import time
 from typing import Final, get_args
 
+from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings, EstimatorName
-from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.simulator.flight import fly
 from gateway.simulator.settings import SimulatorSettings
 

@@ -12,12 +12,13 @@ import msgspec
 import typer
 from rich.live import Live
 
+from gateway.aircraft import AircraftSettings
 from gateway.cli.errors import refuse
 from gateway.cli.prepare import compile_everything
 from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
 from gateway.daemon import Daemon
 from gateway.edges.live_view import LiveView, summary_line
-from gateway.pipeline import AircraftSettings, PipelineSettings
+from gateway.pipeline import PipelineSettings
 
 log = logging.getLogger(__name__)
 

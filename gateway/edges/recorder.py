@@ -203,8 +203,8 @@ class Recorder:
 
     @property
     def recording(self) -> bool:
-        """Whether a recording runs."""
-        return self._session.state is SessionState.RECORDING
+        """Whether a recording runs, and the disk has taken its first bytes."""
+        return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
 
     def frame(self, frame: bytes) -> None:
         """Keep a MAVLink frame that was sent or received."""

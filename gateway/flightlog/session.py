@@ -190,8 +190,10 @@ class Session:
         return mode == "always" or (mode == "in_flight" and self._in_flight)
 
     def start(self) -> None:
-        """Take a user's order to record."""
+        """Take a user's order to record; what was blocked is tried anew, without delay."""
         self._asked = True
+        if self.state is SessionState.BLOCKED:
+            self.state = SessionState.IDLE
 
     def stop(self) -> None:
         """Take a user's order to stop; holds until the next order, or the next flight."""

@@ -2,11 +2,10 @@
 
 from typing import Annotated, Final
 
+from gateway.geometry.rotation import Matrix3
 from gateway.records import Int3, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import STANDARD_GRAVITY_MPS2
-
-Matrix3 = tuple[Vec3, Vec3, Vec3]
 
 IDENTITY3: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -32,7 +31,11 @@ class NodeCalibration(Settings, frozen=True):
 
     mounting: Annotated[
         Matrix3,
-        setting("Rows of the rotation from accelerometer and gyroscope axes to body FRD."),
+        setting(
+            "Rotation from accelerometer and gyroscope axes to body FRD. Here the rows of its "
+            "matrix, as parameters its angles.",
+            rotation=True,
+        ),
     ] = FACE_UP
     accel_bias_mps2: Annotated[Vec3, setting("Accelerometer bias in sensor axes.", "m/s2")] = (
         _NO_OFFSET
@@ -44,7 +47,12 @@ class NodeCalibration(Settings, frozen=True):
         _NO_OFFSET
     )
     mag_mounting: Annotated[
-        Matrix3, setting("Rows of the rotation from magnetometer axes to body FRD.")
+        Matrix3,
+        setting(
+            "Rotation from magnetometer axes to body FRD. Here the rows of its matrix, as "
+            "parameters its angles.",
+            rotation=True,
+        ),
     ] = FACE_UP
     mag_hard_iron_ut: Annotated[
         Vec3, setting("Field of the aircraft's own magnets in sensor axes.", "uT")

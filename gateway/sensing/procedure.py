@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.geometry.rotation import Matrix3
 from gateway.records import Vec3
-from gateway.sensing.calibration import Correction, Matrix3, NodeCalibration
+from gateway.sensing.calibration import Correction, NodeCalibration
 from gateway.sensing.recalibration import absorb_tilt
 from gateway.sensing.solvers import (
     NodeSamples,

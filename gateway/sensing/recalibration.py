@@ -5,8 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.geometry.quaternion import from_euler, rotate
+from gateway.geometry.rotation import Matrix3
 from gateway.records import Vec3
-from gateway.sensing.calibration import Matrix3, NodeCalibration
+from gateway.sensing.calibration import NodeCalibration
 
 
 def absorb_gyro_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from gateway.geometry.rotation import Matrix3
 from gateway.records import ImuFlags, ImuRaw, Vec3
 from gateway.sensing.calibration import (
-    Matrix3,
     accel_from_counts,
     gyro_from_counts,
     mag_from_counts,

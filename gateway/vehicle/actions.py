@@ -6,6 +6,7 @@ from typing import Any
 
 from gateway.records import ClientInterval, Outgoing, Vec3
 from gateway.settings import Settings
+from gateway.vehicle.stored import StoredPlaces
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,14 @@ class SaveSettings:
 
     vehicle_id: int
     sections: tuple[tuple[str, Settings], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SavePlaces:
+    """Keep missions, mark and home for the next start."""
+
+    vehicle_id: int
+    places: StoredPlaces
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +71,7 @@ Action = (
     | ClientInterval
     | SettingsChange
     | SaveSettings
+    | SavePlaces
     | RecordingRequest
     | CalibrationMeasured
 )

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import Answer, RecordingRequest, Reply, Request
+from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.intervals import IntervalService
 from gateway.vehicle.place import GLOBAL_FRAMES
 
@@ -73,8 +73,8 @@ Outcome = tuple[int, list[Answer]]
 """Result of a command, and what goes out behind its acknowledgement."""
 
 Handler = Callable[[Command, int], Outcome]
-Builder = Callable[[int, int, int], list[Any]]
-"""Builds messages for a client: message id, index, client id; none if there are none yet."""
+Explain = Callable[[str, int], list[Answer]]
+"""Tells all a text at a time: why something was refused."""
 
 
 def read_command(request: Request) -> Command:
@@ -106,7 +106,7 @@ class CommandService:
         intervals: IntervalService,
         build: Callable[[int, int], list[Any]],
         knows: Callable[[int], bool],
-        explain: Callable[[str, int], list[Answer]],
+        explain: Explain,
     ) -> None:
         """Start with what needs no other service.
 
@@ -138,8 +138,6 @@ class CommandService:
         self._changing: set[int] = set(REFUSALS)
         for number in REFUSALS:
             self._handlers[number] = self._decline
-        self.register(mavlink.MAV_CMD_LOGGING_START, lambda *_: _recording(True))
-        self.register(mavlink.MAV_CMD_LOGGING_STOP, lambda *_: _recording(False))
 
     def register(self, number: int, handler: Handler) -> None:
         """Let another service carry out a command that changes state."""
@@ -214,7 +212,3 @@ class CommandService:
         interval_us = self._intervals.interval_us(client_id, message_id)
         answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
         return ACCEPTED, [command.request.reply(answer)]
-
-
-def _recording(start: bool) -> Outcome:
-    return ACCEPTED, [RecordingRequest(start)]

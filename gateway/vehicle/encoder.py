@@ -28,23 +28,23 @@ _INTEGER_LIMITS: Final = {
 class Encoder:
     """Frames of one system id; one sequence for all its messages."""
 
-    def __init__(
-        self, system_id: int, key: bytes | None = None, clock: SigningClock | None = None
-    ) -> None:
+    def __init__(self, system_id: int, clock: SigningClock | None = None) -> None:
         """Start the sequence.
 
         Parameters
         ----------
         system_id : int
-        key, clock : optional
-            Sign every frame by this key.
+        clock : SigningClock, optional
+            Dates the signatures, should there be any.
         """
         self.system_id = system_id
         self._mav: Any = mavlink.MAVLink(None, system_id, AUTOPILOT_COMPONENT)
         self._clock = clock
-        if key is not None:
-            self._mav.signing.secret_key = key
-            self._mav.signing.sign_outgoing = True
+
+    def set_key(self, key: bytes | None) -> None:
+        """Sign every frame from now on, or none; the time stamps go on growing."""
+        self._mav.signing.secret_key = key
+        self._mav.signing.sign_outgoing = key is not None
 
     def set_time(self, now_us: int) -> None:
         """Let the next frame's signature carry this time, or one just behind the last frame's."""

@@ -2,8 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from gateway.records import GpsFix, GpsFixType
+from gateway.settings import Settings, setting
+
+HomeSource = Literal["none", "gps", "operator"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +25,33 @@ class Home:
 
     place: Place
     set_time_us: int
+    source: HomeSource = "gps"
+
+
+class HomeParameters(Settings, frozen=True):
+    """Home as ground stations see and set it among the parameters; all zero while there is none."""
+
+    source: Annotated[
+        HomeSource,
+        setting(
+            "Who set home: none yet, the GPS, or an operator. Set 2 to keep a home of the GPS as "
+            "the operator's; set 0 to forget home and let the GPS measure it again."
+        ),
+    ] = "none"
+    lat_deg: Annotated[
+        float,
+        setting(
+            "Latitude of home. While there is no home, one begins when latitude, longitude and "
+            "height have all been set.",
+            "deg",
+            ge=-90.0,
+            le=90.0,
+        ),
+    ] = 0.0
+    lon_deg: Annotated[float, setting("Longitude of home.", "deg", ge=-180.0, le=180.0)] = 0.0
+    alt_m: Annotated[
+        float, setting("Height of home above mean sea level.", "m", ge=-1000.0, le=50000.0)
+    ] = 0.0
 
 
 HAS_PLACE = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})

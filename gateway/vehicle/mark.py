@@ -22,7 +22,8 @@ class Mark:
 
     def __init__(self) -> None:
         self.place: Place | None = None
-        self._from_items: int | None = None
+        self.of: int | None = None
+        """Kind of the stored items that it follows; None if it was put by itself."""
 
     def put(self, place: Place | None) -> None:
         """Mark a place, or none.
@@ -34,7 +35,7 @@ class Mark:
         """
         if place is not None and not is_on_earth(place.lat_deg, place.lon_deg):
             raise ValueError(f"no place on earth: {place.lat_deg}, {place.lon_deg}")
-        self.place, self._from_items = place, None
+        self.place, self.of = place, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
         """Mark the first place among stored items; none there unmarks what they had marked.
@@ -51,8 +52,8 @@ class Mark:
         places = (item.place(home_alt_m) for item in items)
         place = next((place for place in places if place is not None), None)
         if place is not None:
-            self.place, self._from_items = place, kind
-        elif self._from_items == kind:
+            self.place, self.of = place, kind
+        elif self.of == kind:
             self.put(None)
 
     def way(self, state: NavState) -> tuple[float, float] | None:
@@ -71,10 +72,8 @@ class Mark:
         """
         if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
-        distance_m, bearing_deg = vincenty.vdist(
-            state.lat_deg, state.lon_deg, self.place.lat_deg, self.place.lon_deg
-        )
-        way = (float(distance_m), math.radians(float(bearing_deg)))
+        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        way = distance_and_bearing(here, self.place)
         # The iteration need not converge between opposite ends of the earth.
         return way if math.isfinite(sum(way)) else None
 
@@ -100,3 +99,18 @@ class Mark:
             aspd_error=0.0,
             xtrack_error=NAN,
         )
+
+
+def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
+    """Measure the way between two places.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Distance along the ellipsoid in metres, and bearing at `here` in rad from north; NaN where
+        the iteration does not converge.
+    """
+    distance_m, bearing_deg = vincenty.vdist(
+        here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg
+    )
+    return (float(distance_m), math.radians(float(bearing_deg)))

@@ -131,14 +131,16 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
 def vfr_hud(state: NavState) -> Any:
     """Encode speed, heading, height and climb.
 
-    Airspeed is NaN, for nothing measures it; throttle is 0, for a tracker drives nothing. The
-    heading is the yaw of ATTITUDE, and like it always sent.
+    Nothing measures the airspeed: its field carries the ground speed, as ArduPilot's does without
+    such a sensor, because clients print it as an integer, which no NaN survives. Throttle is 0, for
+    a tracker drives nothing. The heading is the yaw of ATTITUDE, and like it always sent.
     """
     north, east, down = state.vel_n_mps
+    speed = math.hypot(north, east)
     yaw = to_euler(state.q_nb)[2]
     return mavlink.MAVLink_vfr_hud_message(
-        airspeed=NAN,
-        groundspeed=math.hypot(north, east),
+        airspeed=speed,
+        groundspeed=speed,
         heading=fields.compass_deg(yaw) if math.isfinite(yaw) else 0,
         throttle=0,
         alt=state.alt_amsl_m,

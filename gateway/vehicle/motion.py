@@ -7,8 +7,9 @@
 | on ground | in air    | fast or high, for `HOLD_US`     |
 | in air    | on ground | slow and low, for `LANDING_US`  |
 
-Fast is above the take-off speed; high is above the take-off height over home. Slow and low are
-below half of either, so that a hover, a stall turn or a touch-and-go does not flip the state.
+Fast is above the take-off speed; high is above the take-off height over the first good fix (not
+over home, which may be set anywhere). Slow and low are below half of either, so that a hover, a
+stall turn or a touch-and-go does not flip the state.
 """
 
 import math
@@ -39,17 +40,17 @@ class Motion:
         self._leaning = UNDEFINED
         self._since_us = 0
 
-    def update(self, state: NavState, home_alt_m: float) -> None:
+    def update(self, state: NavState, ground_alt_m: float) -> None:
         """Judge one navigation state.
 
         Parameters
         ----------
         state : NavState
             What the estimator believes; without a valid velocity nothing changes.
-        home_alt_m : float
-            Height of home above mean sea level, NaN while there is none.
+        ground_alt_m : float
+            Height of the ground above mean sea level, NaN while it is not known.
         """
-        leaning = self._lean(state, home_alt_m)
+        leaning = self._lean(state, ground_alt_m)
         if leaning != self._leaning:
             self._leaning, self._since_us = leaning, state.time_us
         if leaning in (UNDEFINED, self.landed_state):
@@ -58,14 +59,14 @@ class Motion:
         if state.time_us - self._since_us >= hold_us:
             self.landed_state = leaning
 
-    def _lean(self, state: NavState, home_alt_m: float) -> int:
+    def _lean(self, state: NavState, ground_alt_m: float) -> int:
         if not state.flags & NavFlags.VELOCITY_VALID:
             return UNDEFINED
         north, east, _ = state.vel_n_mps
         speed = math.hypot(north, east) / self.takeoff_speed_mps
         height = 0.0
-        if state.flags & NavFlags.ALTITUDE_VALID and not math.isnan(home_alt_m):
-            height = (state.alt_amsl_m - home_alt_m) / self.takeoff_height_m
+        if state.flags & NavFlags.ALTITUDE_VALID and not math.isnan(ground_alt_m):
+            height = (state.alt_amsl_m - ground_alt_m) / self.takeoff_height_m
         most = max(speed, height)
         if most > 1.0:
             return IN_AIR

@@ -35,6 +35,7 @@ ABBREVIATIONS: Final = {
     "highres": "HR",
     "lowpass": "LP",
     "mission": "MIS",
+    "mounting": "MNT",
     "nominal": "NOM",
     "position": "POS",
     "pressure": "PRES",
@@ -70,7 +71,7 @@ def parameter_name(section: str, key: str, axis: str = "") -> str:
     key : str
         The setting; its unit is left out by the caller, unless two keys differ in it alone.
     axis : str, optional
-        X, Y or Z of a vector.
+        X, Y or Z of a vector; ROLL, PIT or YAW of a rotation.
 
     Returns
     -------

@@ -4,10 +4,12 @@ The list goes to the one who asked, a few at a time, so that a client's receive 
 link survive it; a change goes to all, so that every ground station's table stays true.
 """
 
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any, Final, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.settings import Settings
 from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange
 from gateway.vehicle.commands import ACCEPTED, UNSUPPORTED, Command, Outcome, whole
 from gateway.vehicle.parameters import Parameter, ParameterTable, decode_value
@@ -30,13 +32,38 @@ BAD_VALUE: Final = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
 FORBIDDEN: Final = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 
 
+class OwnSection(Protocol):
+    """Parameters that are no settings: the vehicle itself carries out what is set."""
+
+    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
+        """Carry out the change of one of them; ValueError refuses it."""
+        ...
+
+    def store(self) -> list[Answer]:
+        """Let the present values outlive the gateway."""
+        ...
+
+
 class ParameterService:
-    """Parameters of one vehicle."""
+    """Parameters of one vehicle.
+
+    Parameters
+    ----------
+    vehicle_id : int
+        Id in the radio payloads.
+    table : ParameterTable
+        All of them.
+    own : mapping of str to OwnSection, optional
+        Sections of the table that are no settings. They have no defaults to go back to.
+    """
 
     types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
 
-    def __init__(self, vehicle_id: int, table: ParameterTable) -> None:
+    def __init__(
+        self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection] | None = None
+    ) -> None:
         self.table = table
+        self._own = own or {}
         self._vehicle_id = vehicle_id
         self._lists: dict[int, int] = {}
         self._due_us: int | None = None
@@ -56,7 +83,7 @@ class ParameterService:
         """Answer one request."""
         kind = request.message.get_type()
         if kind == "PARAM_SET":
-            return self._set(request)
+            return self._set(request, now_us)
         if kind == "PARAM_REQUEST_READ":
             return self._read(request)
         if request.client_id in self._lists or len(self._lists) < MAX_LISTENERS:
@@ -92,9 +119,10 @@ class ParameterService:
         The calibration of the sensors is no tuning: only its own reset touches it.
         """
         asked = whole(command.params[0])
-        sections = self.table.sections
+        sections = {k: v for k, v in self.table.sections.items() if k not in self._own}
         if asked == WRITE:
-            return ACCEPTED, [SaveSettings(self._vehicle_id, tuple(sections.items()))]
+            own = [answer for section in self._own.values() for answer in section.store()]
+            return ACCEPTED, [SaveSettings(self._vehicle_id, tuple(sections.items())), *own]
         if asked not in (RESET, RESET_CALIBRATION):
             return UNSUPPORTED, []
         before = self._numbers()
@@ -122,20 +150,28 @@ class ParameterService:
         changed = zip(self.table.parameters, before, self._numbers(), strict=True)
         return [self.told(parameter) for parameter, old, new in changed if old != new]
 
-    def _set(self, request: Request) -> list[Answer]:
+    def _set(self, request: Request, now_us: int) -> list[Answer]:
         message = request.message
         parameter = self._named(message.param_id)
         if parameter is None:
             return [self._error(request, UNKNOWN)]
         number = decode_value(message.param_value, message.param_type)
+        before = self.table.sections[parameter.section]
         try:
             settings = self.table.change(parameter, number)
+            answers = self._carry_out(parameter, settings, now_us)
         except ValueError:
+            self.table.sections[parameter.section] = before
             # The error first: a client that sees only the old value would try again.
             return [self._error(request, BAD_VALUE), self.told(parameter)]
+        return [*answers, self.told(parameter)]
+
+    def _carry_out(self, parameter: Parameter, settings: Settings, now_us: int) -> list[Answer]:
         path = ".".join(parameter.path)
-        change = SettingsChange(self._vehicle_id, parameter.section, settings, path)
-        return [change, self.told(parameter)]
+        own = self._own.get(parameter.section)
+        if own is not None:
+            return own.change(settings, path, now_us)
+        return [SettingsChange(self._vehicle_id, parameter.section, settings, path)]
 
     def _read(self, request: Request) -> list[Answer]:
         index = request.message.param_index

@@ -9,16 +9,27 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Final
 
 import msgspec
+import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.geometry.rotation import Matrix3, euler_deg_from_matrix, matrix_from_euler_deg
+from gateway.records import Vec3
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.parameter_names import parameter_name, without_unit
 
 AXES: Final = ("X", "Y", "Z")
+ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
+"""The angles of a rotation: in names, in texts, and how far each goes to either side."""
+
+RotationAngles = tuple[
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+    Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+]
 
 INTEGER_CODES: Final = {
     mavlink.MAV_PARAM_TYPE_UINT8: "<Bxxx",
@@ -43,12 +54,12 @@ def decode_value(value: float, kind: int) -> float:
     Returns
     -------
     float
-        A decimal of seven digits, which is what a 32-bit float can hold.
+        The shortest decimal that is the same 32-bit float: 0.1, not 0.10000000149.
     """
     code = INTEGER_CODES.get(kind)
     if code is not None:
         return float(struct.unpack(code, struct.pack("<f", value))[0])
-    return float(f"{value:.7g}")
+    return float(str(np.float32(value)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +72,9 @@ class Parameter:
     path: tuple[str, ...]
     """Keys within that tree."""
     axis: int | None
-    """Component of a vector."""
+    """Component of a vector; of a rotation: roll, pitch or yaw."""
     field: Field
+    """The setting; of a rotation with its angles in place of its matrix."""
 
     def to_number(self, value: Any) -> float:
         """Turn the setting's value into the parameter's."""
@@ -124,6 +136,9 @@ class ParameterTable:
                 key=lambda parameter: parameter.name,
             )
         )
+        self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
+        # As they were set: a matrix alone would tell others, where the pitch is a right angle or
+        # only some of the three have been set yet.
         self.index = {p.name: n for n, p in enumerate(self.parameters)}
         if len(self.index) < len(self.parameters):
             names = [p.name for p in self.parameters]
@@ -148,6 +163,9 @@ class ParameterTable:
             If the value is not allowed; nothing changes then.
         """
         value = parameter.from_number(number, self._value(parameter))
+        if parameter.field.is_rotation:
+            angles, value = value, matrix_from_euler_deg(value)
+            self._angles[(parameter.section, *parameter.path)] = value, angles
         tree = _replaced(self.sections[parameter.section], parameter.path, value)
         self.sections[parameter.section] = tree
         return tree
@@ -169,7 +187,10 @@ class ParameterTable:
         value: Any = self.sections[parameter.section]
         for key in parameter.path:
             value = getattr(value, key)
-        return value
+        if not parameter.field.is_rotation:
+            return value
+        matrix, angles = self._angles.get((parameter.section, *parameter.path), (None, None))
+        return angles if matrix == value else euler_deg_from_matrix(value)
 
 
 def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
@@ -186,10 +207,29 @@ def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[
         key = bare if bare_keys[bare] == 1 else field.name
         if field.choices or isinstance(default, bool | int | float):
             yield Parameter(parameter_name(group, key), section, inner, None, field)
+        elif field.is_rotation:
+            for axis, (letters, _, _) in enumerate(ANGLES):
+                name = parameter_name(group, key, letters)
+                yield Parameter(name, section, inner, axis, _angle_field(field, axis))
         elif _is_vector(default):
             for axis, letter in enumerate(AXES):
                 name = parameter_name(group, key, letter)
                 yield Parameter(name, section, inner, axis, field)
+
+
+def _angle_field(field: Field, axis: int) -> Field:
+    """Describe one angle of a rotation."""
+    what = field.meaning.partition(". ")[0]
+    _, name, limit = ANGLES[axis]
+    return replace(
+        field,
+        type=RotationAngles,
+        default=euler_deg_from_matrix(field.default),
+        meaning=f"{name} of the {what[0].lower()}{what[1:]}. Yaw is turned first, then pitch, then "
+        "roll; a board that lies face up with its x arrow to the nose has a roll of 180",
+        unit="deg",
+        bounds=(-limit, limit),
+    )
 
 
 def _is_vector(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Home and the marked location, as ground stations set them."""
+"""Home, missions and the marked location, as ground stations set them and as they are kept."""
 
 import math
 from collections.abc import Callable
@@ -6,8 +6,9 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import NAN
-from gateway.vehicle.actions import Answer, Reply
+from gateway.records import NAN, GpsFix
+from gateway.settings import Settings
+from gateway.vehicle.actions import Answer, Reply, SavePlaces
 from gateway.vehicle.commands import (
     ACCEPTED,
     DENIED,
@@ -18,12 +19,14 @@ from gateway.vehicle.commands import (
     whole,
 )
 from gateway.vehicle.events import INFO, Told
-from gateway.vehicle.home import Home, Place
-from gateway.vehicle.mark import Mark
+from gateway.vehicle.home import Place, is_3d, place_of
+from gateway.vehicle.home_service import HomeService
+from gateway.vehicle.mark import Mark, distance_and_bearing
 from gateway.vehicle.messages import has_position
 from gateway.vehicle.mission import MissionService
-from gateway.vehicle.mission_items import FENCE, MISSION
+from gateway.vehicle.mission_items import FENCE, MISSION, RALLY
 from gateway.vehicle.place import GLOBAL_FRAMES, height_amsl_m, is_on_earth
+from gateway.vehicle.stored import KINDS, StoredPlaces
 from gateway.vehicle.telemetry import Telemetry
 
 Say = Callable[[Told, int], list[Any]]
@@ -33,11 +36,33 @@ USE_CURRENT: Final = 1
 
 
 class PlaceService:
-    """Set home, set and clear the mark."""
+    """Set home, set and clear the mark, and keep them and the missions.
 
-    def __init__(self, telemetry: Telemetry, say: Say) -> None:
+    Parameters
+    ----------
+    vehicle_id : int
+        Id in the radio payloads.
+    telemetry : Telemetry
+        Knows where the vehicle is, and tells home and the way to the mark.
+    say : callable
+        Tells all an event.
+    stored : StoredPlaces
+        What was kept last time.
+    """
+
+    def __init__(
+        self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlaces
+    ) -> None:
+        self._vehicle_id = vehicle_id
         self.mark = Mark()
+        self.mark.place, self.mark.of = stored.mark, stored.mark_of
+        self.home = HomeService(telemetry)
+        if stored.home is not None:
+            self.home.restore(stored.home)
+        self._home_untold = stored.home is not None
         self.missions = MissionService(self._on_items, self._explain)
+        self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
+        self.missions.current = stored.current
         self._telemetry = telemetry
         self._say = say
         telemetry.add(
@@ -56,13 +81,45 @@ class PlaceService:
         commands.register(mavlink.MAV_CMD_DO_SET_ROI_NONE, self._clear_roi)
         commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
 
+    def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
+        """Tell once how far it is to a home that was kept: it may be that of another field."""
+        home = self.home.kept
+        if home is None or not self._home_untold or not is_3d(fix):
+            return []
+        self._home_untold = False
+        distance_m, _ = distance_and_bearing(place_of(fix), home)
+        text = f"Home is the one kept, {distance_m:.0f} m from here"
+        return self._explain(text, now_us)
+
     def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
         """Mark a place, or none, and tell all."""
         self.mark.put(place)
         text = "Mark cleared"
         if place is not None:
             text = f"Marked {place.lat_deg:.6f}, {place.lon_deg:.6f}"
-        return [Reply(message) for message in self._say(Told(INFO, text), now_us)]
+        return [self._save(), *self._explain(text, now_us)]
+
+    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
+        """Carry out the change of a parameter of home; ValueError refuses it."""
+        return self.home.change(settings, key, now_us)
+
+    def store(self) -> list[Answer]:
+        """Keep the home that was set by parameters."""
+        self.home.keep()
+        return [self._save()]
+
+    def _save(self) -> SavePlaces:
+        items = self.missions.items
+        stored = StoredPlaces(
+            home=self.home.kept,
+            mark=self.mark.place,
+            mark_of=self.mark.of,
+            current=self.missions.current,
+            mission=items[MISSION],
+            fence=items[FENCE],
+            rally=items[RALLY],
+        )
+        return SavePlaces(self._vehicle_id, stored)
 
     @property
     def _home_alt_m(self) -> float:
@@ -76,7 +133,7 @@ class PlaceService:
         if kind != FENCE:
             first = self.missions.current if kind == MISSION else 0
             self.mark.follow(kind, self.missions.items[kind][first:], self._home_alt_m)
-        return []
+        return [self._save()]
 
     def _place(self, command: Command) -> Place | None:
         """Read the place of a command; None if it is none."""
@@ -97,10 +154,11 @@ class PlaceService:
             place = self._place(command)
         if place is None or not math.isfinite(place.alt_amsl_m):
             return DENIED, []
-        told = self._telemetry.set_home(Home(place, now_us))
+        told = self.home.put(place, now_us)
+        self.home.keep()
         self.mark.put(place)
-        said = self._say(Told(INFO, "Home set by a ground station"), now_us)
-        return ACCEPTED, [Reply(message) for message in (*told, *said)]
+        said = self._explain("Home set by a ground station", now_us)
+        return ACCEPTED, [*told, *said, self._save()]
 
     def _set_roi(self, command: Command, now_us: int) -> Outcome:
         mode = whole(command.params[0])

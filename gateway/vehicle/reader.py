@@ -25,15 +25,14 @@ class RequestReader:
     ----------
     system_id : int
         The system that requests must be meant for.
-    verifier : Verifier or None
-        Checks signatures; with one, an unsigned client may only read.
     """
 
-    def __init__(self, system_id: int, verifier: Verifier | None) -> None:
+    def __init__(self, system_id: int) -> None:
         self.faults: Counter[str] = Counter()
         """Frames dropped, by reason."""
+        self.verifier: Verifier | None = None
+        """Checks signatures; with one, an unsigned client may only read."""
         self._system_id = system_id
-        self._verifier = verifier
         self._mav: Any = mavlink.MAVLink(None)
 
     def read(self, incoming: Incoming, now_us: int) -> Request | None:
@@ -59,9 +58,9 @@ class RequestReader:
         if not self._is_for_us(message):
             return None
         allowed = incoming.trusted
-        if self._verifier is not None:
+        if self.verifier is not None:
             signed = frame[0] == V2_START and frame[2] & SIGNED
-            if signed and not self._verifier.accepts(frame, now_us):
+            if signed and not self.verifier.accepts(frame, now_us):
                 self.faults["bad signature"] += 1
                 return None
             allowed = allowed and bool(signed)

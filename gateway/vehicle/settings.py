@@ -58,7 +58,8 @@ class VehicleSettings(Settings, frozen=True):
         str,
         setting(
             "MAVLink 2 signing: the same passphrase as in the ground station. Everything sent is "
-            "signed then, and nobody changes anything without a signature. Empty for none."
+            "signed then, and nobody changes anything without a signature. Empty for none. "
+            "`mavgate reload` takes over another."
         ),
     ] = ""
     node_silent_s: Annotated[
@@ -94,7 +95,8 @@ class VehicleSettings(Settings, frozen=True):
     takeoff_height_m: Annotated[
         float,
         setting(
-            "Height above home above which, held for two seconds, the vehicle is in the air.",
+            "Height above the first good fix above which, held for two seconds, the vehicle is in "
+            "the air.",
             "m",
             ge=1.0,
             le=100.0,

@@ -4,6 +4,7 @@ Every message has one builder, which works from the newest records; the streams 
 a request for a single message share it.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
@@ -56,6 +57,8 @@ class Telemetry:
         self.calibrating = False
         self.state: NavState | None = None
         self._reference_alt_m = NAN
+        self._ground_alt_m = NAN
+        """Height of the first good fix, whoever sets home."""
         self._sample: ImuSample | None = None
         self._baro: BaroSample | None = None
         self._fix: GpsFix | None = None
@@ -117,7 +120,7 @@ class Telemetry:
             self._updated |= messages.MAG_UPDATED
         if self._reference_alt_m != self._reference_alt_m and messages.has_position(state):
             self._reference_alt_m = state.alt_amsl_m
-        self.motion.update(state, self.home.place.alt_amsl_m if self.home else NAN)
+        self.motion.update(state, self._ground_alt_m)
         due = (m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us))
         return self._build_all(due, state.time_us)
 
@@ -135,11 +138,12 @@ class Telemetry:
             self._unix_offset_us = fix.utc_us - fix.time_us
         stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
         found = [messages.gps_raw_int(fix)] if stream.offer(fix.time_us) else []
+        wanted = self.home is None or math.isnan(self._ground_alt_m)
         limits = self.settings
-        if self.home is None and is_good_enough(
-            fix, limits.home_accuracy_m, limits.home_satellites
-        ):
-            found += self.set_home(Home(place_of(fix), fix.time_us))
+        if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
+            self._ground_alt_m = fix.alt_amsl_m
+            if self.home is None:
+                found += self.set_home(Home(place_of(fix), fix.time_us))
         return found
 
     def set_home(self, home: Home) -> list[Any]:
@@ -147,6 +151,10 @@ class Telemetry:
         self.home = home
         self._reference_alt_m = home.place.alt_amsl_m
         return [messages.home_position(home)]
+
+    def forget_home(self) -> None:
+        """Let the next good fix set home; heights stay relative to the old one until then."""
+        self.home = None
 
     def poll(self, now_us: int) -> list[Any]:
         """Tell what is due by time."""

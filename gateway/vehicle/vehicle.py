@@ -39,12 +39,15 @@ from gateway.vehicle.parameter_service import ParameterService
 from gateway.vehicle.parameters import ParameterTable
 from gateway.vehicle.places import PlaceService
 from gateway.vehicle.reader import RequestReader
+from gateway.vehicle.recording import RecordingService
 from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
+from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry import Telemetry
 from gateway.vehicle.timing import TimingService
 
 OWN_SECTION: Final = "vehicle"
+HOME_SECTION: Final = "home"
 
 
 class Service(Protocol):
@@ -82,6 +85,7 @@ class Vehicle:
         *,
         sections: Mapping[str, Settings] | None = None,
         unix_us_at_zero: int = 0,
+        stored: StoredPlaces | None = None,
     ) -> None:
         """Begin with nothing known.
 
@@ -98,6 +102,8 @@ class Vehicle:
             key under which the change comes back.
         unix_us_at_zero : int, optional
             Unix time when the gateway clock was zero; needed for signing only.
+        stored : StoredPlaces, optional
+            What was kept of an earlier run.
         """
         self.system_id = system_id
         self.vehicle_id = system_id if vehicle_id is None else vehicle_id
@@ -105,25 +111,32 @@ class Vehicle:
         """Requests to change something that were refused."""
         self.health = Health(self.vehicle_id, settings.node_silent_s)
         self.telemetry = Telemetry(settings, self.health)
-        passphrase = settings.signing_passphrase
-        key = key_from_passphrase(passphrase) if passphrase else None
-        clock = SigningClock(unix_us_at_zero)
-        self._encoder = Encoder(system_id, key, clock)
-        self._reader = RequestReader(system_id, Verifier(key, clock) if key else None)
+        self._clock = SigningClock(unix_us_at_zero)
+        self._encoder = Encoder(system_id, clock=self._clock)
+        self._reader = RequestReader(system_id)
+        self._passphrase = ""
+        self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
         # On its own, so that strangers cannot use up what is kept for events.
         self._refusal_texts = Announcer()
-        self._make_services({OWN_SECTION: settings, **(sections or {})})
+        self.places = PlaceService(
+            self.vehicle_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
+        )
+        self._told_home = self.telemetry.home
+        home = self.places.home.parameters()
+        self._make_services({OWN_SECTION: settings, **(sections or {}), HOME_SECTION: home})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
-        self.places = PlaceService(self.telemetry, self._announcements.say)
         self._intervals = IntervalService(self.system_id, self.telemetry)
-        self._parameters = ParameterService(self.vehicle_id, ParameterTable(sections))
+        self._parameters = ParameterService(
+            self.vehicle_id, ParameterTable(sections), {HOME_SECTION: self.places}
+        )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService(
             {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
         )
         self._calibrator = Calibrator(self.vehicle_id)
+        self._recording = RecordingService(self._explain)
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
                 self.system_id
@@ -137,6 +150,11 @@ class Vehicle:
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         self.places.register(commands)
+        self._recording.register(commands)
+        self._route(commands)
+
+    def _route(self, commands: CommandService) -> None:
+        """Tell who takes which message, and who is polled."""
         services: tuple[Service, ...] = (
             commands,
             self._intervals,
@@ -152,6 +170,7 @@ class Vehicle:
             self.places.missions,
             self._ftp,
             self._calibrator,
+            self._recording,
         )
 
     @property
@@ -183,11 +202,12 @@ class Vehicle:
         """Take in one GPS fix."""
         self.health.on_gps(fix)
         had_home = self.telemetry.home is not None
-        found = self.telemetry.on_gps(fix)
+        found = self._replies(self.telemetry.on_gps(fix))
         if self.telemetry.home is not None and not had_home:
-            found += self._announcements.say(Told(INFO, "Home set by GPS"), now_us)
-        found += self._announcements.on_fix(now_us)
-        return self._finish(self._replies(found), now_us)
+            found += self._replies(self._announcements.say(Told(INFO, "Home set by GPS"), now_us))
+        found += self.places.on_fix(fix, now_us)
+        found += self._replies(self._announcements.on_fix(now_us))
+        return self._finish(found, now_us)
 
     def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
@@ -249,10 +269,13 @@ class Vehicle:
         self._parameters.forget_client(client_id)
         self.places.missions.forget_client(client_id)
         self._ftp.forget_client(client_id)
+        self._recording.forget_client(client_id)
 
-    def set_recording(self, recording: bool) -> None:
-        """Note whether a recording runs; the armed bit may follow it."""
+    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
+        """Note whether a recording runs, or why not; the armed bit may follow it."""
         self.health.recording = recording
+        answers = self._recording.update(trouble, now_us, recording=recording)
+        return self._finish(answers, now_us) if answers else []
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
         """Mark a place (its height may be NaN), or clear the mark.
@@ -288,6 +311,16 @@ class Vehicle:
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
         self.telemetry.reconfigure(settings)
+        self._sign_by(settings.signing_passphrase)
+
+    def _sign_by(self, passphrase: str) -> None:
+        """Sign and check by another key; what the present one has seen guards against replays."""
+        if passphrase == self._passphrase:
+            return
+        self._passphrase = passphrase
+        key = key_from_passphrase(passphrase) if passphrase else None
+        self._encoder.set_key(key)
+        self._reader.verifier = Verifier(key, self._clock) if key else None
 
     def _replies(self, messages: Iterable[Any]) -> list[Answer]:
         return [Reply(message) for message in messages]
@@ -296,6 +329,10 @@ class Vehicle:
         """Encode what is still a message, and take over what concerns the vehicle itself."""
         self._encoder.set_time(now_us)
         actions: list[Action] = []
+        if self.telemetry.home is not self._told_home:
+            self._told_home = self.telemetry.home
+            home = self._parameters.take(HOME_SECTION, self.places.home.parameters())
+            answers = [*answers, *home]
         for answer in answers:
             if isinstance(answer, Reply):
                 actions.append(self._encoder.encode(answer.message, answer.client_id))

@@ -334,7 +334,7 @@ async def test_what_was_flushed_is_on_the_disk_without_closing(bench: Bench) -> 
 
 async def test_what_is_wanted_from_the_start_misses_nothing(bench: Bench) -> None:
     bench.recorder.start()
-    assert bench.recorder.recording
+    assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)
     bench.recorder.close()
     assert frames_of(bench.recorder.folder) == FRAMES
@@ -348,7 +348,7 @@ async def test_a_start_on_a_bad_disk_is_told_and_mended(
     assert bench.troubles == ["Recording stopped: File exists"]
     bench.recorder.folder.unlink()
     await bench.turn(RETRY_US / 1e6)
-    assert bench.recorder.recording
+    assert bench.recorder.status().state == "recording"
 
 
 async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
@@ -358,7 +358,7 @@ async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
     assert not bench.recorder.recording
     bench.recorder.record()
     await bench.recorder.settle()
-    assert bench.recorder.recording
+    assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)
     bench.recorder.close()
     assert frames_of(bench.recorder.folder) == FRAMES
@@ -387,3 +387,28 @@ def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         second.write({".tlog": b"y"}, sync=False)
     first.close()
+
+
+async def test_it_records_only_once_the_disk_has_taken_something(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def outcome() -> tuple[bool, str]:
+        status = bench.recorder.status()
+        return bench.recorder.recording, status.reason if status.state == "blocked" else ""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PartFiles, "_open", refuse)
+        await bench.turn()
+        assert outcome() == (False, "")
+        bench.send(FRAMES[:5])
+        await bench.turn()
+        assert outcome() == (False, "disk is read-only")
+    bench.recorder.record()
+    await bench.turn()
+    assert outcome() == (False, "")
+    bench.send(FRAMES[5:])
+    await bench.turn()
+    assert outcome() == (True, "")

@@ -114,7 +114,7 @@ async def test_mavsdk_telemetry(gateway: Gateway) -> None:
         norm = math.hypot(quaternion.w, quaternion.x, quaternion.y, quaternion.z)
         assert norm == pytest.approx(1.0, abs=1e-5)
         metrics = await anext(telemetry.subscribe_fixedwing_metrics())
-        assert math.isnan(metrics.airspeed_m_s), "nothing measures it"
+        assert metrics.airspeed_m_s == metrics.groundspeed_m_s, "nothing measures the airspeed"
         assert math.isfinite(metrics.climb_rate_m_s)
 
     await with_mavsdk(gateway, use)
@@ -159,6 +159,24 @@ async def test_mavsdk_parameters(gateway: Gateway) -> None:
         assert refused.value.result == ParamResult.VALUE_OUT_OF_RANGE
         with pytest.raises(ParamError):
             await param.get_param_float("NO_SUCH")
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        param = ParamAsync(system)
+        homes = TelemetryAsync(system).subscribe_home()
+        before = await anext(homes)
+        await param.set_param_float("HOME_ALT", 432.5)
+        async for home in homes:
+            if home.absolute_altitude_m == pytest.approx(432.5, abs=0.01):
+                break
+        assert home.latitude_deg == before.latitude_deg
+        await param.set_param_float("HOME_SOURCE", 0.0)
+        async for home in homes:
+            if home.absolute_altitude_m != pytest.approx(432.5, abs=1.0):
+                break
 
     await with_mavsdk(gateway, use)
 
@@ -217,6 +235,7 @@ def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
         mavproxy.type("wp load way.txt")
         mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
         mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
+        mavproxy.until(r"airspeed : \d\S*, groundspeed : \d", asking="status VFR_HUD")
         mavproxy.until(r"link 1 OK", asking="link")
         assert "breach" not in mavproxy.output
     finally:

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from gateway.aircraft import Action
 from gateway.cli.app import app
 from gateway.cli.demo import calibrated_aircraft
 from gateway.cli.flights import Wishes
@@ -21,7 +22,7 @@ from gateway.flightlog.session import RecordingSettings
 from gateway.flightlog.table import TableReader
 from gateway.flightlog.tlog import TlogScanner
 from gateway.flightlog.track import Track
-from gateway.pipeline import Action, Pipeline, PipelineSettings
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
 from gateway.replay import header_for
 from gateway.simulator.receiver import simulate

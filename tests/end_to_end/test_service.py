@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.control_socket import ControlError, request, socket_path
-from tests.end_to_end.processes import Client, Gateway, free_udp_ports
+from tests.end_to_end.processes import CONFIG, Client, Gateway, free_udp_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -92,6 +93,61 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert gateway.stop() == 0
     assert told(systemd) == b"STOPPING=1"
     assert "settings not reloaded" in gateway.log.read_text()
+
+
+def test_a_reload_changes_the_signing(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
+) -> None:
+    gateway = start_gateway("demo")
+    client = connect(gateway.port)
+
+    def until_signed(wanted: bool) -> None:
+        client.until(
+            lambda seen: "ATTITUDE" in seen and bool(seen["ATTITUDE"].get_msgbuf()[2] & 1) is wanted
+        )
+
+    until_signed(False)
+    settings = tmp_path / "gateway.toml"
+    plain = settings.read_text()
+    settings.write_text(f'{plain}\n[vehicle]\nsigning_passphrase = "correct horse"\n')
+    gateway.process.send_signal(signal.SIGHUP)
+    until_signed(True)
+    settings.write_text(plain)
+    gateway.process.send_signal(signal.SIGHUP)
+    until_signed(False)
+
+
+def test_a_recording_is_accepted_only_when_it_runs(
+    start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
+) -> None:
+    in_the_way = tmp_path / "flights"
+    in_the_way.write_text("a file where the folder should be")
+    config = f'{CONFIG}\n[recording]\nfolder = "{in_the_way}/today"\n'
+    gateway = start_gateway("demo", config=config)
+    # Commands reach a vehicle from its first heartbeat on.
+    connect(gateway.port).until(lambda seen: "HOME_POSITION" in seen)
+    client = connect()
+    in_progress = mavlink.MAV_RESULT_IN_PROGRESS
+
+    def order() -> list[int]:
+        """Ask for a recording; the results told up to the final one."""
+        number = mavlink.MAV_CMD_LOGGING_START
+        start = mavlink.MAVLink_command_long_message(1, 1, number, 0, *[0] * 7)
+        client.send(start, gateway.listen_port)
+        results: list[int] = []
+        while results in ([], [in_progress]):
+            found = (m for m in client.receive() if m.get_type() == "COMMAND_ACK")
+            results += [m.result for m in found]
+        return results
+
+    def told(seen: dict[str, mavlink.MAVLink_message]) -> bool:
+        return "STATUSTEXT" in seen and "Cannot record: Not a directory" in seen["STATUSTEXT"].text
+
+    assert order() == [in_progress, mavlink.MAV_RESULT_FAILED]
+    client.until(told)
+    in_the_way.unlink()
+    assert order() == [in_progress, mavlink.MAV_RESULT_ACCEPTED]
+    assert list(in_the_way.glob("today/*.tlog"))
 
 
 def test_orders_reach_the_hub(

@@ -159,3 +159,13 @@ def test_a_full_disk_needs_some_room_even_without_a_floor() -> None:
     session.failed("disk is full", 0)
     assert poll(session, RETRY_US, free=900_000) == []
     assert poll(session, RETRY_US, free=1_100_000) == [OpenPart(NAME, 2)]
+
+
+def test_an_order_tries_at_once_what_was_blocked() -> None:
+    session = Session(ALWAYS)
+    poll(session)
+    session.failed("read-only disk", 0)
+    assert poll(session, 1) == []
+    session.start()
+    assert session.state is not SessionState.BLOCKED
+    assert poll(session, 2) == [OpenPart(NAME, 1)]

@@ -53,6 +53,17 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "command/denied": (command(400, 1), ACK, DENIED | {"command": 400}),
     "command/long-running": (command(241, 1), ACK, IN_PROGRESS | {"progress": 255}),
     "command/cancelled": (command(241), ACK, ACCEPTED),
+    "command/home-position": (command(410), "HOME_POSITION", {"longitude": -87_654_321}),
+    "command/capabilities": (command(520, 1), "AUTOPILOT_VERSION", {"product_id": 0}),
+    "command/protocol-version": (command(519, 1), "PROTOCOL_VERSION", {}),
+    "command/set-roi": (command_int(195, *HOME_PLACE), ACK, ACCEPTED),
+    "command/no-such-mission-item": (command(224, 7), ACK, DENIED),
+    "command/set-mode": (
+        lambda: mavlink.MAVLink_set_mode_message(1, 1, 4), ACK, DENIED | {"command": 176},
+    ),
+    "command/store": (command(245, 1), ACK, ACCEPTED),
+    "command/start-recording": (command(2510), ACK, IN_PROGRESS),
+    "command/stop-recording": (command(2511), ACK, ACCEPTED),
     # The messages that MAV_CMD_REQUEST_MESSAGE asks for follow its acknowledgement.
     "request/autopilot-version": (command(512, 148), "AUTOPILOT_VERSION", {"vendor_id": 0}),
     "request/protocol-version": (command(512, 300), "PROTOCOL_VERSION", {}),
@@ -60,6 +71,11 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "request/unknown": (command(512, 12_345), ACK, UNSUPPORTED),
     "request/interval": (command(510, 30), "MESSAGE_INTERVAL", {"interval_us": 20_000}),
     "request/set-interval": (command(511, 30, 100_000), ACK, ACCEPTED),
+    "request/set-interval-unknown": (command(511, 12_345, 100_000), ACK, UNSUPPORTED),
+    "request/interval-by-message": (
+        command(512, 244, 30), "MESSAGE_INTERVAL", {"interval_us": 20_000},
+    ),
+    "request/nothing-to-tell": (command(512, 62), ACK, {"result": 1}),
     # component_metadata.html and standard_modes.html
     "metadata/announcement": (command(512, 397), "COMPONENT_METADATA", {}),
     "metadata/deprecated": (command(512, 395), ACK, UNSUPPORTED),
@@ -90,6 +106,9 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "parameter/set-unknown": (
         param_set(b"NOPE", 1.0), "PARAM_ERROR", {"error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST},
     ),
+    "parameter/set-of-home": (
+        param_set(b"HOME_ALT", 12.5), "PARAM_VALUE", {"param_id": "HOME_ALT", "param_value": 12.5},
+    ),
     # mission.html: the same for the three types.
     **{
         f"mission/list-{kind}": (
@@ -107,6 +126,32 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     ),
     "mission/no-such-item": (
         lambda: mavlink.MAVLink_mission_request_int_message(*ME, 9, 0),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
+    ),
+    "mission/no-such-type": (
+        lambda: mavlink.MAVLink_mission_request_list_message(*ME, 7),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_UNSUPPORTED},
+    ),
+    "mission/partial-download": (
+        lambda: mavlink.MAVLink_mission_request_partial_list_message(*ME, 0, 3, 0),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_UNSUPPORTED},
+    ),
+    "mission/partial-upload": (
+        lambda: mavlink.MAVLink_mission_write_partial_list_message(*ME, 0, 3, 0),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_UNSUPPORTED},
+    ),
+    "mission/stray-item": (
+        lambda: mavlink.MAVLink_mission_item_int_message(
+            *ME, 3, 5, 16, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0
+        ),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_ERROR},
+    ),
+    "mission/empty-upload": (
+        lambda: mavlink.MAVLink_mission_count_message(*ME, 0, 1),
+        "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED, "mission_type": 1},
+    ),
+    "mission/older-request": (
+        lambda: mavlink.MAVLink_mission_request_message(*ME, 2, 0),
         "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
     ),
     "mission/clear": (
@@ -145,9 +190,12 @@ def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
 
 
 TOLD_TO_ALL = {
-    "command/int": {"HOME_POSITION", "STATUSTEXT"},
+    "command/int": {"HOME_POSITION", "STATUSTEXT", "PARAM_VALUE"},
     "command/denied": {"STATUSTEXT"},
     "command/long-running": {"STATUSTEXT"},
+    "command/set-roi": {"STATUSTEXT"},
+    "command/set-mode": {"STATUSTEXT"},
+    "parameter/set-of-home": {"HOME_POSITION", "PARAM_VALUE"},
     "parameter/set": {"PARAM_VALUE"},
     "parameter/set-out-of-range": {"PARAM_VALUE"},
     "mission/set-current-none": {"STATUSTEXT"},
@@ -159,7 +207,8 @@ TOLD_TO_ALL = {
 def test_it_is_given_once_and_to_the_one_who_asked(station: GroundStation, row: str) -> None:
     request, kind, _ = TABLE[row]
     found = station.send(request())
-    expected = 10 if row == "parameter/list" else 1
+    # A list comes in tens; with home's height goes who set it.
+    expected = {"parameter/list": 10, "parameter/set-of-home": 2}.get(row, 1)
     assert sum(m.get_type() == kind for m in found) == expected
     assert {frame.client_id for frame in station.frames} <= {7, None}
     assert station.broadcasts == TOLD_TO_ALL.get(row, set())

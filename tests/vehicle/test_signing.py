@@ -126,6 +126,31 @@ def test_without_a_key_signed_frames_are_taken_as_they_are(clock: ManualClock) -
     assert changed(station.send(SET))
 
 
+def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
+    def change(passphrase: str) -> None:
+        settings = VehicleSettings(signing_passphrase=passphrase)
+        station.vehicle.take_settings("vehicle", settings, station.clock.now_us)
+
+    sign(station)
+    old = station.frame(SET)
+    change("another horse")
+    assert station.send_bytes(old) == []
+    sign(station, key_from_passphrase("another horse"))
+    assert changed(station.send(SET))
+    assert station.frames[-1].frame[2] & 1
+    change("")
+    station.mav.signing.sign_outgoing = False
+    assert changed(station.send(SET))
+    assert not station.frames[-1].frame[2] & 1
+
+
+def test_a_change_of_another_setting_forgets_no_replay(station: GroundStation) -> None:
+    sign(station)
+    frame = station.frame(SET)
+    assert changed(station.send_bytes(frame)), "which is a change of the vehicle's settings"
+    assert station.send_bytes(frame) == []
+
+
 def test_streams_are_bounded() -> None:
     verifier = Verifier(KEY, SigningClock(NOW_UNIX_US))
     mav = mavlink.MAVLink(None, 9, 1)

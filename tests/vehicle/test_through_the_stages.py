@@ -1,13 +1,16 @@
 """What a ground station changes reaches the stage that it concerns, and only that one."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings, EstimatorName
-from gateway.pipeline import AircraftSettings, Pipeline, PipelineSettings
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId, Outgoing
 
 LEVEL = ImuRaw(
@@ -91,6 +94,38 @@ def test_a_tilted_mounting_is_levelled(bench: Bench) -> None:
     bench.run(4.0, **tilted)
     sample = bench.run(1.0, **tilted).sample
     assert sample.accel_b_mps2[:2] == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_the_mounting_is_set_angle_by_angle(bench: Bench) -> None:
+    """A node that stands on its nose: in between, roll and yaw turn about the same axis."""
+    down_b = bench.run(0.1).sample.accel_b_mps2
+    assert down_b == pytest.approx((0.0, 0.0, -9.80665), abs=1e-6)
+    for name, angle in (("CAL_MNT_PIT", 90.0), ("CAL_MNT_ROLL", 30.0), ("CAL_MNT_YAW", -45.0)):
+        bench.set(name, angle)
+    expected = ((0.0, 0.965926, 0.258819), (0.0, 0.258819, -0.965926), (-1.0, 0.0, 0.0))
+    mounting = bench.pipeline.aircraft[1].settings.calibration.mounting
+    np.testing.assert_allclose(mounting, expected, atol=1e-6)
+    turned = np.array(expected) @ (0.0, 0.0, 9.80665)
+    assert bench.run(0.1).sample.accel_b_mps2 == pytest.approx(tuple(turned), abs=1e-5)
+    told = bench.parameters()
+    assert [told[f"CAL_MNT_{angle}"] for angle in ("ROLL", "PIT", "YAW")] == [30.0, 90.0, -45.0]
+
+
+def test_angles_follow_a_mounting_that_was_measured(bench: Bench) -> None:
+    bench.run(0.1)
+    bench.set("CAL_MNT_ROLL", 170.0)
+    bench.calibrate(0, 0, 0, 0, 2)
+    bench.run(4.0)
+    assert abs(bench.parameters()["CAL_MNT_ROLL"]) == pytest.approx(180.0, abs=1e-3)
+
+
+def test_an_angle_out_of_range_changes_nothing(bench: Bench) -> None:
+    bench.run(0.1)
+    before = bench.pipeline.aircraft[1].settings.calibration
+    for name, angle in (("CAL_MNT_PIT", 91.0), ("CAL_MNT_YAW", -181.0), ("CAL_MNT_ROLL", math.nan)):
+        bench.set(name, angle)
+        assert bench.told[-2].get_type() == "PARAM_ERROR"
+    assert bench.pipeline.aircraft[1].settings.calibration == before
 
 
 def test_an_accelerometer_bias_is_gone(bench: Bench) -> None:

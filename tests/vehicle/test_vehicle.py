@@ -6,7 +6,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming, NavFlags, Outgoing
+from gateway.vehicle.home import Place
 from gateway.vehicle.settings import RateSettings, VehicleSettings
+from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
 from tests.vehicle.samples import (
     BARO,
@@ -115,6 +117,14 @@ def test_home_is_the_first_good_fix() -> None:
     assert "HOME_POSITION" not in names(found)
 
 
+def test_a_home_elsewhere_does_not_make_it_fly() -> None:
+    """One that was kept of another field, two hundred metres lower."""
+    stored = StoredPlaces(home=Place(46.0, 8.0, 300.0))
+    vehicle = Vehicle(VehicleSettings(), 1, stored=stored)
+    fly(vehicle, 0, 10, vel_n_mps=(0.0, 0.0, 0.0))
+    assert vehicle.telemetry.motion.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
+
+
 def test_relative_altitude_refers_to_home() -> None:
     vehicle = make()
     fly(vehicle, 0, 2)
@@ -140,7 +150,7 @@ def test_the_armed_bit_follows_the_rule(
     rule: str, recording: bool, speed: float, armed: bool
 ) -> None:
     vehicle = make(armed_when=rule)
-    vehicle.set_recording(recording)
+    vehicle.on_recorder("", 0, recording=recording)
     found = fly(vehicle, 0, 4, vel_n_mps=(speed, 0.0, 0.0), alt_amsl_m=521.0)
     last = [m for m in decode(found) if m.get_type() == "HEARTBEAT"][-1]
     assert bool(last.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED) is armed

@@ -1,0 +1,288 @@
+"""One aircraft: `sensing → estimation → vehicle`, and what changes their settings as they run.
+
+Pure: time is an argument, and what should happen outside comes back as a list of actions.
+"""
+
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import astuple, dataclass
+from typing import Final
+
+import msgspec
+
+from gateway import __version__
+from gateway.estimation.interface import Estimator
+from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.records import (
+    BaroRaw,
+    ClientInterval,
+    FusedSample,
+    FusionState,
+    GpsFix,
+    ImuCalibrated,
+    ImuRaw,
+    ImuSample,
+    NavState,
+    NodeStatus,
+    Outgoing,
+    RawRecord,
+)
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.recalibration import (
+    absorb_accel_error,
+    absorb_gyro_error,
+    absorb_mag_error,
+    absorb_tilt,
+)
+from gateway.settings import Settings
+from gateway.vehicle.actions import Action as VehicleAction
+from gateway.vehicle.actions import (
+    CalibrationKind,
+    CalibrationMeasured,
+    RecordingRequest,
+    SavePlaces,
+    SaveSettings,
+    SettingsChange,
+)
+from gateway.vehicle.home import Home, Place
+from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.vehicle import Vehicle
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsChanged:
+    """What comes from here on was fused with other settings."""
+
+    vehicle_id: int
+
+
+Recorded = FusedSample | BaroRaw | GpsFix | SettingsChanged
+Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
+"""Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
+
+ABSORB: Final = {
+    CalibrationKind.GYRO: absorb_gyro_error,
+    CalibrationKind.ACCEL: absorb_accel_error,
+    CalibrationKind.LEVEL: absorb_tilt,
+    CalibrationKind.MAG: absorb_mag_error,
+}
+
+
+class AircraftSettings(Settings, frozen=True):
+    """The settings of one aircraft's stages; ground stations may change them as parameters."""
+
+    vehicle: VehicleSettings = VehicleSettings()
+    sensing: SensingSettings = SensingSettings()
+    estimation: EstimationSettings = EstimationSettings()
+    calibration: NodeCalibration = NodeCalibration()
+
+
+class Aircraft:
+    """The stages of one aircraft, from its raw records on.
+
+    Parameters
+    ----------
+    vehicle_id : int
+        In the frames of its nodes; MAVLink system id.
+    settings : AircraftSettings
+        Of all stages.
+    unix_us_at_zero : int
+        Civil time at the gateway clock's zero, as well as it is known.
+    stored : StoredPlaces, optional
+        Missions, mark and home kept of an earlier run.
+    correct : callable, optional
+        Changes the states before they are told: for a playback that knows what comes.
+    """
+
+    def __init__(
+        self,
+        vehicle_id: int,
+        settings: AircraftSettings,
+        *,
+        unix_us_at_zero: int = 0,
+        stored: StoredPlaces | None = None,
+        correct: Callable[[NavState], NavState] | None = None,
+    ) -> None:
+        self.vehicle_id = vehicle_id
+        self.settings = settings
+        self.state: NavState | None = None
+        sections = {
+            name: getattr(settings, name) for name in ("sensing", "estimation", "calibration")
+        }
+        self.vehicle = Vehicle(
+            settings.vehicle,
+            vehicle_id,
+            sections=sections,
+            unix_us_at_zero=unix_us_at_zero,
+            stored=stored,
+        )
+        self._chain, self._estimator = make_fusion(settings)
+        self._correct = correct
+
+    @property
+    def fusion_state(self) -> FusionState:
+        """All that filters and estimator remember now, and where home is."""
+        home = self.vehicle.telemetry.home
+        return FusionState(
+            vehicle_id=self.vehicle_id,
+            fits=_fits(self.settings),
+            sensing=self._chain.snapshot(),
+            estimation=self._estimator.snapshot(),
+            home=None if home is None else (*astuple(home.place), home.set_time_us),
+        )
+
+    def restore(self, state: FusionState) -> None:
+        """Go on from a state to the last bit; raises ValueError as `make_fusion`.
+
+        Home is where it was also if the rest does not fit.
+        """
+        if state.home is not None:
+            *place, since_us = state.home
+            self.vehicle.telemetry.set_home(Home(Place(*place), since_us))
+        self._chain, self._estimator = make_fusion(self.settings, state)
+
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
+        """Let one raw record run through the stages."""
+        match record:
+            case ImuRaw():
+                return self._take_imu(record, self._chain.imu(record), now_us)
+            case ImuCalibrated():
+                return self._take_imu(None, self._filter(record), now_us)
+            case BaroRaw():
+                baro = self._chain.baro(record)
+                self._estimator.update_baro(baro)
+                return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
+            case GpsFix():
+                self._estimator.update_gps(record)
+                return self._recorded(record, self.vehicle.on_gps(record, now_us), now_us)
+            case NodeStatus():
+                return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
+
+    def _filter(self, imu: ImuCalibrated) -> ImuSample:
+        return self._chain.imu_si(
+            imu.time_us,
+            imu.accel_b_mps2,
+            imu.gyro_b_radps,
+            imu.mag_b_ut,
+            imu.temperature_degc,
+            imu.flags,
+        )
+
+    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
+        state = self._estimator.update_imu(sample)
+        self.state = state if self._correct is None else self._correct(state)
+        fused = FusedSample(self.vehicle_id, raw, sample, self.state)
+        return self._recorded(fused, self.vehicle.on_state(self.state, sample, now_us), now_us)
+
+    def _recorded(
+        self, record: FusedSample | BaroRaw | GpsFix, wanted: Iterable[VehicleAction], now_us: int
+    ) -> list[Action]:
+        """Put what is recorded behind the frames, which it may not delay, but before a change."""
+        actions = self.perform(wanted, now_us)
+        changed = [action for action in actions if isinstance(action, SettingsChanged)]
+        others = [action for action in actions if not isinstance(action, SettingsChanged)]
+        return [*others, record, *changed]
+
+    def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
+        """Carry out what the vehicle asks of the other stages; hand the rest on.
+
+        Parameters
+        ----------
+        wanted : iterable of VehicleAction
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Action
+        """
+        actions: list[Action] = []
+        for action in wanted:
+            if isinstance(action, SettingsChange):
+                actions += self._change(action.section, action.settings)
+            elif isinstance(action, CalibrationMeasured):
+                calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
+                actions += self._change("calibration", calibration)
+                told = self.vehicle.take_settings("calibration", calibration, now_us)
+                actions += self.perform(told, now_us)
+            else:
+                actions.append(action)
+        return actions
+
+    def change(self, settings: AircraftSettings) -> None:
+        """Take over what differs between these settings and those that hold."""
+        for section in ("sensing", "calibration", "estimation"):
+            wanted = getattr(settings, section)
+            if wanted != getattr(self.settings, section):
+                self._change(section, wanted)
+
+    def sign_by(self, passphrase: str, now_us: int) -> list[Action]:
+        """Sign, and check signatures, by another passphrase from now on."""
+        self.settings = with_passphrase(self.settings, passphrase)
+        vehicle = self.settings.vehicle
+        return self.perform(self.vehicle.take_settings("vehicle", vehicle, now_us), now_us)
+
+    def _change(self, section: str, settings: Settings) -> list[Action]:
+        """Rebuild the stage whose settings changed; the others go on undisturbed."""
+        self.settings = msgspec.structs.replace(self.settings, **{section: settings})
+        if section in ("sensing", "calibration"):
+            self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
+        elif section == "estimation":
+            self._estimator = _succeed(self._estimator, make_estimator(self.settings.estimation))
+        else:
+            return []
+        return [SettingsChanged(self.vehicle_id)]
+
+
+def make_fusion(
+    settings: AircraftSettings, state: FusionState | None = None
+) -> tuple[SensorChain, Estimator]:
+    """Build the two stages that make navigation states of raw records.
+
+    Parameters
+    ----------
+    settings : AircraftSettings
+        Of the aircraft.
+    state : FusionState, optional
+        To go on from; else they begin afresh.
+
+    Returns
+    -------
+    chain : SensorChain
+    estimator : Estimator
+
+    Raises
+    ------
+    ValueError
+        If the state is of another version or other settings, or damaged.
+    """
+    chain = SensorChain(settings.sensing, settings.calibration)
+    estimator = make_estimator(settings.estimation)
+    if state is not None:
+        if state.fits != _fits(settings):
+            raise ValueError("it is of another version or other settings")
+        chain.restore(state.sensing)
+        estimator.restore(state.estimation)
+    return chain, estimator
+
+
+def _fits(settings: AircraftSettings) -> str:
+    """Tell version and settings apart from all others, in a few letters."""
+    fused_with = (settings.sensing, settings.estimation, settings.calibration)
+    return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
+
+
+def _succeed(old: Estimator, new: Estimator) -> Estimator:
+    """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
+    state = getattr(old, "state", None)
+    if state is not None and type(new) is type(old):
+        new.state = state  # type: ignore[attr-defined]
+    return new
+
+
+def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSettings:
+    """Give an aircraft another signing passphrase."""
+    vehicle = msgspec.structs.replace(settings.vehicle, signing_passphrase=passphrase)
+    return msgspec.structs.replace(settings, vehicle=vehicle)

@@ -1,0 +1,112 @@
+"""Where the places of each aircraft are kept: one JSON file each, beside its settings.
+
+A file is replaced whole or not at all, by a thread of its own, since a disk may hold up whoever
+writes to it. A file that cannot be read is told and left alone: it may hold a mission that a person
+can mend.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Final
+
+from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
+
+log = logging.getLogger(__name__)
+
+NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
+
+
+class PlaceFiles:
+    """The files of all aircraft.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when it is needed.
+    tell : callable
+        Told the vehicle id and why its places could not be kept.
+    """
+
+    def __init__(self, folder: Path, tell: Callable[[int, str], None]) -> None:
+        self.failures = 0
+        """Changes that could not be written since the start."""
+        self._folder = folder
+        self._tell = tell
+        self._pending: dict[int, StoredPlaces] = {}
+        self._broken: set[int] = set()
+        self._worker = ThreadPoolExecutor(1, "places")
+        self._task: asyncio.Task[None] | None = None
+
+    def load(self) -> dict[int, StoredPlaces]:
+        """Read all files that can be read."""
+        found: dict[int, StoredPlaces] = {}
+        for file in sorted(self._folder.glob("*.places.json")):
+            named = NAME.fullmatch(file.name)
+            if named is None:
+                continue
+            vehicle_id = int(named[1])
+            try:
+                found[vehicle_id] = decode_places(file.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                self._broken.add(vehicle_id)
+                log.warning(
+                    "%s cannot be read and is left alone: %s. Missions, mark and home of aircraft "
+                    "%d begin empty and are not kept until it is mended or removed.",
+                    file,
+                    error,
+                    vehicle_id,
+                )
+        return found
+
+    def save(self, vehicle_id: int, places: StoredPlaces) -> None:
+        """Keep the places of an aircraft; returns at once, and only the newest count."""
+        self._pending[vehicle_id] = places
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._write_pending())
+
+    async def settle(self) -> None:
+        """Wait until what was given so far is written."""
+        if self._task is not None:
+            await self._task
+
+    def close(self) -> None:
+        """Write what is left and end; waits for the disk."""
+        if self._task is not None:
+            self._task.cancel()
+        self._worker.shutdown(wait=True)
+        for vehicle_id, places in self._pending.items():
+            with contextlib.suppress(OSError):
+                self._write(vehicle_id, places)
+
+    async def _write_pending(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._pending:
+            vehicle_id, places = next(iter(self._pending.items()))
+            try:
+                await loop.run_in_executor(self._worker, self._write, vehicle_id, places)
+            except OSError as error:
+                self.failures += 1
+                reason = error.strerror or str(error)
+                log.warning("places of aircraft %d cannot be kept: %s", vehicle_id, reason)
+                self._tell(vehicle_id, reason)
+            # Until it is written it stays, so that an end in between loses nothing.
+            if self._pending[vehicle_id] is places:
+                del self._pending[vehicle_id]
+
+    def _write(self, vehicle_id: int, places: StoredPlaces) -> None:
+        file = self._folder / f"{vehicle_id}.places.json"
+        if vehicle_id in self._broken and file.exists():
+            raise OSError(None, f"{file.name} is broken: mend or remove it")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        fresh = file.with_suffix(".new")
+        with fresh.open("w", encoding="utf-8") as stream:
+            stream.write(encode_places(places))
+            stream.flush()
+            os.fsync(stream.fileno())
+        fresh.replace(file)

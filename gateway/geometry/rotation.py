@@ -1,0 +1,65 @@
+"""Rotation matrices, and the three angles by which people tell them."""
+
+import math
+
+from gateway.records import Vec3
+
+Matrix3 = tuple[Vec3, Vec3, Vec3]
+
+_GIMBAL_LOCK = 1e-9
+"""Cosine of a pitch at which roll and yaw turn about the same axis."""
+
+
+def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
+    """Turn by yaw, then pitch, then roll, each about the axes already turned (Z-Y-X).
+
+    Parameters
+    ----------
+    roll_pitch_yaw_deg : tuple of 3 floats
+        In degrees.
+
+    Returns
+    -------
+    tuple of 3 tuples of 3 floats
+        Rows of the matrix that takes vectors of the turned axes to those turned from; whole
+        quarters of a turn give exact zeros and ones.
+    """
+    (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in roll_pitch_yaw_deg)
+    # Adding zero makes a plain zero of a negative one.
+    return (
+        (cy * cp + 0.0, cy * sp * sr - sy * cr + 0.0, cy * sp * cr + sy * sr + 0.0),
+        (sy * cp + 0.0, sy * sp * sr + cy * cr + 0.0, sy * sp * cr - cy * sr + 0.0),
+        (-sp + 0.0, cp * sr + 0.0, cp * cr + 0.0),
+    )
+
+
+def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
+    """Give the angles of `matrix_from_euler_deg`.
+
+    Parameters
+    ----------
+    matrix : tuple of 3 tuples of 3 floats
+        Rows of a rotation matrix.
+
+    Returns
+    -------
+    tuple of 3 floats
+        Roll (-180 to 180), pitch (-90 to 90), yaw (-180 to 180) in degrees. Where the pitch leaves
+        but the sum or difference of roll and yaw to be told, the roll is zero.
+    """
+    (xx, xy, _), (yx, yy, _), (zx, zy, zz) = matrix
+    level = math.hypot(xx, yx)
+    pitch = math.atan2(-zx, level)
+    if level > _GIMBAL_LOCK:
+        roll, yaw = math.atan2(zy, zz), math.atan2(yx, xx)
+    else:
+        roll, yaw = 0.0, math.atan2(-xy, yy)
+    return (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
+
+
+def _cos_sin(angle_deg: float) -> tuple[float, float]:
+    quarters, rest_deg = divmod(angle_deg, 90.0)
+    if rest_deg == 0.0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+    angle = math.radians(angle_deg)
+    return math.cos(angle), math.sin(angle)
