@@ -81,14 +81,9 @@ class Daemon:
         self._settings = settings
         self._read = read
         self._places = PlaceFiles(aircraft_folder(settings), self._tell_unkept)
-        self._pipeline = Pipeline(
-            PipelineSettings(
-                settings.default_aircraft,
-                aircraft,
-                unix_time_us() - self.now_us(),
-                places=self._places.load(),
-            )
-        )
+        at_zero_us = unix_time_us() - self.now_us()
+        default, places = settings.default_aircraft, self._places.load()
+        self._pipeline = Pipeline(PipelineSettings(default, aircraft, at_zero_us, places=places))
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
             settings.hub,
@@ -107,16 +102,20 @@ class Daemon:
             lambda vehicle_id: self._pipeline.aircraft[vehicle_id].fusion_state,
         )
         self._heard: bytes | None = None
-        self._control = ControlServer(socket_path("run"))
-        RecorderVerbs(self._recorder).register(self._control)
-        AircraftVerbs(self._mark).register(self._control)
-        HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(self._control)
+        self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
         self._notifier = ServiceNotifier()
         self._serial = SerialLink(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
+
+    def _make_control(self) -> ControlServer:
+        control = ControlServer(socket_path("run"))
+        RecorderVerbs(self._recorder).register(control)
+        AircraftVerbs(self._mark).register(control)
+        HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(control)
+        return control
 
     def start(self) -> None:
         """Open everything; needs a running event loop. What is not there yet is tried again."""
