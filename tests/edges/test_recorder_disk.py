@@ -61,9 +61,9 @@ async def test_a_full_disk(bench: Bench, disk: Path) -> None:
     assert not bench.recorder.recording
     ballast.unlink()
     await bench.turn(RETRY_S)
-    assert bench.recorder.recording
     bench.send(FRAMES[8:])
     await bench.turn()
+    assert bench.recorder.recording
     assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[8:]
     assert bench.announced[-1] == (False, f"Recording {NAME}")
     assert len(bench.troubles) == 1
