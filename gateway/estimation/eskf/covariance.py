@@ -51,6 +51,7 @@ def propagate(s: State, p: Gains) -> None:
         return
     transit(s, s.P)
     transit(s, s.P.T)
+    symmetrise(s.P)
     turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
     s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
@@ -87,6 +88,14 @@ def transit(s: State, P: FloatArray) -> None:
             for k in range(3):
                 P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
                 P[TILT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
+
+
+@compiled
+def symmetrise(P: FloatArray) -> None:
+    """Take the rounding off that makes `P` lopsided, which grows without bound in long flights."""
+    for i in range(STATES):
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
 @compiled
