@@ -82,6 +82,19 @@ def test_each_axis_stays_within_three_standard_deviations(flight: Flight) -> Non
 
 
 @pytest.mark.slow
+def test_iron_that_the_calibration_left_is_learned_in_flight(flight: Flight) -> None:
+    imu = flight.log.imu.copy()
+    imu[:, 6:9] += [3.0, -2.0, 4.0]
+    bent = replace(flight, log=replace(flight.log, imu=imu))
+
+    def yaw(settings: EskfSettings) -> float:
+        out = EskfEstimator(settings, flight.reference).run(bent.log)
+        return attitude_scores(bent, out[:, :4])["yaw"]
+
+    assert yaw(EskfSettings()) < 0.8 * yaw(EskfSettings(mag_bias_ut=0.01))
+
+
+@pytest.mark.slow
 def test_a_gyroscope_off_scale_is_learned_in_the_turns(flight: Flight) -> None:
     """An MPU6050 may be 3 % off, eleven degrees in each circle."""
     imu = flight.log.imu.copy()

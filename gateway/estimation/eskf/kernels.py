@@ -240,11 +240,12 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:
-        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]), mag_b)
+        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]))
         s.heading_true = 1 if known else 0
     elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
         since = min(s.time_s - s.mag_used_s, STALE_MAG_S)
         s.mag_used_s = s.time_s
+        put(s.field_n, field)
         absorb_compass(s, p, field, declination, weight, since)
 
 

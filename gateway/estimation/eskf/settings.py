@@ -34,7 +34,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.1,
         ),
-    ] = 0.05
+    ] = 0.06
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
@@ -45,7 +45,7 @@ class EskfSettings(Settings, frozen=True):
     accel_scale: Annotated[
         float,
         setting("Share by which the specific force beyond gravity is wrong.", ge=0.0, le=0.2),
-    ] = 0.008
+    ] = 0.005
     gyro_bias_walk_degpsprs: Annotated[
         float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
     ] = 0.0045
@@ -89,10 +89,10 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.08
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
-    ] = 4.5
+    ] = 4.7
     mag_bias_ut: Annotated[
         float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
-    ] = 0.1
+    ] = 0.5
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.018

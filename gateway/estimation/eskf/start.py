@@ -22,8 +22,8 @@ from gateway.estimation.eskf.state import (
 )
 from gateway.estimation.health import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
 from gateway.estimation.place import NEVER_S
-from gateway.estimation.record import as_quat, put, put_quat
-from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
+from gateway.estimation.record import as_quat, as_vec, put, put_quat
+from gateway.geometry.quaternion import from_euler, multiply, normalise
 from gateway.records import NAN, Vec3
 
 FIRST_TILT_VAR: Final = 0.05**2
@@ -46,7 +46,6 @@ def start(s: State, p: Gains) -> None:
         s.P[GYRO_SCALE + k, GYRO_SCALE + k] = p.gyro_scale_var
         s.wander_var[k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
-        s.P[MAG_BIAS + k, MAG_BIAS + k] = p.mag_bias_var
         s.rate_b[k] = NAN
     s.declination_rad = NAN
     forget_times(s)
@@ -94,18 +93,31 @@ def turn_heading(s: State, turn_rad: float) -> None:
 
 
 @compiled
-def start_heading_by_compass(s: State, p: Gains, turn_rad: float, mag_b: Vec3) -> None:
-    """Take the heading from the compass: the iron's error is then the heading's, reversed."""
+def start_heading_by_compass(s: State, p: Gains, turn_rad: float) -> None:
+    """Take the heading from the compass."""
     turn_heading(s, turn_rad)
-    compass_row(s, rotate(as_quat(s.q_nb), mag_b))
     forget(s.P, TILT + 2, p.mag_var)
-    for k in range(3):
-        share = s.h[MAG_BIAS + k]
-        forget(s.P, MAG_BIAS + k, p.mag_bias_var)
-        tie(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
-        s.P[TILT + 2, TILT + 2] += share * share * p.mag_bias_var
-        s.mag_bias_b[k] = 0.0
     s.heading_known = 1
+
+
+@compiled
+def doubt_iron(s: State, p: Gains) -> None:
+    """Look for iron that the calibration left, once the GPS can tell it from the heading.
+
+    A heading that came from the compass has the iron's error, reversed.
+    """
+    if s.iron_doubted == 1:
+        return
+    s.iron_doubted = 1
+    by_compass = s.field_n[0] != 0.0 or s.field_n[1] != 0.0
+    if by_compass:
+        compass_row(s, as_vec(s.field_n))
+    for k in range(3):
+        forget(s.P, MAG_BIAS + k, p.mag_bias_var)
+        if by_compass:
+            share = s.h[MAG_BIAS + k]
+            tie(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
+            s.P[TILT + 2, TILT + 2] += share * share * p.mag_bias_var
 
 
 @compiled
@@ -144,6 +156,7 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
         if s.baro_known == 1:
             restart_baro(s, p)
     s.aided = 1
+    doubt_iron(s, p)
     s.off_last_m = s.contradiction_m = 0.0
 
 

@@ -70,6 +70,10 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     declination_rad: float
     mag_s: float
     mag_used_s: float
+    field_n: Annotated[FloatArray, (3,)]
+    """The field that the compass was last used with, NED, uT; all zero before."""
+    iron_doubted: int
+    """1 once the iron that the calibration left is looked for."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
     hold_s: float
