@@ -92,6 +92,7 @@ class Daemon:
             on_foreign=self._on_foreign,
             on_gone=self._pipeline.forget_client,
             on_trouble=self._on_trouble,
+            seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us()),
         )
         self._recorder = Recorder(
             settings.recording,

@@ -26,8 +26,11 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.events import Told
 from gateway.vehicle.home import Place
+from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stored import StoredPlaces
 from gateway.wire.link import Link
+from gateway.wire.mavlink_signing import Signer
+from gateway.wire.mavlink_splitter import origin_of, restamp
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
@@ -59,6 +62,8 @@ class Pipeline:
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
         self._link = Link()
+        self._signer = Signer()
+        self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self._connected = False
         self._port = ""
         self._report_due_us = 0
@@ -126,6 +131,14 @@ class Pipeline:
         for key, each in self.aircraft.items():
             actions += each.sign_by(own.get(key, common), now_us)
         return actions
+
+    def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
+        """Give a frame of ours that leaves its number, and a signature if its aircraft signs."""
+        aircraft = self.aircraft.get(origin_of(frame)[0])
+        key = None if aircraft is None else aircraft.vehicle.signing_key
+        if key is None:
+            return restamp(frame, sequence)
+        return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us))
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""

@@ -24,11 +24,13 @@ from gateway.routing.trouble import TroubleWatch
 from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import (
     is_station_heartbeat,
     key_of,
     message_id_of,
     origin_of,
+    restamp,
     target_of,
 )
 
@@ -69,6 +71,8 @@ class Hub:
         Called with the id of a client that has gone for good.
     on_trouble : callable, optional
         Called with a short text when clients come into trouble or out of it.
+    seal : callable, optional
+        Numbers, and signs, each frame of ours that leaves; without it none is signed.
     """
 
     def __init__(
@@ -79,23 +83,25 @@ class Hub:
         on_foreign: Callable[[bytes], None] | None = None,
         on_gone: Callable[[int], None] | None = None,
         on_trouble: Callable[[str], None] | None = None,
+        seal: Seal = restamp,
     ) -> None:
         self.settings = settings
+        self.seal = seal
         self.now_us = now_us
         self._on_frame = on_frame
         self._on_foreign = on_foreign
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()
-        self._fanout = Fanout()
+        self._fanout = Fanout(seal)
         self._table = RoutingTable()
         self._guard = LoopGuard()
-        self._probe = RoundTrip()
+        self._probe = RoundTrip(seal)
         self._links: dict[int, Link] = {}
         self._express_sources: set[Link] = set()
         self._endpoints: dict[str, Link | Listener[Any]] = {}
         self._next_id = 1
-        self._vehicles = OwnVehicles()
+        self._vehicles = OwnVehicles(seal)
         self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._published = self._forwarded = self._duplicates = 0

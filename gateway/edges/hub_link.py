@@ -12,6 +12,7 @@ from gateway.routing.clients import ClientStats
 from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_numeric
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import Origin
+from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import SplitFault
 
 Write = Callable[[bytes], object]
@@ -150,6 +151,10 @@ class HubContext(Protocol):
     @property
     def settings(self) -> HubSettings:
         """The settings of this moment."""
+
+    @property
+    def seal(self) -> Seal:
+        """Numbers, and signs, a frame of ours that leaves."""
 
     def now_us(self) -> int:
         """Return the gateway time."""

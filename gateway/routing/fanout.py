@@ -8,18 +8,24 @@ look-up and one call per outlet.
 A frame that one outlet does not get (filtered, limited, or an answer to another client) leaves a
 gap in the sequence numbers there, which ground stations show as loss of the radio. So our own
 frames are numbered anew for those outlets: each outlet remembers how many it was not given, and
-all outlets that lack the same number share one restamped copy. Frames of other vehicles and signed
-frames are never touched; a filter on those does show as loss.
+all outlets that lack the same number share one copy, which is signed too if our vehicle signs.
+Frames of other vehicles are never touched; a filter on those does show as loss.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Final
 
 from gateway.records import ClientInterval
 from gateway.routing.endpoint import NO_MESSAGES, Endpoint
-from gateway.wire.mavlink_splitter import START_V2, key_of, message_id_of, origin_of, restamp
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import (
+    key_of,
+    message_id_of,
+    origin_of,
+    restamp,
+    sequence_of,
+)
 
 Transmit = Callable[[bytes, int], None]
 """Hands a frame and its message id to a transport."""
@@ -28,8 +34,6 @@ SEQUENCE_MASK: Final = 0xFF
 SLACK_SHIFT: Final = 2
 """A limited frame may come a quarter of its interval early, or jitter would halve the rate."""
 
-COPIES: Final = 16
-"""Restamped copies kept while one frame goes round the outlets."""
 MAX_PLANS: Final = 4096
 """A vehicle sends some fifty kinds of message; forged headers must not fill the memory."""
 
@@ -90,9 +94,16 @@ class _Plan:
 
 
 class Fanout:
-    """Give frames to outlets by their filters, rates and addresses."""
+    """Give frames to outlets by their filters, rates and addresses.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    seal : callable
+        Numbers, and signs, each frame of ours that leaves.
+    """
+
+    def __init__(self, seal: Seal = restamp) -> None:
+        self._seal = seal
         self._outlets: dict[int, _Outlet] = {}
         self._plans: dict[bytes, _Plan] = {}
 
@@ -121,13 +132,12 @@ class Fanout:
     def publish(self, frame: bytes, now_us: int) -> None:
         """Send one of our own frames to every outlet that takes it."""
         plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
-        message_id = plan.message_id
+        copies: dict[int, bytes] = {}
         for lane in plan.open:
-            skipped = lane.stamp.skipped
-            lane.transmit(_shifted(frame, skipped) if skipped else frame, message_id)
+            self._hand(frame, lane, plan.message_id, copies)
         for lane in plan.limited:
             if lane.is_due(now_us):
-                lane.transmit(_shifted(frame, lane.stamp.skipped), message_id)
+                self._hand(frame, lane, plan.message_id, copies)
             else:
                 _skip(lane.stamp)
         for stamp in plan.closed:
@@ -140,7 +150,7 @@ class Fanout:
         for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
             if outlet.client_id == client_id:
-                outlet.transmit(_shifted(frame, stamp.skipped), message_id_of(frame))
+                outlet.transmit(self._copy(frame, stamp.skipped), message_id_of(frame))
             else:
                 _skip(stamp)
 
@@ -168,6 +178,16 @@ class Fanout:
             if outlet := self._outlets.get(client_id):
                 outlet.transmit(frame, message_id)
 
+    def _hand(self, frame: bytes, lane: _Lane, message_id: int, copies: dict[int, bytes]) -> None:
+        skipped = lane.stamp.skipped
+        copy = copies.get(skipped)
+        if copy is None:
+            copy = copies[skipped] = self._copy(frame, skipped)
+        lane.transmit(copy, message_id)
+
+    def _copy(self, frame: bytes, skipped: int) -> bytes:
+        return self._seal(frame, sequence_of(frame) - skipped & SEQUENCE_MASK)
+
     def _make_plan(self, frame: bytes) -> _Plan:
         if len(self._plans) >= MAX_PLANS:
             self._plans.clear()
@@ -189,11 +209,3 @@ class Fanout:
 
 def _skip(stamp: _Stamp) -> None:
     stamp.skipped = (stamp.skipped + 1) & SEQUENCE_MASK
-
-
-@lru_cache(maxsize=COPIES)
-def _shifted(frame: bytes, skipped: int) -> bytes:
-    if not skipped:
-        return frame
-    sequence = frame[4] if frame[0] == START_V2 else frame[2]
-    return restamp(frame, (sequence - skipped) & SEQUENCE_MASK)
