@@ -15,6 +15,7 @@ from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
+from gateway.routing.digest import Digest
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
@@ -40,6 +41,8 @@ MAX_EXPRESS: Final = 1024
 """Kinds of frame a client; beyond a few hundred they are forged."""
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
+VISITS_IN_FULL: Final = 30
+"""Comings and goings at listening ports that are logged one by one in a minute."""
 
 LINKS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Link]]] = {
     EndpointKind.UDP: UdpLink,
@@ -93,6 +96,7 @@ class Hub:
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()
+        self._visits = Digest(VISITS_IN_FULL, "more comings and goings at listening ports")
         self._fanout = Fanout(seal)
         self._table = RoutingTable()
         self._guard = LoopGuard()
@@ -269,7 +273,7 @@ class Hub:
         self._links[link.client_id] = link
         self._fanout.add(link.client_id, link.transmit, link.endpoint)
         self._forget_express()
-        log.info("client %s: %s", link.client_id, link.remote)
+        self._log_visit(link, f"client {link.client_id}: {link.remote}")
 
     def greet(self, link: Link) -> None:
         """Tell a peer that has just come which vehicles there are, and their homes."""
@@ -287,7 +291,7 @@ class Hub:
         self._table.forget(link.client_id)
         self._vehicles.forget(link.client_id)
         if self._links.pop(link.client_id, None):
-            log.info("client %s has gone: %s", link.client_id, link.remote)
+            self._log_visit(link, f"client {link.client_id} has gone: {link.remote}")
             if self._on_gone is not None:
                 self._on_gone(link.client_id)
         link.close()
@@ -372,10 +376,17 @@ class Hub:
         if now_us - self._trouble_us < US_PER_S:
             return
         self._trouble_us = now_us
+        for line in self._visits.poll(now_us):
+            log.info("%s", line)
         for text in self._trouble.update(self.clients(), self.listeners(), now_us):
             log.warning("%s", text)
             if self._on_trouble is not None:
                 self._on_trouble(text)
+
+    def _log_visit(self, link: Link, text: str) -> None:
+        is_caller = link.endpoint.kind in LISTENERS
+        for line in self._visits.say(text, self.now_us()) if is_caller else [text]:
+            log.info("%s", line)
 
     def _ask_round_trips(self, now_us: int) -> None:
         """Ask every client that speaks; one that does not listens to nothing but telemetry."""
