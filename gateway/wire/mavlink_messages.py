@@ -10,7 +10,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as dialect
 
 DROPPED: Final = {300: ("PROTOCOL_VERSION", 217), 397: ("COMPONENT_METADATA", 182)}
-"""Name and checksum seed of messages that the generated dialects lack and ground stations ask for."""
+"""Name and checksum seed of messages that the dialects lack and ground stations ask for."""
 
 NO_TARGET: Final = -1
 
