@@ -80,7 +80,11 @@ class Pipeline:
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
-        return self._aircraft_of(record.node.vehicle_id).take(record, now_us)
+        is_new = record.node.vehicle_id not in self.aircraft
+        aircraft = self._aircraft_of(record.node.vehicle_id)
+        # Its heartbeat comes first: before it ground stations hear nothing of an aircraft.
+        first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us) if is_new else []
+        return first + aircraft.take(record, now_us)
 
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)

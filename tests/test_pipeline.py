@@ -85,6 +85,15 @@ def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
+def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:
+    kinds = [m.get_type() for m in decode(pipeline.feed(Tracker().frame(0, LEVEL), 5_000))]
+    assert kinds[0] == "HEARTBEAT"
+    assert kinds.count("HEARTBEAT") == 1
+    assert "HEARTBEAT" not in [m.get_type() for m in decode(pipeline.poll(6_000))]
+    later = decode(pipeline.feed(Tracker().frame(0, LEVEL), 7_000))
+    assert "HEARTBEAT" not in [m.get_type() for m in later]
+
+
 def test_frames_are_sent_before_the_sample_is_recorded(pipeline: Pipeline) -> None:
     actions = pipeline.feed(Tracker().frame(0, LEVEL), 5_000)
     assert isinstance(actions[-1], FusedSample)
