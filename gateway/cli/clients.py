@@ -39,6 +39,7 @@ def status(*, json: JsonOption = False) -> None:
     console = Console()
     console.print(_summary(snapshot), highlight=False)
     if nodes := snapshot["report"]["nodes"]:
+        console.print()
         console.print(_nodes(nodes))
     _print_clients(console, snapshot)
 
@@ -126,7 +127,9 @@ def _nodes(nodes: Sequence[Record]) -> Table:
 
 def _print_clients(console: Console, snapshot: Record) -> None:
     if listeners := snapshot["listeners"]:
+        console.print()
         console.print(_listeners(listeners))
+    console.print()
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
         if client["reason"]:
@@ -158,8 +161,8 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    # Narrow padding: the table of clients fits a terminal of 80 columns.
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    # No padding: the table of clients fits a terminal of 80 columns.
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     return table
