@@ -145,6 +145,31 @@ async def test_odd_datagrams_rain(rig: Any) -> None:
     assert len(flight.hub.clients()) == 3
 
 
+@pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
+async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
+    flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
+    await flight.start()
+    with socket.create_connection(("127.0.0.1", flight.hub.listening_ports()[1])) as rude:
+        await rig.until(lambda: len(flight.hub.clients()) == 4)
+        rude.setblocking(False)
+        for _ in range(50):
+            with contextlib.suppress(BlockingIOError):
+                rude.send(garbage * (20_000 // len(garbage)))
+            with contextlib.suppress(BlockingIOError):
+                rude.recv(1 << 20)
+            await flight.fly(20)
+        assert await flight.lost() == 0
+        client = flight.hub.clients()[-1]
+        assert client.bytes_garbage > 100_000
+        assert client.received == 0
+        said = rig.sender(200, 190).heartbeat()
+        while not flight.hub.clients()[-1].received:
+            # What looks like the head of a frame swallows the first ones.
+            with contextlib.suppress(BlockingIOError):
+                rude.send(said)
+            await flight.fly(1)
+
+
 @pytest.mark.parametrize("room", [16, 100])
 async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
     flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
