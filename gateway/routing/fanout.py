@@ -92,6 +92,16 @@ class _Plan:
     limited: list[_Lane] = field(default_factory=list)
     closed: list[_Stamp] = field(default_factory=list)
 
+    def due(self, now_us: int) -> list[_Lane]:
+        """Return who gets a frame now; those for whom it is too soon skip its number."""
+        lanes = list(self.open)
+        for lane in self.limited:
+            if lane.is_due(now_us):
+                lanes.append(lane)
+            else:
+                _skip(lane.stamp)
+        return lanes
+
 
 class Fanout:
     """Give frames to outlets by their filters, rates and addresses.
@@ -132,14 +142,14 @@ class Fanout:
     def publish(self, frame: bytes, now_us: int) -> None:
         """Send one of our own frames to every outlet that takes it."""
         plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
-        copies: dict[int, bytes] = {}
-        for lane in plan.open:
-            self._hand(frame, lane, plan.message_id, copies)
-        for lane in plan.limited:
-            if lane.is_due(now_us):
-                self._hand(frame, lane, plan.message_id, copies)
-            else:
-                _skip(lane.stamp)
+        message_id = plan.message_id
+        sequence = sequence_of(frame)
+        copies = {0: self._seal(frame, sequence)}
+        for lane in plan.due(now_us) if plan.limited else plan.open:
+            skipped = lane.stamp.skipped
+            if skipped not in copies:
+                copies[skipped] = self._seal(frame, sequence - skipped & SEQUENCE_MASK)
+            lane.transmit(copies[skipped], message_id)
         for stamp in plan.closed:
             _skip(stamp)
 
@@ -150,7 +160,8 @@ class Fanout:
         for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
             if outlet.client_id == client_id:
-                outlet.transmit(self._copy(frame, stamp.skipped), message_id_of(frame))
+                sequence = sequence_of(frame) - stamp.skipped & SEQUENCE_MASK
+                outlet.transmit(self._seal(frame, sequence), message_id_of(frame))
             else:
                 _skip(stamp)
 
@@ -177,16 +188,6 @@ class Fanout:
         for client_id in client_ids:
             if outlet := self._outlets.get(client_id):
                 outlet.transmit(frame, message_id)
-
-    def _hand(self, frame: bytes, lane: _Lane, message_id: int, copies: dict[int, bytes]) -> None:
-        skipped = lane.stamp.skipped
-        copy = copies.get(skipped)
-        if copy is None:
-            copy = copies[skipped] = self._copy(frame, skipped)
-        lane.transmit(copy, message_id)
-
-    def _copy(self, frame: bytes, skipped: int) -> bytes:
-        return self._seal(frame, sequence_of(frame) - skipped & SEQUENCE_MASK)
 
     def _make_plan(self, frame: bytes) -> _Plan:
         if len(self._plans) >= MAX_PLANS:

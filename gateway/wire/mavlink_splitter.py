@@ -186,8 +186,10 @@ def restamp(frame: bytes, sequence: int) -> bytes:
         The frame to send instead.
     """
     at = 4 if frame[0] == START_V2 else 2
+    if frame[at] == sequence:
+        return frame
     extra = CRC_EXTRA.get(message_id_of(frame))
-    if frame[at] == sequence or extra is None or is_signed(frame):
+    if extra is None or is_signed(frame):
         return frame
     body = frame[1:at] + bytes((sequence,)) + frame[at + 1 : -2]
     return frame[:1] + body + mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
