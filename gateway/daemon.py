@@ -195,6 +195,8 @@ class Daemon:
             hub=self._hub.counters(),
             listeners=(*self._hub.listeners(), *self._metrics.listeners()),
             places_not_kept=self._places.failures,
+            refused=self._pipeline.refused,
+            forged=self._pipeline.forged,
         )
 
     def _reload_or_refuse(self) -> str:

@@ -26,6 +26,7 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.events import Told
 from gateway.vehicle.home import Place
+from gateway.vehicle.reader import BAD_SIGNATURE
 from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stored import StoredPlaces
 from gateway.wire.link import Link
@@ -195,6 +196,16 @@ class Pipeline:
     def in_flight(self) -> bool:
         """Whether an aircraft flies."""
         return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
+
+    @property
+    def refused(self) -> int:
+        """Requests to change something, of clients that may not."""
+        return sum(aircraft.vehicle.refusals for aircraft in self.aircraft.values())
+
+    @property
+    def forged(self) -> int:
+        """Requests whose signature was wrong, old, or there before."""
+        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self.aircraft.values())
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; ground stations are told."""

@@ -208,6 +208,19 @@ def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None
     assert kinds > {0, 22, 30, 31, 77, 300, 397, 435}
 
 
+def test_requests_that_are_not_carried_out_are_counted(pipeline: Pipeline) -> None:
+    for vehicle_id in (1, 2):
+        pipeline.feed(Tracker(vehicle_id).frame(0, LEVEL), 0)
+    pipeline.sign_by("correct horse", {}, 0)
+    station = mavlink.MAVLink(None, 255, 190)
+    change = mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 5.0, 9)
+    for _ in range(3):
+        pipeline.handle(Incoming(7, bytes(change.pack(station)), trusted=True), 0)
+    station.signing.secret_key, station.signing.sign_outgoing = bytes(32), True
+    pipeline.handle(Incoming(7, bytes(change.pack(station)), trusted=True), 0)
+    assert (pipeline.refused, pipeline.forged) == (3, 1)
+
+
 def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipeline) -> None:
     trackers = {vehicle_id: Tracker(vehicle_id) for vehicle_id in (1, 2, 3)}
 

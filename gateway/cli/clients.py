@@ -110,7 +110,11 @@ def _summary(snapshot: Record) -> str:
         for vehicle_id, state in snapshot["states"]
     ]
     hub = snapshot["hub"]
-    lines.append(", ".join(f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"))
+    counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
+    lines.append("MAVLink frames: " + ", ".join(counts))
+    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
+    if requests:
+        lines.append("requests: " + ", ".join(requests))
     return "\n".join(lines)
 
 

@@ -168,7 +168,7 @@ def test_orders_reach_the_hub(
     (tablet,) = (c for c in request(control, "status")["clients"] if c["name"] == "tablet")
     assert (tablet["state"], tablet["trusted"]) == ("open", True)
     assert tablet["sent"] >= 3
-    assert request(control, "reload") == "settings of the hub applied"
+    assert request(control, "reload") == "settings of the hub and of signing applied"
     assert url not in request(control, "clients.remove", {"name": "tablet"})
     with pytest.raises(ControlError, match="tablet"):
         request(control, "clients.remove", {"name": "tablet"})
