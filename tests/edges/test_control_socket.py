@@ -130,9 +130,9 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
 
 
 def test_nobody_there_is_said_plainly(tmp_path: Path) -> None:
-    with pytest.raises(ControlError, match="nothing runs.*: start `mavgate run` or"):
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
         request(tmp_path / "run.sock", "status")
-    with pytest.raises(ControlError, match="nothing runs.*: start `mavgate play` first"):
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
         request(tmp_path / "play.sock", "status")
 
 
