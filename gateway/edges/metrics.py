@@ -6,7 +6,7 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from gateway.edges.hub_link import reason_of
+from gateway.edges.reasons import reason_of
 from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
