@@ -205,7 +205,7 @@ class Aircraft:
             elif isinstance(action, CalibrationMeasured):
                 calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
                 actions += self._change("calibration", calibration)
-                told = self.vehicle.take_settings("calibration", calibration, now_us)
+                told = self.vehicle.take_settings("calibration", calibration)
                 actions += self.perform(told, now_us)
             else:
                 actions.append(action)
@@ -222,7 +222,7 @@ class Aircraft:
         """Sign, and check signatures, by another passphrase from now on."""
         self.settings = with_passphrase(self.settings, passphrase)
         vehicle = self.settings.vehicle
-        return self.perform(self.vehicle.take_settings("vehicle", vehicle, now_us), now_us)
+        return self.perform(self.vehicle.take_settings("vehicle", vehicle), now_us)
 
     def _change(self, section: str, settings: Settings) -> list[Action]:
         """Rebuild the stage whose settings changed; the others go on undisturbed."""

@@ -80,9 +80,10 @@ class Daemon:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
         self._read = read
-        self._places = PlaceFiles(aircraft_folder(settings), self._tell_unkept)
+        self._places = PlaceFiles(aircraft_folder(settings), self._tell_kept)
         at_zero_us = unix_time_us() - self.now_us()
         default, places = settings.default_aircraft, self._places.load()
+        self._broken_places = dict(self._places.broken)
         self._pipeline = Pipeline(PipelineSettings(default, aircraft, at_zero_us, places=places))
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
@@ -92,6 +93,7 @@ class Daemon:
             on_foreign=self._on_foreign,
             on_gone=self._pipeline.forget_client,
             on_trouble=self._on_trouble,
+            seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us()),
         )
         self._recorder = Recorder(
             settings.recording,
@@ -193,6 +195,8 @@ class Daemon:
             hub=self._hub.counters(),
             listeners=(*self._hub.listeners(), *self._metrics.listeners()),
             places_not_kept=self._places.failures,
+            refused=self._pipeline.refused,
+            forged=self._pipeline.forged,
         )
 
     def _reload_or_refuse(self) -> str:
@@ -242,6 +246,9 @@ class Daemon:
     def _poll(self) -> None:
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
+        for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
+            # After its first heartbeat, before which ground stations hear nothing of it.
+            self._tell_kept(vehicle_id, self._broken_places.pop(vehicle_id))
         self._recorder.set_in_flight(self._pipeline.in_flight)
         status = self._recorder.status()
         trouble = status.reason if status.state == "blocked" else ""
@@ -285,8 +292,10 @@ class Daemon:
             told = Told(NOTICE, f"Settings saved: {file.name}")
         self._tell_of(aircraft, told)
 
-    def _tell_unkept(self, vehicle_id: int, reason: str) -> None:
-        told = Told(WARNING, f"Mission, mark and home not kept: {reason}")
+    def _tell_kept(self, vehicle_id: int, trouble: str | None) -> None:
+        told = Told(NOTICE, "Mission, mark and home are kept again")
+        if trouble is not None:
+            told = Told(WARNING, f"Mission, mark and home not kept: {trouble}")
         self._tell_of(self._pipeline.aircraft[vehicle_id], told)
 
     def _tell_of(self, aircraft: Aircraft, told: Told) -> None:

@@ -26,8 +26,12 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.events import Told
 from gateway.vehicle.home import Place
+from gateway.vehicle.reader import BAD_SIGNATURE
+from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stored import StoredPlaces
 from gateway.wire.link import Link
+from gateway.wire.mavlink_signing import Signer
+from gateway.wire.mavlink_splitter import origin_of, restamp
 
 REPORT_INTERVAL_US: Final = US_PER_S
 
@@ -59,6 +63,8 @@ class Pipeline:
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
         self._link = Link()
+        self._signer = Signer()
+        self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self._connected = False
         self._port = ""
         self._report_due_us = 0
@@ -75,7 +81,11 @@ class Pipeline:
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
-        return self._aircraft_of(record.node.vehicle_id).take(record, now_us)
+        is_new = record.node.vehicle_id not in self.aircraft
+        aircraft = self._aircraft_of(record.node.vehicle_id)
+        # Its heartbeat comes first: before it ground stations hear nothing of an aircraft.
+        first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us) if is_new else []
+        return first + aircraft.take(record, now_us)
 
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)
@@ -126,6 +136,14 @@ class Pipeline:
         for key, each in self.aircraft.items():
             actions += each.sign_by(own.get(key, common), now_us)
         return actions
+
+    def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
+        """Give a frame of ours that leaves its number, and a signature if its aircraft signs."""
+        aircraft = self.aircraft.get(origin_of(frame)[0])
+        key = None if aircraft is None else aircraft.vehicle.signing_key
+        if key is None:
+            return restamp(frame, sequence)
+        return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us))
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; what was half received is forgotten."""
@@ -178,6 +196,16 @@ class Pipeline:
     def in_flight(self) -> bool:
         """Whether an aircraft flies."""
         return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
+
+    @property
+    def refused(self) -> int:
+        """Requests to change something, of clients that may not."""
+        return sum(aircraft.vehicle.refusals for aircraft in self.aircraft.values())
+
+    @property
+    def forged(self) -> int:
+        """Requests whose signature was wrong, old, or there before."""
+        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self.aircraft.values())
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; ground stations are told."""

@@ -21,3 +21,7 @@ class Snapshot:
     listeners: tuple[ListenerStats, ...] = ()
     places_not_kept: int = 0
     """Changes of missions, marks and homes that could not be written since the start."""
+    refused: int = 0
+    """Requests to change something, of clients that may not."""
+    forged: int = 0
+    """Requests whose signature was wrong, old, or there before."""

@@ -9,12 +9,24 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.aircraft import Action, AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, NodeId, Outgoing
+from gateway.records import (
+    BaroRaw,
+    FusedSample,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    Incoming,
+    NodeId,
+    Outgoing,
+)
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.home import Place
+from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
+UNIX_US = 1_790_000_000_000_000
 LEVEL = payloads.ImuPayload(
     accel=(0, 0, 4096),
     gyro=(0, 0, 0),
@@ -71,6 +83,15 @@ def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
     assert message.time_boot_ms == 5
     (attitude,) = named(actions, "ATTITUDE")
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:
+    kinds = [m.get_type() for m in decode(pipeline.feed(Tracker().frame(0, LEVEL), 5_000))]
+    assert kinds[0] == "HEARTBEAT"
+    assert kinds.count("HEARTBEAT") == 1
+    assert "HEARTBEAT" not in [m.get_type() for m in decode(pipeline.poll(6_000))]
+    later = decode(pipeline.feed(Tracker().frame(0, LEVEL), 7_000))
+    assert "HEARTBEAT" not in [m.get_type() for m in later]
 
 
 def test_frames_are_sent_before_the_sample_is_recorded(pipeline: Pipeline) -> None:
@@ -162,6 +183,44 @@ def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> No
     assert dict(pipeline.report.faults)
 
 
+def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None:
+    vehicle = VehicleSettings(signing_passphrase="correct horse")
+    pipeline = Pipeline(PipelineSettings(AircraftSettings(vehicle=vehicle), {}, UNIX_US))
+    receiver, tracker, kinds = mavlink.MAVLink(None), Tracker(), set()
+    receiver.signing.secret_key = key_from_passphrase("correct horse")
+    receiver.signing.timestamp = (UNIX_US - EPOCH_2015_US) // 10
+    station = mavlink.MAVLink(None, 255, 190)
+    for time_us in range(0, 3_000_000, 10_000):
+        actions = pipeline.feed(tracker.frame(time_us, LEVEL), time_us) + pipeline.poll(time_us)
+        wanted = 148 + time_us // 10_000
+        ask = mavlink.MAVLink_command_long_message(1, 1, 512, 0, wanted, 0, 0, 0, 0, 0, 0)
+        read = mavlink.MAVLink_param_request_read_message(1, 1, b"", 0)
+        for question in (ask, read):
+            incoming = Incoming(7, bytes(question.pack(station)), trusted=True)
+            actions += pipeline.handle(incoming, time_us)
+        for action in actions:
+            if isinstance(action, Outgoing):
+                signed = pipeline.seal(action.frame, action.frame[4], time_us)
+                # It steps over the signatures of messages that it does not know.
+                assert receiver.decode(bytearray(signed)) is not None
+                assert signed[2] & 1
+                kinds.add(action.message_id)
+    assert kinds > {0, 22, 30, 31, 77, 300, 397, 435}
+
+
+def test_requests_that_are_not_carried_out_are_counted(pipeline: Pipeline) -> None:
+    for vehicle_id in (1, 2):
+        pipeline.feed(Tracker(vehicle_id).frame(0, LEVEL), 0)
+    pipeline.sign_by("correct horse", {}, 0)
+    station = mavlink.MAVLink(None, 255, 190)
+    change = mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 5.0, 9)
+    for _ in range(3):
+        pipeline.handle(Incoming(7, bytes(change.pack(station)), trusted=True), 0)
+    station.signing.secret_key, station.signing.sign_outgoing = bytes(32), True
+    pipeline.handle(Incoming(7, bytes(change.pack(station)), trusted=True), 0)
+    assert (pipeline.refused, pipeline.forged) == (3, 1)
+
+
 def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipeline) -> None:
     trackers = {vehicle_id: Tracker(vehicle_id) for vehicle_id in (1, 2, 3)}
 
@@ -169,8 +228,9 @@ def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipe
         actions = []
         for tracker in trackers.values():
             actions += pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
-        found = [a for a in actions if isinstance(a, Outgoing)]
-        return {action.frame[5]: bool(action.frame[2] & 1) for action in found}
+        frames = [a.frame for a in actions if isinstance(a, Outgoing)]
+        sealed = [pipeline.seal(frame, frame[4], time_us) for frame in frames]
+        return {frame[5]: bool(frame[2] & 1) for frame in sealed}
 
     pipeline.feed(trackers[1].frame(0, LEVEL), 0)
     pipeline.sign_by("", {1: "mine", 3: "theirs"}, 1_000_000)

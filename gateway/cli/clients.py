@@ -39,6 +39,7 @@ def status(*, json: JsonOption = False) -> None:
     console = Console()
     console.print(_summary(snapshot), highlight=False)
     if nodes := snapshot["report"]["nodes"]:
+        console.print()
         console.print(_nodes(nodes))
     _print_clients(console, snapshot)
 
@@ -109,7 +110,11 @@ def _summary(snapshot: Record) -> str:
         for vehicle_id, state in snapshot["states"]
     ]
     hub = snapshot["hub"]
-    lines.append(", ".join(f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"))
+    counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
+    lines.append("MAVLink frames: " + ", ".join(counts))
+    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
+    if requests:
+        lines.append("requests: " + ", ".join(requests))
     return "\n".join(lines)
 
 
@@ -126,7 +131,9 @@ def _nodes(nodes: Sequence[Record]) -> Table:
 
 def _print_clients(console: Console, snapshot: Record) -> None:
     if listeners := snapshot["listeners"]:
+        console.print()
         console.print(_listeners(listeners))
+    console.print()
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
         if client["reason"]:
@@ -158,8 +165,8 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    # Narrow padding: the table of clients fits a terminal of 80 columns.
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    # No padding: the table of clients fits a terminal of 80 columns.
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     return table

@@ -24,6 +24,8 @@ MAX_CONNECTIONS: Final = 16
 FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
 REQUEST_TIMEOUT_S: Final = 10.0
+STARTERS: Final = {"run": "`mavgate run` or `mavgate demo`", "play": "`mavgate play`"}
+"""What opens which socket."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 """Linux `struct ucred`: process, user, group."""
@@ -218,7 +220,9 @@ def request(
             with link.makefile("rb") as lines:
                 answer = msgspec.json.decode(lines.readline(), type=_Answer)
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise ControlError(f"nothing runs that could do this (no socket {path})") from error
+        starter = STARTERS.get(path.stem, "the gateway")
+        text = f"nothing runs that could do this: start {starter} first (no socket {path})"
+        raise ControlError(text) from error
     except (OSError, msgspec.DecodeError) as error:
         raise ControlError(f"no answer on {path}: {error}") from error
     if not answer.ok:

@@ -15,6 +15,7 @@ from gateway.edges.hub_udp import UdpLink
 from gateway.edges.hub_udp_listen import UdpListener
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
+from gateway.routing.digest import Digest
 from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.probe import RoundTrip
@@ -24,11 +25,13 @@ from gateway.routing.trouble import TroubleWatch
 from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import (
     is_station_heartbeat,
     key_of,
     message_id_of,
     origin_of,
+    restamp,
     target_of,
 )
 
@@ -38,6 +41,8 @@ MAX_EXPRESS: Final = 1024
 """Kinds of frame a client; beyond a few hundred they are forged."""
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
+VISITS_IN_FULL: Final = 30
+"""Comings and goings at listening ports that are logged one by one in a minute."""
 
 LINKS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Link]]] = {
     EndpointKind.UDP: UdpLink,
@@ -69,6 +74,8 @@ class Hub:
         Called with the id of a client that has gone for good.
     on_trouble : callable, optional
         Called with a short text when clients come into trouble or out of it.
+    seal : callable, optional
+        Numbers, and signs, each frame of ours that leaves; without it none is signed.
     """
 
     def __init__(
@@ -79,23 +86,26 @@ class Hub:
         on_foreign: Callable[[bytes], None] | None = None,
         on_gone: Callable[[int], None] | None = None,
         on_trouble: Callable[[str], None] | None = None,
+        seal: Seal = restamp,
     ) -> None:
         self.settings = settings
+        self.seal = seal
         self.now_us = now_us
         self._on_frame = on_frame
         self._on_foreign = on_foreign
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()
-        self._fanout = Fanout()
+        self._visits = Digest(VISITS_IN_FULL, "more comings and goings at listening ports")
+        self._fanout = Fanout(seal)
         self._table = RoutingTable()
         self._guard = LoopGuard()
-        self._probe = RoundTrip()
+        self._probe = RoundTrip(seal)
         self._links: dict[int, Link] = {}
         self._express_sources: set[Link] = set()
         self._endpoints: dict[str, Link | Listener[Any]] = {}
         self._next_id = 1
-        self._vehicles = OwnVehicles()
+        self._vehicles = OwnVehicles(seal)
         self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._published = self._forwarded = self._duplicates = 0
@@ -263,7 +273,7 @@ class Hub:
         self._links[link.client_id] = link
         self._fanout.add(link.client_id, link.transmit, link.endpoint)
         self._forget_express()
-        log.info("client %s: %s", link.client_id, link.remote)
+        self._log_visit(link, f"client {link.client_id}: {link.remote}")
 
     def greet(self, link: Link) -> None:
         """Tell a peer that has just come which vehicles there are, and their homes."""
@@ -281,7 +291,7 @@ class Hub:
         self._table.forget(link.client_id)
         self._vehicles.forget(link.client_id)
         if self._links.pop(link.client_id, None):
-            log.info("client %s has gone: %s", link.client_id, link.remote)
+            self._log_visit(link, f"client {link.client_id} has gone: {link.remote}")
             if self._on_gone is not None:
                 self._on_gone(link.client_id)
         link.close()
@@ -366,10 +376,17 @@ class Hub:
         if now_us - self._trouble_us < US_PER_S:
             return
         self._trouble_us = now_us
+        for line in self._visits.poll(now_us):
+            log.info("%s", line)
         for text in self._trouble.update(self.clients(), self.listeners(), now_us):
             log.warning("%s", text)
             if self._on_trouble is not None:
                 self._on_trouble(text)
+
+    def _log_visit(self, link: Link, text: str) -> None:
+        is_caller = link.endpoint.kind in LISTENERS
+        for line in self._visits.say(text, self.now_us()) if is_caller else [text]:
+            log.info("%s", line)
 
     def _ask_round_trips(self, now_us: int) -> None:
         """Ask every client that speaks; one that does not listens to nothing but telemetry."""

@@ -2,25 +2,20 @@
 
 import asyncio
 import ipaddress
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from gateway.edges.hub_express import Express
+from gateway.edges.reasons import reason_of
 from gateway.routing.clients import ClientStats
 from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_numeric
 from gateway.routing.settings import HubSettings
 from gateway.routing.table import Origin
+from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import SplitFault
 
 Write = Callable[[bytes], object]
-
-
-def reason_of(error: OSError | ValueError) -> str:
-    """Say what went wrong, in the words of the operating system if it has some."""
-    number = getattr(error, "errno", None) or 0
-    return os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
 
 
 def not_open(data: bytes) -> int:
@@ -150,6 +145,10 @@ class HubContext(Protocol):
     @property
     def settings(self) -> HubSettings:
         """The settings of this moment."""
+
+    @property
+    def seal(self) -> Seal:
+        """Numbers, and signs, a frame of ours that leaves."""
 
     def now_us(self) -> int:
         """Return the gateway time."""

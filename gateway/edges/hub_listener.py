@@ -5,7 +5,8 @@ import logging
 import socket
 from typing import Final, Generic, TypeVar
 
-from gateway.edges.hub_link import HubContext, Link, reason_of
+from gateway.edges.hub_link import HubContext, Link
+from gateway.edges.reasons import reason_of
 from gateway.routing.clients import ListenerStats
 from gateway.routing.endpoint import Endpoint
 from gateway.units import US_PER_S

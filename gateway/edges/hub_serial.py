@@ -42,7 +42,7 @@ class SerialLink(Link):
         baud = self.endpoint.port
         self._outbox = Outbox(max(MIN_QUEUE_BYTES, round(QUEUE_S * baud / BITS_PER_BYTE)))
         self._pacer = Pacer(baud, AHEAD_US)
-        self._numbering = Numbering(self.context.is_own)
+        self._numbering = Numbering(self.context.is_own, self.context.seal)
         self._splitter = MavlinkSplitter()
         self.tick(self.context.now_us())
 

@@ -37,7 +37,7 @@ class StreamLink(Link):
         """Begin without a connection."""
         super().__post_init__()
         self._outbox = Outbox(self.context.settings.queue_bytes)
-        self._numbering = Numbering(self.context.is_own)
+        self._numbering = Numbering(self.context.is_own, self.context.seal)
         self._splitter = MavlinkSplitter()
 
     @property

@@ -1,4 +1,8 @@
-"""The live view in the terminal: link, aircraft and clients at a glance."""
+"""The live view in the terminal: link, aircraft and clients at a glance.
+
+It is made for 80 columns and upwards. Where the rows do not suffice, the end is cut off; so what
+matters most comes first, and last the rates of the messages.
+"""
 
 import logging
 import math
@@ -6,7 +10,7 @@ from collections import deque
 from typing import Final
 
 from pymavlink.dialects.v20 import common as mavlink
-from rich import box
+from rich.columns import Columns
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -22,8 +26,8 @@ UNKNOWN: Final = "—"
 LOG_LINES: Final = 5
 RATE_SNAPSHOTS: Final = 11
 """Rates are told over so many views: a message of 1 Hz must not flicker between 0 and 2."""
-RATE_COLUMNS: Final = 3
-"""Message rates stand side by side: the view must fit a terminal of 80 by 40."""
+RATE_NAME: Final = 22
+"""Letters of the longest usual name, so that names and figures stand below each other."""
 
 FLAG_WORDS: Final = (
     (NavFlags.ATTITUDE_VALID, "attitude", "green"),
@@ -77,14 +81,14 @@ class LiveView:
         parts: list[RenderableType] = [_link_line(snapshot), Text()]
         if snapshot.report.nodes:
             parts.append(_nodes(snapshot.report))
-        parts += [_aircraft(vehicle_id, state) for vehicle_id, state in snapshot.states]
+        for vehicle_id, state in snapshot.states:
+            parts += [Text(), _aircraft(vehicle_id, state), _flags(state)]
         if not snapshot.states:
-            parts.append(Text("No aircraft heard yet.\n", style="dim"))
-        if snapshot.sent:
-            parts.append(_rates(snapshot, previous))
-        parts.append(_clients(snapshot))
-        parts += _troubles(snapshot)
+            parts.append(Text("No aircraft heard yet.", style="dim"))
+        parts += [Text(), _clients(snapshot), *_ports(snapshot), *_troubles(snapshot), Text()]
         parts += [Text(line, style=style) for line, style in self.log.lines]
+        if snapshot.sent:
+            parts += [Text("MAVLink sent, Hz", style="bold italic"), _rates(snapshot, previous)]
         return Group(*parts)
 
 
@@ -108,8 +112,9 @@ def summary_line(snapshot: Snapshot) -> str:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    for number, column in enumerate(columns):
+    """Begin a table whose first column has the table's own name at its head."""
+    table = Table(box=None, pad_edge=False)
+    for number, column in enumerate((title, *columns)):
         table.add_column(column, justify="left" if number == 0 else "right")
     return table
 
@@ -130,8 +135,8 @@ def _link_line(snapshot: Snapshot) -> Text:
 
 
 def _nodes(report: LinkReport) -> Table:
-    columns = ("node", "pipe", "rate Hz", "received", "lost", "lost %", "dup", "restarts", "ppm")
-    table = _table("Radio", *columns, "age s")
+    columns = ("pipe", "rate Hz", "received", "lost", "lost %", "dup", "restarts", "ppm")
+    table = _table("node", *columns, "age s")
     for node in report.nodes:
         table.add_row(*_node_cells(node), _age(report.time_us, node.last_time_us))
     return table
@@ -161,10 +166,11 @@ def _aircraft(vehicle_id: int, state: NavState) -> Table:
     roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
     north, east, down = state.vel_n_mps
     table = _table(
-        f"Aircraft {vehicle_id}",
-        *("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "speed m/s", "climb m/s"),
+        "aircraft",
+        *("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "m/s", "climb"),
     )
     table.add_row(
+        str(vehicle_id),
         _figure(roll, "+.1f"),
         _figure(pitch, "+.1f"),
         _figure(yaw % 360.0, ".1f"),
@@ -174,28 +180,26 @@ def _aircraft(vehicle_id: int, state: NavState) -> Table:
         _figure(math.hypot(north, east), ".1f"),
         _figure(-down, "+.1f"),
     )
-    table.caption = Text("  ").join(
-        Text(word, style=style) for flag, word, style in FLAG_WORDS if flag in state.flags
-    )
-    table.caption_justify = "left"
     return table
+
+
+def _flags(state: NavState) -> Text:
+    words = [Text(word, style=style) for flag, word, style in FLAG_WORDS if flag in state.flags]
+    return Text("  ").join(words)
 
 
 def _figure(value: float, spec: str) -> str:
     return format(value, spec) if math.isfinite(value) else UNKNOWN
 
 
-def _rates(snapshot: Snapshot, previous: Snapshot) -> Table:
-    table = _table("MAVLink sent", *("message", "Hz") * RATE_COLUMNS)
+def _rates(snapshot: Snapshot, previous: Snapshot) -> Columns:
     span_s = (snapshot.time_us - previous.time_us) / US_PER_S
     before = dict(previous.sent)
-    cells = [
+    rates = [
         (_message_name(key), f"{(count - before.get(key, 0)) / span_s:.1f}" if span_s else UNKNOWN)
         for key, count in snapshot.sent
     ]
-    for start in range(0, len(cells), RATE_COLUMNS):
-        table.add_row(*(text for cell in cells[start : start + RATE_COLUMNS] for text in cell))
-    return table
+    return Columns([f"{name:<{RATE_NAME}}{rate:>6}" for name, rate in rates], padding=(0, 3))
 
 
 def _message_name(message_id: int) -> str:
@@ -204,10 +208,15 @@ def _message_name(message_id: int) -> str:
 
 
 def _clients(snapshot: Snapshot) -> Table:
-    table = _table("Clients", "client", "state", "sent", "dropped", "received", "heard s ago")
+    table = _table("client", "state", "sent", "dropped", "received", "heard s ago")
     for client in snapshot.clients:
         table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
     return table
+
+
+def _ports(snapshot: Snapshot) -> list[Text]:
+    names = [port.name for port in snapshot.listeners if port.state == "open"]
+    return [Text(f"open to others: {', '.join(names)}", style="dim")] if names else []
 
 
 def _troubles(snapshot: Snapshot) -> list[Text]:
@@ -217,7 +226,8 @@ def _troubles(snapshot: Snapshot) -> list[Text]:
 
 def _client_cells(client: ClientStats) -> tuple[str, ...]:
     figures = (client.sent, client.dropped, client.received)
-    return (client.remote or client.endpoint, client.state, *(str(figure) for figure in figures))
+    name = client.name if client.remote in client.name else f"{client.name} {client.remote}"
+    return (name, client.state, *(str(figure) for figure in figures))
 
 
 def _heard(now_us: int, client: ClientStats) -> str:

@@ -6,7 +6,7 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from gateway.edges.hub_link import reason_of
+from gateway.edges.reasons import reason_of
 from gateway.routing.clients import ClientStats, ListenerStats
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
@@ -188,8 +188,12 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
     yield "listener_open", "gauge", "A listening port takes clients.", is_open
     away: list[Sample] = [(labels, float(port.turned_away)) for labels, port in ports]
     yield "listener_turned_away_total", "counter", "Clients that found no room.", away
-    unkept: list[Sample] = [({}, float(snapshot.places_not_kept))]
-    yield "places_not_kept_total", "counter", "Missions, marks or homes not written.", unkept
+    for name, count, meaning in (
+        ("places_not_kept", snapshot.places_not_kept, "Missions, marks or homes not written."),
+        ("requests_refused", snapshot.refused, "Requests of clients that may not change anything."),
+        ("requests_forged", snapshot.forged, "Requests with a wrong, old or repeated signature."),
+    ):
+        yield f"{name}_total", "counter", meaning, [({}, float(count))]
     yield from _client_families(snapshot.clients, now_us)
 
 

@@ -17,6 +17,7 @@ from typing import Annotated, Final
 import serial
 from serial.tools import list_ports
 
+from gateway.edges.reasons import reason_of
 from gateway.settings import Settings, setting
 
 log = logging.getLogger(__name__)
@@ -187,13 +188,18 @@ class SerialLink:
 
     def _open(self) -> None:
         self._retry = None
+        device = self._settings.port
         try:
-            device = find_port(self._settings.port, list_serial_ports())
+            device = find_port(device, list_serial_ports())
             self._port = serial.Serial(
                 device, self._settings.baud, timeout=0, write_timeout=0, exclusive=True
             )
-        except (PortNotFoundError, serial.SerialException, OSError, ValueError) as error:
+        except PortNotFoundError as error:
             self._complain(str(error))
+            self._try_later()
+            return
+        except (OSError, ValueError) as error:
+            self._complain(f"receiver {device}: {reason_of(error)}")
             self._try_later()
             return
         log.info("receiver on %s at %d baud", device, self._settings.baud)
@@ -220,7 +226,7 @@ class SerialLink:
     def _broke(self, error: OSError) -> None:
         assert self._port is not None
         device = str(self._port.port)
-        self._complain(f"{device} is gone: {error}")
+        self._complain(f"receiver {device} is gone: {reason_of(error)}")
         self._release()
         self._on_lost(device)
         self._try_later()

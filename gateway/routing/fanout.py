@@ -8,18 +8,24 @@ look-up and one call per outlet.
 A frame that one outlet does not get (filtered, limited, or an answer to another client) leaves a
 gap in the sequence numbers there, which ground stations show as loss of the radio. So our own
 frames are numbered anew for those outlets: each outlet remembers how many it was not given, and
-all outlets that lack the same number share one restamped copy. Frames of other vehicles and signed
-frames are never touched; a filter on those does show as loss.
+all outlets that lack the same number share one copy, which is signed too if our vehicle signs.
+Frames of other vehicles are never touched; a filter on those does show as loss.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Final
 
 from gateway.records import ClientInterval
 from gateway.routing.endpoint import NO_MESSAGES, Endpoint
-from gateway.wire.mavlink_splitter import START_V2, key_of, message_id_of, origin_of, restamp
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import (
+    key_of,
+    message_id_of,
+    origin_of,
+    restamp,
+    sequence_of,
+)
 
 Transmit = Callable[[bytes, int], None]
 """Hands a frame and its message id to a transport."""
@@ -28,8 +34,6 @@ SEQUENCE_MASK: Final = 0xFF
 SLACK_SHIFT: Final = 2
 """A limited frame may come a quarter of its interval early, or jitter would halve the rate."""
 
-COPIES: Final = 16
-"""Restamped copies kept while one frame goes round the outlets."""
 MAX_PLANS: Final = 4096
 """A vehicle sends some fifty kinds of message; forged headers must not fill the memory."""
 
@@ -88,11 +92,28 @@ class _Plan:
     limited: list[_Lane] = field(default_factory=list)
     closed: list[_Stamp] = field(default_factory=list)
 
+    def due(self, now_us: int) -> list[_Lane]:
+        """Return who gets a frame now; those for whom it is too soon skip its number."""
+        lanes = list(self.open)
+        for lane in self.limited:
+            if lane.is_due(now_us):
+                lanes.append(lane)
+            else:
+                _skip(lane.stamp)
+        return lanes
+
 
 class Fanout:
-    """Give frames to outlets by their filters, rates and addresses."""
+    """Give frames to outlets by their filters, rates and addresses.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    seal : callable
+        Numbers, and signs, each frame of ours that leaves.
+    """
+
+    def __init__(self, seal: Seal = restamp) -> None:
+        self._seal = seal
         self._outlets: dict[int, _Outlet] = {}
         self._plans: dict[bytes, _Plan] = {}
 
@@ -122,14 +143,13 @@ class Fanout:
         """Send one of our own frames to every outlet that takes it."""
         plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
         message_id = plan.message_id
-        for lane in plan.open:
+        sequence = sequence_of(frame)
+        copies = {0: self._seal(frame, sequence)}
+        for lane in plan.due(now_us) if plan.limited else plan.open:
             skipped = lane.stamp.skipped
-            lane.transmit(_shifted(frame, skipped) if skipped else frame, message_id)
-        for lane in plan.limited:
-            if lane.is_due(now_us):
-                lane.transmit(_shifted(frame, lane.stamp.skipped), message_id)
-            else:
-                _skip(lane.stamp)
+            if skipped not in copies:
+                copies[skipped] = self._seal(frame, sequence - skipped & SEQUENCE_MASK)
+            lane.transmit(copies[skipped], message_id)
         for stamp in plan.closed:
             _skip(stamp)
 
@@ -140,7 +160,8 @@ class Fanout:
         for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
             if outlet.client_id == client_id:
-                outlet.transmit(_shifted(frame, stamp.skipped), message_id_of(frame))
+                sequence = sequence_of(frame) - stamp.skipped & SEQUENCE_MASK
+                outlet.transmit(self._seal(frame, sequence), message_id_of(frame))
             else:
                 _skip(stamp)
 
@@ -189,11 +210,3 @@ class Fanout:
 
 def _skip(stamp: _Stamp) -> None:
     stamp.skipped = (stamp.skipped + 1) & SEQUENCE_MASK
-
-
-@lru_cache(maxsize=COPIES)
-def _shifted(frame: bytes, skipped: int) -> bytes:
-    if not skipped:
-        return frame
-    sequence = frame[4] if frame[0] == START_V2 else frame[2]
-    return restamp(frame, (sequence - skipped) & SEQUENCE_MASK)

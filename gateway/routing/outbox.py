@@ -17,7 +17,8 @@ from typing import Final
 
 from gateway.routing.table import MAX_ORIGINS, Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import START_V2, origin_of, restamp
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of
 
 URGENT_IDS: Final = frozenset({0, 30, 31, 61, 69, 70, 75, 76, 77, 253})
 """HEARTBEAT, the attitudes, manual control and overrides, commands and answers, STATUSTEXT."""
@@ -47,15 +48,19 @@ class Numbering:
     Each frame keeps its step from the one before it in our own order; at the exit the steps of
     those that leave add up. So without drops every frame leaves as it came, gaps of a recording
     included, and with drops the numbers run on without a gap.
+    What is signed is signed anew, since a frame that was overtaken bears too early a stamp.
 
     Parameters
     ----------
     is_own : callable
         Tells whether an origin is one of our vehicles; frames of others are never touched.
+    seal : callable
+        Numbers, and signs, each frame of ours that leaves.
     """
 
-    def __init__(self, is_own: Callable[[Origin], bool]) -> None:
+    def __init__(self, is_own: Callable[[Origin], bool], seal: Seal = restamp) -> None:
         self._is_own = is_own
+        self._seal = seal
         self._came: dict[Origin, int] = {}
         self._left: dict[Origin, int] = {}
 
@@ -64,7 +69,7 @@ class Numbering:
         origin = origin_of(frame)
         if not self._is_own(origin):
             return None
-        sequence = frame[4] if frame[0] == START_V2 else frame[2]
+        sequence = sequence_of(frame)
         before = self._came.get(origin, sequence - 1)
         if len(self._came) < MAX_ORIGINS or origin in self._came:
             self._came[origin] = sequence
@@ -75,11 +80,10 @@ class Numbering:
         if step is None:
             return frame
         origin = origin_of(frame)
-        sequence = frame[4] if frame[0] == START_V2 else frame[2]
-        wanted = self._left.get(origin, sequence - step) + step & SEQUENCE_MASK
+        wanted = self._left.get(origin, sequence_of(frame) - step) + step & SEQUENCE_MASK
         if len(self._left) < MAX_ORIGINS or origin in self._left:
             self._left[origin] = wanted
-        return frame if wanted == sequence else restamp(frame, wanted)
+        return self._seal(frame, wanted)
 
 
 class Outbox:

@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from gateway.routing.table import Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import message_id_of, restamp
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
 LONGEST_US: Final = 60 * US_PER_S
@@ -21,9 +22,16 @@ NOBODY: Final = 0
 
 
 class RoundTrip:
-    """Ask for round trips and read the answers."""
+    """Ask for round trips and read the answers.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    seal : callable
+        Numbers, and signs, each question that leaves.
+    """
+
+    def __init__(self, seal: Seal = restamp) -> None:
+        self._seal = seal
         self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
 
@@ -53,7 +61,8 @@ class RoundTrip:
             dialect.MAVLink_ping_message(now_us, self._sender.seq, 0, 0),
             dialect.MAVLink_timesync_message(0, now_us * NS_PER_US),
         ):
-            questions.append((bytes(message.pack(self._sender)), message.id))
+            frame = bytes(message.pack(self._sender))
+            questions.append((self._seal(frame, self._sender.seq), message.id))
             self._sender.seq = (self._sender.seq + 1) % 256
         return questions
 

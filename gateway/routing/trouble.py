@@ -1,8 +1,13 @@
-"""Trouble with clients and ports, told in words: once when it comes, once when it has passed."""
+"""Trouble with clients and ports, told in words: once when it comes, once when it has passed.
+
+Every configured client has its own words. Those who call at a listening port may be anybody, and
+any number: of them only a few are named in a minute, lest an attack drown what else is told.
+"""
 
 from typing import Final
 
 from gateway.routing.clients import ClientStats, ListenerStats
+from gateway.routing.digest import Digest
 from gateway.units import US_PER_S
 
 PATIENCE_US: Final = 5 * US_PER_S
@@ -11,7 +16,8 @@ QUIET_US: Final = 30 * US_PER_S
 """A client that has dropped nothing for so long is no longer slow."""
 TROUBLED_STATES: Final = frozenset({"unreachable", "resolving", "connecting"})
 """`refused` is not among them: a ground station that is not running is nothing unusual."""
-
+CALLERS_IN_FULL: Final = 3
+"""Callers' troubles that are told one by one in a minute."""
 
 Key = int | str
 """Id of a client, or URL of a listening port."""
@@ -26,6 +32,7 @@ class TroubleWatch:
         self._dropped: dict[int, int] = {}
         """Drops at the last look, of clients that were open then."""
         self._slow_until_us: dict[int, int] = {}
+        self._callers = Digest(CALLERS_IN_FULL, "more troubles of clients of listening ports")
 
     def update(
         self,
@@ -49,15 +56,18 @@ class TroubleWatch:
         list of str
             Short texts.
         """
-        ids = {client.client_id for client in clients}
-        self._forget_all_but(ids, {listener.endpoint for listener in listeners})
-        texts = []
+        ports = {listener.endpoint for listener in listeners}
+        self._forget_all_but({client.client_id for client in clients}, ports)
+        texts = self._callers.poll(now_us)
         for listener in listeners:
             texts += self._away(listener.endpoint, listener.name, listener.reason, now_us)
         for client in clients:
             trouble = client.reason or client.state if client.state in TROUBLED_STATES else ""
-            texts += self._away(client.client_id, client.name, trouble, now_us)
-            texts += self._slow(client, now_us)
+            found = self._away(client.client_id, client.name, trouble, now_us)
+            found += self._slow(client, now_us)
+            if client.endpoint in ports:
+                found = [told for text in found for told in self._callers.say(text, now_us)]
+            texts += found
         return texts
 
     def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[str]:

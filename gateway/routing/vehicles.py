@@ -4,7 +4,8 @@ from typing import Final
 
 from gateway.routing.table import Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import START_V2, origin_of, restamp
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of
 
 HEARTBEAT_ID: Final = 0
 HOME_POSITION_ID: Final = 242
@@ -19,9 +20,15 @@ class OwnVehicles:
 
     A newcomer is greeted just before the next frame of a vehicle, with the two sequence numbers
     before it, so that its stream begins without a gap.
+
+    Parameters
+    ----------
+    seal : callable
+        Numbers, and signs, each frame of ours that leaves.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seal: Seal = restamp) -> None:
+        self._seal = seal
         self._seen_us: dict[Origin, int] = {}
         self._frames: dict[Origin, dict[int, bytes]] = {}
         self._newcomers: dict[Origin, list[int]] = {}
@@ -80,9 +87,8 @@ class OwnVehicles:
             return [], []
         known = self._frames[origin]
         ids = [message_id for message_id in GREETING if message_id in known]
-        sequence = frame[4] if frame[0] == START_V2 else frame[2]
-        first = sequence - len(ids)
+        first = sequence_of(frame) - len(ids)
         return clients, [
-            (restamp(known[message_id], first + place & 0xFF), message_id)
+            (self._seal(known[message_id], first + place & 0xFF), message_id)
             for place, message_id in enumerate(ids)
         ]

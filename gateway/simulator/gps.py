@@ -41,6 +41,14 @@ SETTLING_FACTOR: Final = 4.0
 GPS_EPOCH_UNIX_US: Final = 315_964_800_000_000
 LEAP_US: Final = 18_000_000
 WEEK_MS: Final = 604_800_000
+EARLIEST_UNIX_US: Final = 946_684_800_000_000
+LATEST_UNIX_US: Final = EARLIEST_UNIX_US + 255 * 365 * 86_400_000_000
+"""What the node's byte for the year, from 2000 on, can tell."""
+
+
+def gps_start(unix_us: int) -> int:
+    """Return the UTC that the GPS tells at a start; it knows nothing of a PC clock never set."""
+    return min(max(unix_us, EARLIEST_UNIX_US), LATEST_UNIX_US)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +102,8 @@ class GpsSampler:
     ) -> None:
         self._settings = settings
         self._trajectory = trajectory
-        self._start_unix_us = start_unix_us
-        self._epoch = -(-start_unix_us // EPOCH_US)
+        self._start_unix_us = gps_start(start_unix_us)
+        self._epoch = -(-self._start_unix_us // EPOCH_US)
         place, noise, speed, speed_noise, sky, self._latency = rng.spawn(6)
         interval_s = 1.0 / GPS_RATE_HZ
         self._position_wander = Wander(place, 1.0, WANDER_S, interval_s)

@@ -235,7 +235,8 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
     ----------
     settings : SimulatorSettings
     start_unix_us : int
-        UTC at the start, which the GPS will tell.
+        UTC at the start, which the GPS will tell; beyond the years that it can tell, 2000 to 2254,
+        it tells the nearest.
 
     Returns
     -------

@@ -16,7 +16,7 @@ import numpy as np
 
 from gateway.records import ImuFlags, NodeId
 from gateway.simulator.flight import GPS_BOOT_US, GPS_NODE, IMU_NODE, START_UNIX_US
-from gateway.simulator.gps import GPS_EPOCH_UNIX_US, LEAP_US, WEEK_MS, GpsSamples
+from gateway.simulator.gps import GPS_EPOCH_UNIX_US, LEAP_US, WEEK_MS, GpsSamples, gps_start
 from gateway.simulator.node import (
     GPS_SENSORS,
     IMU_SENSORS,
@@ -300,7 +300,7 @@ def _baro_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]
 def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
     size = len(flight.gps_time_s)
     valid_s = flight.gps_time_s - flight.gps_latency_s
-    unix_us = start_unix_us + np.rint(valid_s * 1e6).astype(np.int64)
+    unix_us = gps_start(start_unix_us) + np.rint(valid_s * 1e6).astype(np.int64)
     has_height = np.isfinite(flight.gps_alt_m)
     has_velocity = _complete(flight.gps_vel_n_mps)
     vel = np.where(has_velocity[:, np.newaxis], flight.gps_vel_n_mps, 0.0)

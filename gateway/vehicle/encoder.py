@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Outgoing
 from gateway.vehicle.fields import FLOAT32_MAX
-from gateway.vehicle.signing import SigningClock
 
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
@@ -28,29 +27,10 @@ _INTEGER_LIMITS: Final = {
 class Encoder:
     """Frames of one system id; one sequence for all its messages."""
 
-    def __init__(self, system_id: int, clock: SigningClock | None = None) -> None:
-        """Start the sequence.
-
-        Parameters
-        ----------
-        system_id : int
-        clock : SigningClock, optional
-            Dates the signatures, should there be any.
-        """
+    def __init__(self, system_id: int) -> None:
+        """Start the sequence."""
         self.system_id = system_id
         self._mav: Any = mavlink.MAVLink(None, system_id, AUTOPILOT_COMPONENT)
-        self._clock = clock
-
-    def set_key(self, key: bytes | None) -> None:
-        """Sign every frame from now on, or none; the time stamps go on growing."""
-        self._mav.signing.secret_key = key
-        self._mav.signing.sign_outgoing = key is not None
-
-    def set_time(self, now_us: int) -> None:
-        """Let the next frame's signature carry this time, or one just behind the last frame's."""
-        if self._clock is not None:
-            signing = self._mav.signing
-            signing.timestamp = max(signing.timestamp, self._clock.stamp(now_us))
 
     def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
         """Build the MAVLink 2 frame of one message.

@@ -16,6 +16,7 @@ SIGNED: Final = 0x01
 V1_OVERHEAD: Final = 8
 V2_OVERHEAD: Final = 12
 BROADCAST: Final = 0
+BAD_SIGNATURE: Final = "bad signature"
 
 
 class RequestReader:
@@ -61,7 +62,7 @@ class RequestReader:
         if self.verifier is not None:
             signed = frame[0] == V2_START and frame[2] & SIGNED
             if signed and not self.verifier.accepts(frame, now_us):
-                self.faults["bad signature"] += 1
+                self.faults[BAD_SIGNATURE] += 1
                 return None
             allowed = allowed and bool(signed)
         return Request(

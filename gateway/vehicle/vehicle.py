@@ -112,9 +112,10 @@ class Vehicle:
         self.health = Health(self.vehicle_id, settings.node_silent_s)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = SigningClock(unix_us_at_zero)
-        self._encoder = Encoder(system_id, clock=self._clock)
+        self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
-        self._passphrase = ""
+        self.signing_key: bytes | None = None
+        """What frames of this vehicle are signed with as they leave the gateway, if at all."""
         self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
         # On its own, so that strangers cannot use up what is kept for events.
@@ -191,12 +192,12 @@ class Vehicle:
         found += self._intervals.on_state(state.time_us)
         if self._calibrator.busy:
             found += self._calibrator.on_sample(sample)
-        return self._finish(found, now_us)
+        return self._finish(found)
 
-    def on_baro(self, sample: BaroSample, now_us: int) -> list[Action]:
+    def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
         """Take in one barometer sample."""
         self.health.on_baro(sample)
-        return self._finish(self._replies(self.telemetry.on_baro(sample)), now_us)
+        return self._finish(self._replies(self.telemetry.on_baro(sample)))
 
     def on_gps(self, fix: GpsFix, now_us: int) -> list[Action]:
         """Take in one GPS fix."""
@@ -207,7 +208,7 @@ class Vehicle:
             found += self._replies(self._announcements.say(Told(INFO, "Home set by GPS"), now_us))
         found += self.places.on_fix(fix, now_us)
         found += self._replies(self._announcements.on_fix(now_us))
-        return self._finish(found, now_us)
+        return self._finish(found)
 
     def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
@@ -217,7 +218,7 @@ class Vehicle:
     def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
         """Take in the state of the serial link and of all radio links."""
         self.health.on_link(report)
-        return self._finish(self._replies(self._announcements.on_link(report, now_us)), now_us)
+        return self._finish(self._replies(self._announcements.on_link(report, now_us)))
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Answer one frame of a client; one that is not for this vehicle is left alone.
@@ -240,13 +241,13 @@ class Vehicle:
         if service is None:
             return []
         if request.may_change or not service.changes_state(request):
-            return self._finish(service.handle(request, now_us), now_us)
+            return self._finish(service.handle(request, now_us))
         self.refusals += 1
         name = _describe(request)
         told = Told(NOTICE, f"Refused {name} of system {request.system_id}")
         answers = service.refuse(request)
         answers += self._replies(self._refusal_texts.say(told, now_us))
-        return self._finish(answers, now_us)
+        return self._finish(answers)
 
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""
@@ -255,7 +256,7 @@ class Vehicle:
         found += self._replies(self._announcements.poll(now_us))
         for service in self._timed:
             found += service.poll(now_us)
-        return self._finish(found, now_us)
+        return self._finish(found)
 
     def next_due_us(self) -> int:
         """Tell when `poll` is to be called next, at the latest."""
@@ -275,7 +276,7 @@ class Vehicle:
         """Note whether a recording runs, or why not; the armed bit may follow it."""
         self.health.recording = recording
         answers = self._recording.update(trouble, now_us, recording=recording)
-        return self._finish(answers, now_us) if answers else []
+        return self._finish(answers) if answers else []
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
         """Mark a place (its height may be NaN), or clear the mark.
@@ -285,17 +286,17 @@ class Vehicle:
         ValueError
             If it is no place on earth.
         """
-        return self._finish(self.places.put_mark(place, now_us), now_us)
+        return self._finish(self.places.put_mark(place, now_us))
 
     def say(self, text: Told, now_us: int) -> list[Action]:
         """Tell all an event of the gateway, such as a recording that stopped."""
-        return self._finish(self._replies(self._announcements.say(text, now_us)), now_us)
+        return self._finish(self._replies(self._announcements.say(text, now_us)))
 
-    def take_settings(self, section: str, settings: Settings, now_us: int) -> list[Action]:
+    def take_settings(self, section: str, settings: Settings) -> list[Action]:
         """Take over a section that was changed elsewhere, and tell the parameters that differ."""
         if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
             self._reconfigure(settings)
-        return self._finish(self._parameters.take(section, settings), now_us)
+        return self._finish(self._parameters.take(section, settings))
 
     def _knows(self, message_id: int) -> bool:
         return message_id in self._identity or self.telemetry.knows(message_id)
@@ -315,19 +316,17 @@ class Vehicle:
 
     def _sign_by(self, passphrase: str) -> None:
         """Sign and check by another key; what the present one has seen guards against replays."""
-        if passphrase == self._passphrase:
-            return
-        self._passphrase = passphrase
         key = key_from_passphrase(passphrase) if passphrase else None
-        self._encoder.set_key(key)
+        if key == self.signing_key:
+            return
+        self.signing_key = key
         self._reader.verifier = Verifier(key, self._clock) if key else None
 
     def _replies(self, messages: Iterable[Any]) -> list[Answer]:
         return [Reply(message) for message in messages]
 
-    def _finish(self, answers: Iterable[Answer], now_us: int) -> list[Action]:
+    def _finish(self, answers: Iterable[Answer]) -> list[Action]:
         """Encode what is still a message, and take over what concerns the vehicle itself."""
-        self._encoder.set_time(now_us)
         actions: list[Action] = []
         if self.telemetry.home is not self._told_home:
             self._told_home = self.telemetry.home

@@ -9,9 +9,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as dialect
 
-PROTOCOL_VERSION_ID: Final = 300
-PROTOCOL_VERSION_CRC_EXTRA: Final = 217
-"""The generated dialects dropped this message; ground stations still ask for it."""
+DROPPED: Final = {300: ("PROTOCOL_VERSION", 217), 397: ("COMPONENT_METADATA", 182)}
+"""Name and checksum seed of messages that the dialects lack and ground stations ask for."""
 
 NO_TARGET: Final = -1
 
@@ -30,7 +29,7 @@ def _offset_of(message: Any, field: str) -> int:
 
 CRC_EXTRA: Final[dict[int, bytes]] = {
     message_id: bytes((message.crc_extra,)) for message_id, message in dialect.mavlink_map.items()
-} | {PROTOCOL_VERSION_ID: bytes((PROTOCOL_VERSION_CRC_EXTRA,))}
+} | {message_id: bytes((extra,)) for message_id, (_, extra) in DROPPED.items()}
 """The byte that closes each message's checksum, as the checksum function wants it."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
@@ -47,6 +46,6 @@ TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
 
 MESSAGE_NAMES: Final[dict[int, str]] = {
     message_id: message.msgname for message_id, message in dialect.mavlink_map.items()
-} | {PROTOCOL_VERSION_ID: "PROTOCOL_VERSION"}
+} | {message_id: name for message_id, (name, _) in DROPPED.items()}
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}

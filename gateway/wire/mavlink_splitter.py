@@ -149,6 +149,11 @@ def is_signed(frame: bytes) -> bool:
     return frame[0] == START_V2 and bool(frame[2] & SIGNED)
 
 
+def sequence_of(frame: bytes) -> int:
+    """Return the sequence number of a frame."""
+    return frame[4] if frame[0] == START_V2 else frame[2]
+
+
 def target_of(frame: bytes) -> tuple[int, int]:
     """Return the system and component that a frame addresses; 0 is everybody.
 
@@ -166,7 +171,7 @@ def target_of(frame: bytes) -> tuple[int, int]:
 
 
 def restamp(frame: bytes, sequence: int) -> bytes:
-    """Return an unsigned frame with another sequence number and the checksum that fits.
+    """Return an unsigned frame with this sequence number and the checksum that fits.
 
     Parameters
     ----------
@@ -180,10 +185,12 @@ def restamp(frame: bytes, sequence: int) -> bytes:
     bytes
         The frame to send instead.
     """
+    at = 4 if frame[0] == START_V2 else 2
+    if frame[at] == sequence:
+        return frame
     extra = CRC_EXTRA.get(message_id_of(frame))
     if extra is None or is_signed(frame):
         return frame
-    at = 4 if frame[0] == START_V2 else 2
     body = frame[1:at] + bytes((sequence,)) + frame[at + 1 : -2]
     return frame[:1] + body + mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
 

@@ -72,6 +72,7 @@ SNAPSHOT = Snapshot(
     sent=((30, 9),),
     hub=HubCounters(published=9, looped=1),
     listeners=(OPEN, CLOSED),
+    refused=3,
 )
 
 
@@ -128,7 +129,8 @@ def test_status_for_people(gateway: Gateway) -> None:
     text = run("status").output
     assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in text
     assert "aircraft 1: 47.500000 —, — m" in text
-    assert "9 published, 1 looped" in text
+    assert "MAVLink frames: 9 published, 1 looped" in text
+    assert "requests: 3 refused" in text
     assert "tablet" in text
     assert "255.190" in text
     assert "radio: No such device" in text

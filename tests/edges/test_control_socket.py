@@ -130,8 +130,10 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
 
 
 def test_nobody_there_is_said_plainly(tmp_path: Path) -> None:
-    with pytest.raises(ControlError, match="nothing runs"):
-        request(tmp_path / "none.sock", "status")
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
+        request(tmp_path / "run.sock", "status")
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
+        request(tmp_path / "play.sock", "status")
 
 
 def test_the_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:

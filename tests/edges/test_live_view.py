@@ -66,11 +66,11 @@ SNAPSHOT = Snapshot(
 )
 
 
-def text_of(*snapshots: Snapshot) -> str:
+def text_of(*snapshots: Snapshot, width: int = 100) -> str:
     view = LiveView()
     for snapshot in snapshots:
         drawn = view.draw(snapshot)
-    console = Console(width=100, no_color=True)
+    console = Console(width=width, no_color=True)
     with console.capture() as captured:
         console.print(drawn)
     return captured.get()
@@ -93,6 +93,24 @@ def test_link_node_aircraft_and_client_are_shown() -> None:
         "127.0.0.1:14550",
     ):
         assert part in text
+
+
+def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
+    far = replace(FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6)
+    long = replace(CLIENT, sent=123_456_789, dropped=1_234_567, received=1_234_567)
+    port = ListenerStats("udp-listen:127.0.0.1:14551", "", "open", "", 14551, 0, 0)
+    sent = tuple((number, 9) for number in (0, 1, 2, 24, 29, 30, 31, 33, 42, 62, 74, 105, 230))
+    full = replace(SNAPSHOT, states=((1, far),), clients=(long,), listeners=(port,), sent=sent)
+    text = text_of(full, width=80)
+    for part in ("-77.123456", "-170.123456", "12345.6", "123456789", "1234567", port.name):
+        assert part in text
+    assert "…" not in text
+    assert len(text.splitlines()) <= 24
+
+
+def test_a_client_is_called_by_its_name() -> None:
+    tablet = replace(CLIENT, name="tablet", remote="10.0.0.7:14550")
+    assert "tablet 10.0.0.7:14550" in text_of(replace(SNAPSHOT, clients=(tablet,)))
 
 
 def test_rates_are_those_since_the_previous_view() -> None:

@@ -63,6 +63,8 @@ SNAPSHOT = Snapshot(
     listeners=(
         ListenerStats("here", "tcp-listen:0.0.0.0:1?name=here", "closed", "taken", 0, 0, 4),
     ),
+    refused=5,
+    forged=6,
 )
 PORT = '{name="here",endpoint="tcp-listen:0.0.0.0:1?name=here"}'
 LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
@@ -83,6 +85,8 @@ LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
         f"mavgate_client_open{LABELS} 1",
         f"mavgate_listener_open{PORT} 0",
         f"mavgate_listener_turned_away_total{PORT} 4",
+        "mavgate_requests_refused_total 5",
+        "mavgate_requests_forged_total 6",
     ],
 )
 def test_samples(line: str) -> None:

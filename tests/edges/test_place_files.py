@@ -1,5 +1,6 @@
 """Files of places: whole or not at all, told when not, and left alone when broken."""
 
+import asyncio
 import errno
 import os
 from collections.abc import AsyncIterator, Callable
@@ -8,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from gateway.edges import place_files
 from gateway.edges.place_files import PlaceFiles
 from gateway.vehicle.home import Place
 from gateway.vehicle.stored import StoredPlaces
@@ -21,7 +23,7 @@ SECOND = StoredPlaces(mark=Place(4.0, 5.0, 6.0))
 class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.told: list[tuple[int, str]] = []
+        self.told: list[tuple[int, str | None]] = []
         self.files = PlaceFiles(folder, lambda *told: self.told.append(told))
 
     async def save(self, vehicle_id: int, places: StoredPlaces) -> None:
@@ -84,6 +86,48 @@ async def test_a_disk_that_refuses_is_counted_and_told(
     assert bench.read() == {1: FIRST}, "the old file is whole"
     await bench.save(1, SECOND)
     assert bench.read() == {1: SECOND}
+    assert bench.told[1:] == [(1, None)]
+
+
+async def test_what_could_not_be_written_is_tried_again_and_told_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = []
+    fsync: Callable[[int], None] = os.fsync
+
+    def ill(fd: int) -> None:
+        attempts.append(fd)
+        if len(attempts) < 5:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", ill)
+    monkeypatch.setattr(place_files, "RETRY_S", 0)
+    await bench.save(1, FIRST)
+    assert len(attempts) == 1, "the next attempt is not made at once"
+    async with asyncio.timeout(10):
+        while bench.told[-1:] != [(1, None)]:
+            await asyncio.sleep(0)
+    assert bench.told == [(1, "Input/output error"), (1, None)]
+    assert bench.files.failures == 1
+    assert bench.read() == {1: FIRST}
+    assert bench.files._retry is None
+
+
+async def test_one_that_cannot_be_written_holds_up_no_other(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await bench.save(2, FIRST)
+    file = bench.folder / "1.places.json"
+    file.write_text("{")
+    bench.files.load()
+    bench.files.save(1, FIRST)
+    await bench.save(2, SECOND)
+    assert bench.files.broken == {1: "1.places.json is broken: mend or remove it"}
+    file.unlink()
+    assert bench.read() == {2: SECOND}
+    await bench.save(2, FIRST)
+    assert bench.read() == {1: FIRST, 2: FIRST}, "what waited went with it"
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"version": 7}'])

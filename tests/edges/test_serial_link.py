@@ -142,6 +142,8 @@ async def test_unplugged_and_plugged_again(
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warnings) == len(set(warnings)), "each trouble is told once"
     assert any("is gone" in text for text in warnings)
+    missing = f"receiver {bench.link}: No such file or directory; trying again until it works"
+    assert missing in warnings
 
 
 @pytest.mark.io

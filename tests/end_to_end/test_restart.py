@@ -2,7 +2,10 @@
 
 import asyncio
 import socket
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -45,26 +48,54 @@ def find(port: int) -> tuple[int, int, int]:
     return home.latitude, home.longitude, home.altitude
 
 
-async def test_missions_and_home_survive_a_restart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compile_everything()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def hear_of_trouble(port: int) -> list[str]:
+    """Connect before the aircraft is heard; return what it says, its texts in words."""
+    station = Station(socket.SOCK_STREAM, port, 2)
+    end_s, told = time.monotonic() + 30.0, [""]
+    while "1.places.json" not in told[-1] and time.monotonic() < end_s:
+        told += [getattr(m, "text", m.get_type()) for m in station.wait(0.1)]
+        told = told[: next((n + 1 for n, t in enumerate(told) if "1.places.json" in t), None)]
+    station.close()
+    return told
+
+
+async def run(folder: Path, use: Callable[[int], Any]) -> Any:
+    """Let the gateway run for as long as somebody uses its TCP port."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     settings = GatewaySettings(
         hub=HubSettings(endpoints=(f"tcp-listen:127.0.0.1:{port}",)),
-        aircraft_folder=str(tmp_path / "aircraft"),
+        aircraft_folder=str(folder / "aircraft"),
     )
-    for use in (store, find):
-        line = simulate(settings.simulator, START_UNIX_US).frames()
-        daemon = Daemon(settings, {}, lambda: settings, line)
-        daemon.start()
-        try:
-            found = await asyncio.to_thread(use, port)
-        finally:
-            daemon.close()
+    line = simulate(settings.simulator, START_UNIX_US).frames()
+    daemon = Daemon(settings, {}, lambda: settings, line)
+    daemon.start()
+    try:
+        return await asyncio.to_thread(use, port)
+    finally:
+        daemon.close()
         # The event loop ends the readers of what was closed.
         await asyncio.sleep(0)
-    assert found == (475_000_000, 85_000_000, 400_000)
-    assert [f.name for f in (tmp_path / "aircraft").iterdir()] == ["1.places.json"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    compile_everything()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+async def test_a_broken_file_is_told_when_the_aircraft_appears(folder: Path) -> None:
+    file = folder / "aircraft" / "1.places.json"
+    file.parent.mkdir()
+    file.write_text("{")
+    told = await run(folder, hear_of_trouble)
+    assert told[-1].startswith("Mission, mark and home not kept: 1.places.json")
+    assert "HEARTBEAT" in told, "before which ground stations hear nothing"
+    assert file.read_text() == "{"
+
+
+async def test_missions_and_home_survive_a_restart(folder: Path) -> None:
+    await run(folder, store)
+    assert await run(folder, find) == (475_000_000, 85_000_000, 400_000)
+    assert [f.name for f in (folder / "aircraft").iterdir()] == ["1.places.json"]

@@ -101,3 +101,23 @@ def test_a_client_that_left_is_forgotten() -> None:
     assert look(watch, (), 11 * S) == []
     assert not watch._away_told
     assert not watch._dropped
+
+
+def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
+    watch, port = TroubleWatch(), "udp-listen:0.0.0.0:14551"
+    listeners = (ListenerStats("port", port, "open", "", 14551, 0, 0),)
+    texts = []
+    for n in range(100):
+        strangers = tuple(
+            dataclasses.replace(
+                CLIENT, client_id=100 + number, name=f"stranger {number}", endpoint=port, dropped=n
+            )
+            for number in range(n * 10, n * 10 + 20)
+        )
+        clients = (*client(dropped=100 * (n >= 50)), *strangers)
+        texts += watch.update(clients, listeners, n * S)
+    assert texts.count("tablet is too slow: telemetry dropped") == 1
+    assert len([text for text in texts if text.startswith("stranger")]) == 2 * 3
+    (summed,) = [text for text in texts if "more troubles" in text]
+    assert int(summed.split()[0]) > 500
+    assert len(texts) == 8

@@ -3,6 +3,7 @@
 import gc
 import itertools
 import tracemalloc
+from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
@@ -165,6 +166,19 @@ class TestThroughTheWire:
         assert {(n.node.vehicle_id, n.node.node_id, n.pipe) for n in nodes} == {
             (7, 0, 0), (7, 1, 1), (8, 0, 2), (8, 1, 3), (9, 0, 4), (9, 1, 5)
         }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("start_unix_us", "year"), [(0, 2000), (-(10**15), 2000), (10**18, 2254), (8 * 10**15, 2223)]
+)
+def test_a_clock_that_was_never_set_does_not_stop_the_simulator(
+    start_unix_us: int, year: int
+) -> None:
+    line = list(simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0))
+    link = Link()
+    records = [record for frame in line for record in link.feed(frame.data, 0)]
+    told = [r.utc_us for r in records if isinstance(r, GpsFix) and r.utc_us is not None]
+    assert {datetime.fromtimestamp(us / 1e6, UTC).year for us in told} == {year}
 
 
 def test_vehicle_ids_must_fit_the_protocol() -> None:

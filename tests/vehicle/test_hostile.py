@@ -134,3 +134,40 @@ def _size_of(root: object) -> int:
         slots = getattr(type(item), "__slots__", ())
         pending += [getattr(item, s) for s in slots if isinstance(s, str) and hasattr(item, s)]
     return total
+
+
+def test_every_command_is_acknowledged_once_to_the_one_who_asked(station: GroundStation) -> None:
+    known = set(mavlink.enums["MAV_CMD"]) - {mavlink.MAV_CMD_LOGGING_START}
+    asked = sorted((known | set(range(0, 65_536, 37))) & set(range(65_536)))
+    for number in asked:
+        station.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *[0] * 7))
+        station.wait(0.001)
+    acks = [m for m in station.inbox if m.get_type() == "COMMAND_ACK"]
+    begun = [m.command for m in acks if m.result == mavlink.MAV_RESULT_IN_PROGRESS]
+    assert begun == [mavlink.MAV_CMD_LOGGING_STOP] * len(begun)
+    ended = [m.command for m in acks if m.result != mavlink.MAV_RESULT_IN_PROGRESS]
+    assert sorted({*ended, *begun}) == asked
+    assert len(ended) + len(begun) == len(acks) == len(asked)
+    told = {frame.client_id for frame in station.frames if frame.message_id == 77}
+    assert told == {station.client_id}
+
+
+def test_a_flood_for_the_parameters_is_one_list_and_not_a_thousand(
+    station: GroundStation,
+) -> None:
+    ask = mavlink.MAVLink_param_request_list_message(1, 1)
+    for _ in range(1000):
+        station.send(ask)
+    station.inbox.clear()
+    found = [m for m in station.wait(60.0) if m.get_type() == "PARAM_VALUE"]
+    count = found[-1].param_count
+    assert len(found) <= count
+    assert found[-1].param_index == count - 1
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 255])
+def test_a_mission_of_65535_items_is_refused_at_once(station: GroundStation, kind: int) -> None:
+    (answer,) = station.send(mavlink.MAVLink_mission_count_message(1, 1, 65_535, kind))
+    assert answer.get_type() == "MISSION_ACK"
+    assert answer.type in (mavlink.MAV_MISSION_NO_SPACE, mavlink.MAV_MISSION_UNSUPPORTED)
+    assert [m for m in station.wait(20.0) if m.get_type() == "MISSION_REQUEST_INT"] == []

@@ -10,7 +10,8 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.edges.hub import Hub
 from gateway.records import Incoming, Outgoing
 from gateway.routing.settings import HubSettings
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import message_id_of, restamp
 
 STATION = 190
 
@@ -98,9 +99,9 @@ class Rig:
         self.vehicle = Sender(1, 1)
         self.closing: list[Callable[[], object]] = []
 
-    def hub(self, *endpoints: str, **settings: object) -> Hub:
+    def hub(self, *endpoints: str, seal: Seal = restamp, **settings: object) -> Hub:
         wanted = HubSettings(endpoints=endpoints, **settings)  # type: ignore[arg-type]
-        hub = Hub(wanted, self.incoming.append, self.clock, self.foreign.append)
+        hub = Hub(wanted, self.incoming.append, self.clock, self.foreign.append, seal=seal)
         self.closing.append(hub.close)
         hub.start()
         return hub

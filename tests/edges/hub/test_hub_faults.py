@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import shutil
 import signal
@@ -13,6 +14,9 @@ from typing import Any
 
 import msgspec
 import pytest
+
+from gateway.edges.hub import VISITS_IN_FULL
+from gateway.routing.digest import WINDOW_US
 
 pytestmark = pytest.mark.io
 
@@ -141,6 +145,31 @@ async def test_odd_datagrams_rain(rig: Any) -> None:
     assert len(flight.hub.clients()) == 3
 
 
+@pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
+async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
+    flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
+    await flight.start()
+    with socket.create_connection(("127.0.0.1", flight.hub.listening_ports()[1])) as rude:
+        await rig.until(lambda: len(flight.hub.clients()) == 4)
+        rude.setblocking(False)
+        for _ in range(50):
+            with contextlib.suppress(BlockingIOError):
+                rude.send(garbage * (20_000 // len(garbage)))
+            with contextlib.suppress(BlockingIOError):
+                rude.recv(1 << 20)
+            await flight.fly(20)
+        assert await flight.lost() == 0
+        client = flight.hub.clients()[-1]
+        assert client.bytes_garbage > 100_000
+        assert client.received == 0
+        said = rig.sender(200, 190).heartbeat()
+        while not flight.hub.clients()[-1].received:
+            # What looks like the head of a frame swallows the first ones.
+            with contextlib.suppress(BlockingIOError):
+                rude.send(said)
+            await flight.fly(1)
+
+
 @pytest.mark.parametrize("room", [16, 100])
 async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
     flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
@@ -204,3 +233,21 @@ async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
     before_and_after = seen["far end could hear"]
     assert before_and_after - 50 <= seen["far end heard"] <= before_and_after
     assert seen["far end heard"] >= seen["sent after"] - 5
+
+
+async def test_strangers_without_number_do_not_flood_the_log(
+    rig: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="gateway")
+    many = VISITS_IN_FULL + 10
+    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
+    for _ in range(many):
+        stranger = rig.station(hub.listening_ports()[0])
+        stranger.say(stranger.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == many)
+    assert len(caplog.messages) == VISITS_IN_FULL
+    hub.add("udp:127.0.0.1:9")
+    assert caplog.messages[-1].endswith("127.0.0.1:9"), "who is configured is always named"
+    rig.clock.us += WINDOW_US
+    rig.tick(hub)
+    assert "10 more comings and goings at listening ports" in caplog.messages
