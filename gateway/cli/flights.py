@@ -58,6 +58,9 @@ Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 Line = TableRow | TableHeader | FusionState
 
 
+NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
+
+
 class FlightError(Exception):
     """A file that does not hold what a command needs; the text says what and where."""
 

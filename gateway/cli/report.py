@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.sources import with_latency
@@ -21,6 +20,7 @@ from gateway.cli.loading import (
 )
 from gateway.cli.recording_files import ColumnsOption, SettingsOption
 from gateway.cli.run import ConfigOption, load_settings, or_refuse
+from gateway.cli.terminal import console_of
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
@@ -74,8 +74,11 @@ def report(
         others = fusion_of(or_refuse(lambda: load_settings(against_config)))
         if flight is None:
             others = with_latency(others, loaded.latency_s)
-    console = Console(stderr=True)
-    with Progress(*COLUMNS, console=console, transient=True, auto_refresh=False) as progress:
+    console = console_of(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(
+        *COLUMNS, console=console, transient=True, auto_refresh=False, disable=hidden
+    ) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
         case = make_case(loaded)

@@ -8,7 +8,6 @@ from typing import Final
 import msgspec
 import pandas as pd
 from rich import box
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -24,6 +23,7 @@ from gateway.analysis.sweep import COLUMN_OF, Axis, Contest, Metric, SweepError,
 from gateway.analysis.workers import Run, pool
 from gateway.cli.errors import refuse
 from gateway.cli.loading import Loading, load_flight
+from gateway.cli.terminal import console_of
 from gateway.config import GatewaySettings, render
 
 SHOWN: Final = 10
@@ -98,9 +98,10 @@ def _axes(wish: Wish) -> list[Axis]:
 
 
 def _progress() -> Progress:
+    console = console_of(stderr=True)
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=Console(stderr=True), transient=True,
+        console=console, transient=True, disable=not console.is_terminal,
     )  # fmt: skip
 
 
@@ -140,7 +141,7 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
         shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
     for row in results[names].head(SHOWN).itertuples(index=False):
         shown.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row))
-    Console().print(shown)
+    console_of().print(shown)
 
 
 def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:

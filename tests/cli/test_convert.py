@@ -235,10 +235,10 @@ def test_info_for_people(tlog: Path) -> None:
 def test_info_of_what_is_no_recording(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.tlog"
     path.write_bytes(content)
-    if content:
-        assert "holds no MAVLink" in " ".join(run("info", path, code=2).split())
-    else:
-        assert "0 records" in run("info", path)
+    for command in ("info", "recover", "play"):
+        assert f"{path}: is no recording" in run(command, path, code=2)
+    assert f"{path}: is no recording" in run("convert", path, "-o", tmp_path / "x.kml", code=2)
+    assert not list(tmp_path.glob("x.*.tlog"))
     assert "No such file" in run("info", tmp_path / "none.tlog", code=2)
 
 
