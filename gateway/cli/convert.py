@@ -32,7 +32,14 @@ from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.row import TableRow, row_to_line
-from gateway.flightlog.table import TableHeader, encode_head, encode_header, encode_state
+from gateway.flightlog.table import (
+    TableHeader,
+    TableMark,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_state,
+)
 from gateway.flightlog.tlog import TlogRecord, encode_record
 from gateway.records import FusionState
 
@@ -150,6 +157,8 @@ def _table_text(table: Table) -> Iterator[bytes]:
                 lines.append(row_to_line(row))
             case TableHeader():
                 lines.append(encode_header(row))
+            case TableMark():
+                lines.append(encode_mark(row))
             case FusionState():
                 lines.append(encode_state(row))
         if len(lines) == LINES:

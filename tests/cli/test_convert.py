@@ -320,3 +320,15 @@ def test_record_without_a_gateway(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["first flight_01.tlog"]
     run("record", "delete", "last", "--yes", "-c", config)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [[], ["--fuse"]])
+def test_remarks_stay_in_their_place(table: Path, tmp_path: Path, options: list[str]) -> None:
+    mark = '# mark: {"time_us":123456,"text":"over the wood"}'
+    lines = table.read_text().splitlines()
+    lines.insert(len(lines) // 2, mark)
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, *options)
+    assert out.read_text().splitlines().index(mark) == lines.index(mark)
+    run("convert", table, "-o", tmp_path / "again.tlog")
