@@ -39,6 +39,7 @@ def status(*, json: JsonOption = False) -> None:
     console = console_of()
     console.print(_summary(snapshot), markup=False)
     if nodes := snapshot["report"]["nodes"]:
+        console.print()
         console.print(_nodes(nodes))
     _print_clients(console, snapshot)
 
@@ -124,7 +125,9 @@ def _nodes(nodes: Sequence[Record]) -> Table:
 
 def _print_clients(console: Console, snapshot: Record) -> None:
     if listeners := snapshot["listeners"]:
+        console.print()
         console.print(_listeners(listeners))
+    console.print()
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
         if client["reason"]:

@@ -1,5 +1,6 @@
 """`mavgate report`: figures and tables of a flight as one page."""
 
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -58,7 +59,8 @@ def report(
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        refuse(f"a report needs {' and '.join(missing)}: install mavgate[plot]")
+        install = f"{sys.executable} -m pip install {' '.join(missing)}"
+        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")
     # These need what may be missing, and take a second to load.
     from gateway.analysis.case import make_case
     from gateway.analysis.page import count_pictures, write_report
