@@ -75,6 +75,7 @@ def refusing() -> Iterator[None]:
     except FileExistsError as error:
         refuse(f"{error.filename}: is there already; --force overwrites it")
     except OSError as error:
-        refuse(f"{error.filename or 'disk'}: {error.strerror}")
+        file = str(error.filename or "disk").removesuffix(".partial")
+        refuse(f"{file}: {error.strerror}")
     except FlightError as error:
         refuse(str(error))

@@ -19,7 +19,7 @@ from gateway.cli.loading import (
     fusion_of,
     load_flight,
 )
-from gateway.cli.recording_files import ColumnsOption, SettingsOption
+from gateway.cli.recording_files import ColumnsOption, SettingsOption, refusing
 from gateway.cli.run import ConfigOption, load_settings, or_refuse
 from gateway.cli.terminal import console_of
 
@@ -93,5 +93,6 @@ def report(
             progress.advance(task)
             progress.refresh()
 
-        page = write_report(made, output, advance)
+        with refusing():
+            page = write_report(made, output, advance)
     print(page)

@@ -23,6 +23,7 @@ from gateway.analysis.sweep import COLUMN_OF, Axis, Contest, Metric, SweepError,
 from gateway.analysis.workers import Run, pool
 from gateway.cli.errors import refuse
 from gateway.cli.loading import Loading, load_flight
+from gateway.cli.recording_files import refusing
 from gateway.cli.terminal import console_of
 from gateway.config import GatewaySettings, render
 
@@ -77,12 +78,14 @@ def run_sweep(path: Path | None, loading: Loading, wish: Wish) -> None:
         results = sweeping.tabulate(contest.keys, trials, wish.metric)
     except SweepError as error:
         refuse(str(error))
-    if wish.table is not None:
-        results.to_csv(wish.table, index=False)
     _show(results, contest, wish.metric)
     best = tuple(results.iloc[0][list(contest.keys)])
-    wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
-    print(wish.output)
+    with refusing():
+        wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
+        print(wish.output)
+        if wish.table is not None:
+            with wish.table.open("w", encoding="utf-8", newline="") as table:
+                results.to_csv(table, index=False)
 
 
 def _axes(wish: Wish) -> list[Axis]:
