@@ -8,7 +8,6 @@
 """
 
 import asyncio
-import errno
 import logging
 import os
 from collections.abc import Callable
@@ -38,14 +37,6 @@ KNOWN_ADAPTERS: Final = {
     (0x2341, 0x0001): "Arduino Uno",
 }
 """USB serial chips that stand on Arduino-class boards and programming cables."""
-
-
-ADVICE: Final = {
-    errno.EACCES: "the group that owns it may, often dialout: sudo usermod -aG dialout $USER, then "
-    "log in anew",
-    errno.EAGAIN: "another program reads it: close that first",
-}
-"""What helps where a port is there but cannot be opened."""
 
 
 class SerialSettings(Settings, frozen=True):
@@ -138,12 +129,6 @@ def find_port(wanted: str, ports: list[Port]) -> str:
     raise PortNotFoundError(f"no port fits {wanted!r}; this machine has {seen}")
 
 
-def _with_advice(error: Exception) -> str:
-    """Tell what was wrong with a port, and what helps."""
-    number = getattr(error, "errno", None)
-    return f"{error}{f' ({ADVICE[number]})' if number in ADVICE else ''}"
-
-
 class SerialLink:
     """Keep one serial port open and hand on what it says.
 
@@ -208,7 +193,7 @@ class SerialLink:
                 device, self._settings.baud, timeout=0, write_timeout=0, exclusive=True
             )
         except (PortNotFoundError, serial.SerialException, OSError, ValueError) as error:
-            self._complain(_with_advice(error))
+            self._complain(str(error))
             self._try_later()
             return
         log.info("receiver on %s at %d baud", device, self._settings.baud)

@@ -1,7 +1,6 @@
 """The serial port: choice, unplugging, coming back."""
 
 import asyncio
-import errno
 import os
 import tty
 from collections.abc import Iterator
@@ -15,7 +14,6 @@ from gateway.edges.serial_link import (
     PortNotFoundError,
     SerialLink,
     SerialSettings,
-    _with_advice,
     find_port,
 )
 
@@ -172,28 +170,3 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
     assert delays == [0.25, 0.5, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0]
     assert delays[-1] == LONGEST_RETRY_S
     link.close()
-
-
-@pytest.mark.io
-async def test_a_port_that_another_program_reads_is_told_as_such(
-    bench: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
-    bench.plug()
-    settings = SerialSettings(port=str(bench.link))
-    links = [
-        SerialLink(settings, lambda *_: None, lambda _: None, lambda _: None, lambda: 0)
-        for _ in range(2)
-    ]
-    for link in links:
-        link.start()
-    assert [link.connected for link in links] == [True, False]
-    assert "another program reads it" in caplog.text
-    for link in links:
-        link.close()
-
-
-def test_who_may_not_open_a_port_is_told_what_helps() -> None:
-    told = _with_advice(PermissionError(errno.EACCES, "Permission denied", "/dev/ttyUSB0"))
-    assert "/dev/ttyUSB0" in told
-    assert "dialout" in told
-    assert _with_advice(OSError(errno.ENOENT, "No such file")) == "[Errno 2] No such file"
