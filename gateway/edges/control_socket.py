@@ -218,10 +218,7 @@ def request(
             with link.makefile("rb") as lines:
                 answer = msgspec.json.decode(lines.readline(), type=_Answer)
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise ControlError(
-            f"nothing runs that could do this: start `mavgate {path.stem}` first "
-            f"(nobody listens on {path})"
-        ) from error
+        raise ControlError(f"nothing runs that could do this (no socket {path})") from error
     except (OSError, msgspec.DecodeError) as error:
         raise ControlError(f"no answer on {path}: {error}") from error
     if not answer.ok:
