@@ -107,8 +107,8 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load(tmp_path / "missing.toml")
     file = tmp_path / "latin.toml"
-    file.write_bytes(b'port = "\xff"')
-    with pytest.raises(ConfigError, match="cannot be read"):
+    file.write_bytes(b'# speed\nport = "\xff"')
+    with pytest.raises(ConfigError, match="line 2: is not UTF-8"):
         load(file)
 
 

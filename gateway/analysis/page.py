@@ -53,7 +53,7 @@ class Table:
 
     def _text(self, value: object) -> str:
         if isinstance(value, float):
-            return "–" if value != value else f"{value:.{self.digits}f}"
+            return "–" if value != value else f"{value:z.{self.digits}f}"
         return str(value)
 
 

@@ -10,13 +10,13 @@ from typing import Annotated, Final
 import msgspec
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.errors import refuse
 from gateway.cli.flights import Wishes, open_rows
 from gateway.cli.recording_files import refusing
 from gateway.cli.run import ConfigOption, read_aircraft, read_settings
+from gateway.cli.terminal import console_of
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock
 from gateway.edges.serial_link import SerialLink, SerialSettings
@@ -43,7 +43,7 @@ REST_S: Final = 5.0
 MAG_S: Final = 45.0
 MAX_TRIES: Final = 24
 
-console = Console(highlight=False)
+console = console_of()
 
 
 class Step(StrEnum):

@@ -5,11 +5,11 @@ from typing import Annotated, Any, Final
 
 import msgspec
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.record import JsonOption, ask
+from gateway.cli.terminal import NEGATIVE_NUMBERS, console_of, table_of
 from gateway.units import US_PER_S
 
 PANEL: Final = "A gateway that runs"
@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command(rich_help_panel=PANEL)(status)
     app.add_typer(group, name="clients", rich_help_panel=PANEL)
-    app.command(rich_help_panel=PANEL)(mark)
+    app.command(rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(mark)
     app.command(rich_help_panel=PANEL)(reload)
 
 
@@ -36,8 +36,8 @@ def status(*, json: JsonOption = False) -> None:
     if json:
         print(msgspec.json.encode(snapshot).decode())
         return
-    console = Console()
-    console.print(_summary(snapshot), highlight=False)
+    console = console_of()
+    console.print(_summary(snapshot), markup=False)
     if nodes := snapshot["report"]["nodes"]:
         console.print()
         console.print(_nodes(nodes))
@@ -50,7 +50,7 @@ def list_clients(*, json: JsonOption = False) -> None:
     if json:
         print(msgspec.json.encode(ask("clients.list")).decode())
         return
-    _print_clients(Console(), ask("status"))
+    _print_clients(console_of(), ask("status"))
 
 
 @group.command()
@@ -72,10 +72,8 @@ def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -
 
 
 def mark(
-    lat_deg: Annotated[
-        float | None, typer.Argument(help="Latitude; write `mavgate mark -- -7.8 110.4` if south.")
-    ] = None,
-    lon_deg: Annotated[float | None, typer.Argument(help="Longitude.")] = None,
+    lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
+    lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
     *,
     alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
     aircraft: Annotated[
@@ -119,7 +117,7 @@ def _summary(snapshot: Record) -> str:
 
 
 def _nodes(nodes: Sequence[Record]) -> Table:
-    table = _table("node", "rate Hz", "received", "lost", "restarts")
+    table = table_of("node", "rate Hz", "received", "lost", "restarts")
     for node in nodes:
         table.add_row(
             f"{node['node']['vehicle_id']}.{node['node']['node_id']}",
@@ -141,7 +139,7 @@ def _print_clients(console: Console, snapshot: Record) -> None:
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:
-    table = _table("listening", "state", "clients", "turned away")
+    table = table_of("listening", "state", "clients", "turned away")
     for port in listeners:
         figures = (str(port[key]) for key in ("clients", "turned_away"))
         table.add_row(port["name"], port["reason"] or port["state"], *figures)
@@ -149,9 +147,7 @@ def _listeners(listeners: Sequence[Record]) -> Table:
 
 
 def _clients(clients: Sequence[Record], now_us: int) -> Table:
-    table = _table(
-        "client", "state", "sent", "dropped", "waiting", "received", "heard s", "trip ms"
-    )
+    table = table_of("client", "state", "sent", "dropped", "queued", "received", "age s", "trip ms")
     for client in clients:
         heard_us, trip_us = client["heard_us"], client["round_trip_us"]
         table.add_row(
@@ -161,14 +157,6 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
             UNKNOWN if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.1f}",
             UNKNOWN if trip_us is None else f"{trip_us / US_PER_MS:.1f}",
         )
-    return table
-
-
-def _table(*columns: str) -> Table:
-    # No padding: the table of clients fits a terminal of 80 columns.
-    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     return table
 
 

@@ -7,11 +7,10 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
-from rich.console import Console
 
 from gateway.cli import flights
 from gateway.cli.errors import refuse
-from gateway.cli.flights import FlightError, Line, Table, Wishes, open_rows
+from gateway.cli.flights import NO_RECORDING, FlightError, Line, Table, Wishes, open_rows
 from gateway.cli.recording_files import (
     PANEL,
     ColumnsOption,
@@ -28,11 +27,19 @@ from gateway.cli.recording_files import (
 )
 from gateway.cli.refusion import Refusion
 from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.terminal import console_of
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.row import TableRow, row_to_line
-from gateway.flightlog.table import TableHeader, encode_head, encode_header, encode_state
+from gateway.flightlog.table import (
+    TableHeader,
+    TableMark,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_state,
+)
 from gateway.flightlog.tlog import TlogRecord, encode_record
 from gateway.records import FusionState
 
@@ -95,12 +102,16 @@ def convert(
             pieces = _fused_again(refusion, out, limits)
         size = write_new(out, pieces, overwrite=force)
     for remark in refusion.remarks if refusion else ():
-        Console(stderr=True, highlight=False).print(remark)
-    Console(highlight=False).print(f"{out}: {size / 1e6:.3f} MB")
+        console_of(stderr=True).print(remark, markup=False)
+    console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)
 
 
 def _from_tlogs(files: list[Path], out: Path, wishes: Wishes, limits: Limits) -> Iterator[bytes]:
-    records = _within(flights.recorded_frames(files, wishes.progress), limits)
+    recorded = flights.recorded_frames(files, wishes.progress)
+    first = next(recorded, None)
+    if first is None:
+        raise FlightError(f"{', '.join(map(str, files))}: {NO_RECORDING}")
+    records = _within(chain([first], recorded), limits)
     if out.suffix == ".tlog":
         return _tlog_bytes(records)
     return _map_shape(out, flights.points_of_frames(records, wishes.system_id))
@@ -146,6 +157,8 @@ def _table_text(table: Table) -> Iterator[bytes]:
                 lines.append(row_to_line(row))
             case TableHeader():
                 lines.append(encode_header(row))
+            case TableMark():
+                lines.append(encode_mark(row))
             case FusionState():
                 lines.append(encode_state(row))
         if len(lines) == LINES:

@@ -3,7 +3,8 @@
 from typing import NoReturn
 
 import typer
-from rich.console import Console
+
+from gateway.cli.terminal import console_of
 
 
 def refuse(text: str) -> NoReturn:
@@ -14,6 +15,6 @@ def refuse(text: str) -> NoReturn:
     text : str
         What was wrong, where, and what to do; one or more lines.
     """
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = console_of(stderr=True)
     console.print(text, style="red", markup=False, emoji=False)
     raise typer.Exit(2)

@@ -26,7 +26,7 @@ from gateway.flightlog.mapshape import TrackPoint
 from gateway.flightlog.row import RowBuilder, TableRow
 from gateway.flightlog.stamps import JUMP_US
 from gateway.flightlog.summary import payload_of
-from gateway.flightlog.table import TableHeader, TableReader
+from gateway.flightlog.table import TableHeader, TableMark, TableReader
 from gateway.flightlog.tlog import TlogRecord
 from gateway.pipeline import PipelineSettings
 from gateway.records import (
@@ -55,7 +55,10 @@ SettingsChoice = Literal["recorded", "current"]
 Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 
 
-Line = TableRow | TableHeader | FusionState
+Line = TableRow | TableHeader | TableMark | FusionState
+
+
+NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
 
 
 class FlightError(Exception):
@@ -85,7 +88,7 @@ class Table:
     header: TableHeader
     rows: Iterator[Line]
     """A header among them tells of settings that were changed in flight, a state of what the
-    fusion remembered there."""
+    fusion remembered there, a mark of what somebody remarked."""
 
     @property
     def plain_rows(self) -> Iterator[TableRow]:
@@ -187,6 +190,8 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
     """Move a row and all its records in time; a state holds times of its own and is left out."""
     if not shift_us or isinstance(row, TableHeader):
         yield row
+    elif isinstance(row, TableMark):
+        yield TableMark(row.time_us + shift_us, row.text)
     elif isinstance(row, TableRow):
         yield TableRow(
             row.time_us + shift_us,

@@ -11,7 +11,6 @@ from typing import Annotated, Final
 import msgspec
 import numpy as np
 import typer
-from rich.console import Console
 
 from gateway.aircraft import AircraftSettings, make_fusion
 from gateway.cli.flights import (
@@ -31,6 +30,7 @@ from gateway.cli.recording_files import (
 )
 from gateway.cli.refusion import SETTLES
 from gateway.cli.run import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.terminal import console_of
 from gateway.edges.flight_files import FileKind, kind_of, write_new
 from gateway.estimation.columns import (
     NAV_ALT,
@@ -123,7 +123,7 @@ def fuse_log(
             raise FlightError(f"{file}: {error}") from error
         write_new(out, _lines(time_us, states), overwrite=True)
     name = aircraft.estimation.estimator
-    Console(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}")
+    console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 
 
 def _begin(table: Table, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
@@ -133,7 +133,7 @@ def _begin(table: Table, aircraft: AircraftSettings) -> tuple[SensorChain, Estim
         try:
             return make_fusion(aircraft, first)
         except ValueError as error:
-            told = Console(stderr=True, highlight=False)
+            told = console_of(stderr=True)
             told.print(SETTLES.format(error), markup=False)
     else:
         table.rows = itertools.chain([first], table.rows)

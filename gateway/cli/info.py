@@ -8,11 +8,11 @@ from typing import Annotated, Final
 import msgspec
 import typer
 from pymavlink.dialects.v20 import common as mavlink
-from rich.console import Console
-from rich.table import Table as Grid
+from rich.table import Table
 
-from gateway.cli.flights import FlightError
+from gateway.cli.flights import NO_RECORDING, FlightError
 from gateway.cli.recording_files import PANEL, ForceOption, progress_of, refusing
+from gateway.cli.terminal import console_of, table_of
 from gateway.edges.flight_files import (
     FileKind,
     Progress,
@@ -76,18 +76,18 @@ def recover(
     The checksum of every frame is checked. The damaged file is never changed.
     """
     target = out or file.with_name(f"{file.stem}.recovered{file.suffix}")
-    console = Console(highlight=False)
+    console = console_of()
     left_out: list[str] = []
     with progress_of([file]) as advance, refusing():
         sound = _sound_records if kind_of(file) is FileKind.TLOG else _sound_lines
         size = write_new(target, sound(file, advance, left_out.append), overwrite=force)
         before = file.stat().st_size
     for line in left_out[:SHOWN]:
-        console.print(line)
+        console.print(line, markup=False)
     if len(left_out) > SHOWN:
         console.print(f"and {len(left_out) - SHOWN} more places")
     verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
-    console.print(f"{target}: {size} of {before} bytes; {verdict}")
+    console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
 
 
 def describe(file: Path, advance: Progress | None = None) -> FileInfo:
@@ -117,8 +117,8 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
         for batch in read_batches(file, advance):
             tlog.add(batch)
         found = tlog.result(size)
-        if size and not found.records:
-            raise FlightError(f"{file}: holds no MAVLink")
+        if not found.records:
+            raise FlightError(f"{file}: {NO_RECORDING}")
         return found
     if kind is FileKind.FOREIGN:
         raise FlightError(f"{file}: is a CSV of another program; convert it first")
@@ -129,10 +129,14 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
 
 
 def _sound_records(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+    found = False
     for batch in read_batches(file, advance, strict=True):
         for run in batch.damage:
             tell(f"at byte {run.offset}: {run.size} bytes that are no record")
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
+        found = found or len(batch.starts) > 0
+    if not found:
+        raise FlightError(f"{file}: {NO_RECORDING}")
 
 
 def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
@@ -160,16 +164,17 @@ def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
 
 
 def _show(file: Path, found: FileInfo) -> None:
-    console = Console(highlight=False)
-    console.print(f"[bold]{file}[/bold]: {found.kind}, {found.size / 1e6:.3f} MB")
+    console = console_of()
+    console.print(f"{file}: {found.kind}, {found.size / 1e6:.3f} MB", markup=False)
     console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:
         head = found.header
         console.print(
-            f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}"
+            f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}",
+            markup=False,
         )
     for vehicle in found.vehicles:
-        console.print(_grid(vehicle, found.kind))
+        console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n", markup=False)
     for gap in found.gaps[:SHOWN]:
         at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
         console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
@@ -185,15 +190,16 @@ def _show(file: Path, found: FileInfo) -> None:
         )
 
 
-def _grid(vehicle: VehicleInfo, kind: str) -> Grid:
+def _heading(vehicle: VehicleInfo, kind: str) -> str:
     title = f"system {vehicle.system_id}" if kind == "tlog" else f"vehicle {vehicle.system_id}"
     if vehicle.mav_type is not None:
         title += f": {_enum_name('MAV_TYPE', vehicle.mav_type)}"
         title += f", {_enum_name('MAV_AUTOPILOT', vehicle.autopilot or 0)}"
-    grid = Grid(title=f"{title}; {vehicle.distance_m / 1000:.3f} km", title_justify="left")
-    grid.add_column("what")
-    grid.add_column("count", justify="right")
-    grid.add_column("per s", justify="right")
+    return f"{title}; {vehicle.distance_m / 1000:.3f} km"
+
+
+def _rates(vehicle: VehicleInfo) -> Table:
+    grid = table_of("what", "count", "per s")
     for rate in vehicle.rates:
         grid.add_row(rate.name, str(rate.count), f"{rate.rate_hz:.2f}")
     return grid

@@ -18,8 +18,8 @@ from gateway.edges.flight_files import FileKind, kind_of
 FlightArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="A recording: our CSV, another program's CSV with --columns, or a tlog "
-        "; by default the built-in simulated flight.",
+        help="A recording: our CSV, another program's CSV with --columns, or a tlog; "
+        "by default the built-in simulated flight.",
         show_default=False,
     ),
 ]

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gateway.cli.errors import refuse
-from gateway.cli.flights import FlightError, Wishes
+from gateway.cli.flights import NO_RECORDING, FlightError, Wishes
 from gateway.cli.record import ask
 from gateway.cli.recording_files import (
     PANEL,
@@ -38,6 +37,7 @@ from gateway.cli.run import (
     read_settings,
     with_endpoints,
 )
+from gateway.cli.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.edges.clock import GatewayClock
 from gateway.edges.control_socket import ControlError, ControlServer, socket_path
@@ -80,7 +80,7 @@ class Course:
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command("play", rich_help_panel=PANEL)(play)
-    app.command("seek", rich_help_panel=PANEL)(seek)
+    app.command("seek", rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(seek)
     app.add_typer(group, name="player", rich_help_panel=PANEL)
 
 
@@ -131,8 +131,12 @@ def play(
 group = typer.Typer(help="Steer the player that runs.", no_args_is_help=True)
 
 
-def seek(to: Annotated[str, typer.Argument(help="80, 1:20, +10, -0:30 or a date.")]) -> None:
-    """Move the player to a moment; write `mavgate seek -- -0:30` to go back."""
+def seek(
+    to: Annotated[
+        str, typer.Argument(help="80 or 1:20 from the begin, +10 or -0:30 from here, or a date.")
+    ],
+) -> None:
+    """Move the player to a moment."""
     _show(ask("seek", {"to": to}, of="play"))
 
 
@@ -278,7 +282,7 @@ async def _serve(
 
 async def _watch(daemon: PlayerDaemon) -> None:
     """Show the place until the end."""
-    console = Console()
+    console = console_of()
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}")
     )
@@ -317,10 +321,10 @@ def _open_all(files: Sequence[Path], wishes: Wishes, opened: ExitStack) -> list[
             sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], wishes)))
             opened.callback(sources[-1].close)
             for remark in refusion.remarks:
-                Console(stderr=True, highlight=False).print(f"{parts[0]}: {remark}", markup=False)
+                console_of(stderr=True).print(f"{parts[0]}: {remark}", markup=False)
         for source, file in zip(sources, parts, strict=False):
             if not source.index.count:
-                raise FlightError(f"{file}: holds no MAVLink")
+                raise FlightError(f"{file}: {NO_RECORDING}")
         flights.append([*sources])
     return flights
 
@@ -379,4 +383,4 @@ def _place(status: PlayerStatus) -> str:
 
 def _show(status: dict[str, Any]) -> None:
     place = PlayerStatus(**{**status, "files": tuple(status["files"])})
-    Console(highlight=False).print(f"{place.state}: {_place(place)}", markup=False)
+    console_of().print(f"{place.state}: {_place(place)}", markup=False)

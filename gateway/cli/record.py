@@ -6,12 +6,11 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.table import Table as Grid
 
 from gateway.cli.errors import refuse
 from gateway.cli.recording_files import PANEL
 from gateway.cli.run import ConfigOption, read_settings
+from gateway.cli.terminal import console_of, table_of
 from gateway.edges.control_socket import ControlError, request, socket_path
 from gateway.edges.recordings import (
     Recording,
@@ -132,10 +131,12 @@ def _folder(config: Path | None) -> Path:
 
 
 def _show(status: dict[str, Any]) -> None:
-    console = Console(highlight=False)
+    console = console_of()
     line = status["state"]
     if status["name"]:
-        line += f": {status['name']}, part {status['part']}, {status['part_bytes'] / 1e6:.1f} MB"
+        line += f": {status['name']}, part {status['part']}"
+    if status["part_bytes"]:
+        line += f", {status['part_bytes'] / 1e6:.1f} MB"
     if status["reason"]:
         line += f" ({status['reason']})"
     console.print(line, markup=False)
@@ -143,11 +144,7 @@ def _show(status: dict[str, Any]) -> None:
 
 
 def _list(recordings: list[Recording]) -> None:
-    grid = Grid()
-    grid.add_column("recording")
-    grid.add_column("files", justify="right")
-    grid.add_column("MB", justify="right")
-    grid.add_column("last written (UTC)")
+    grid = table_of("recording", "files", "MB", "last written (UTC)")
     for recording in recordings:
         when = datetime.fromtimestamp(recording.modified_s, UTC)
         grid.add_row(
@@ -156,4 +153,4 @@ def _list(recordings: list[Recording]) -> None:
             f"{recording.size / 1e6:.2f}",
             f"{when:%Y-%m-%d %H:%M:%S}",
         )
-    Console(highlight=False).print(grid)
+    console_of().print(grid)

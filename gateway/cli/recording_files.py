@@ -7,11 +7,11 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gateway.cli.errors import refuse
 from gateway.cli.flights import FlightError, Position, SettingsChoice
+from gateway.cli.terminal import console_of
 from gateway.flightlog.foreign import ColumnMap
 from gateway.flightlog.moment import Moment, parse_moment
 
@@ -59,7 +59,7 @@ def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
     """Show how far the files are read, on a terminal."""
     total = sum(file.stat().st_size for file in files if file.exists())
     columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
+    console = console_of(stderr=True)
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as progress:
@@ -75,6 +75,7 @@ def refusing() -> Iterator[None]:
     except FileExistsError as error:
         refuse(f"{error.filename}: is there already; --force overwrites it")
     except OSError as error:
-        refuse(f"{error.filename or 'disk'}: {error.strerror}")
+        file = str(error.filename or "disk").removesuffix(".partial")
+        refuse(f"{file}: {error.strerror}")
     except FlightError as error:
         refuse(str(error))

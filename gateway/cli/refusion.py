@@ -21,7 +21,7 @@ from gateway.cli.flights import (
 from gateway.edges.flight_files import FileKind, kind_of, read_ends
 from gateway.flightlog.row import RowBuilder, TableRow
 from gateway.flightlog.stamps import Stamper
-from gateway.flightlog.table import TableHeader, TableReader
+from gateway.flightlog.table import TableHeader, TableMark, TableReader
 from gateway.flightlog.tlog import TlogRecord
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, Outgoing
@@ -66,6 +66,8 @@ class Refusion:
         """Yield the MAVLink that the gateway would have sent, at civil times."""
         stamper = Stamper(self._zero_us or 0)
         for row in self._table.rows:
+            if isinstance(row, TableMark):
+                continue
             for now_us, action in self._replay.take(row):
                 if isinstance(action, Outgoing) and action.client_id is None:
                     yield TlogRecord(stamper.stamp(now_us), action.frame)
@@ -87,6 +89,9 @@ class Refusion:
             if isinstance(row, FusionState):
                 if self._replay.restore(row):
                     yield row
+                continue
+            if isinstance(row, TableMark):
+                yield row
                 continue
             if isinstance(row, TableHeader) and self._recorded:
                 yield row

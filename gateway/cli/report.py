@@ -1,12 +1,12 @@
 """`mavgate report`: figures and tables of a flight as one page."""
 
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.sources import with_latency
@@ -19,8 +19,9 @@ from gateway.cli.loading import (
     fusion_of,
     load_flight,
 )
-from gateway.cli.recording_files import ColumnsOption, SettingsOption
+from gateway.cli.recording_files import ColumnsOption, SettingsOption, refusing
 from gateway.cli.run import ConfigOption, load_settings, or_refuse
+from gateway.cli.terminal import console_of
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
@@ -58,7 +59,8 @@ def report(
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        refuse(f"a report needs {' and '.join(missing)}: install mavgate[plot]")
+        install = f"{sys.executable} -m pip install {' '.join(missing)}"
+        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")
     # These need what may be missing, and take a second to load.
     from gateway.analysis.case import make_case
     from gateway.analysis.page import count_pictures, write_report
@@ -74,8 +76,11 @@ def report(
         others = fusion_of(or_refuse(lambda: load_settings(against_config)))
         if flight is None:
             others = with_latency(others, loaded.latency_s)
-    console = Console(stderr=True)
-    with Progress(*COLUMNS, console=console, transient=True, auto_refresh=False) as progress:
+    console = console_of(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(
+        *COLUMNS, console=console, transient=True, auto_refresh=False, disable=hidden
+    ) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
         case = make_case(loaded)
@@ -88,5 +93,6 @@ def report(
             progress.advance(task)
             progress.refresh()
 
-        page = write_report(made, output, advance)
+        with refusing():
+            page = write_report(made, output, advance)
     print(page)

@@ -28,7 +28,10 @@ VIEW_INTERVAL_S: Final = 0.5
 LOG_INTERVAL_S: Final = 10.0
 
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", "-c", help=f"Settings file; by default {USER_CONFIG}.")
+    Path | None,
+    typer.Option(
+        "--config", "-c", help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}."
+    ),
 ]
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines in place of the live view.")]
 EndpointOption = Annotated[

@@ -4,11 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from gateway.cli.errors import refuse
+from gateway.cli.terminal import console_of, table_of
 from gateway.config import ConfigError, GatewaySettings, load, render
 from gateway.edges.serial_link import PortNotFoundError, find_port, list_serial_ports
 
@@ -22,13 +20,11 @@ def register(app: typer.Typer) -> None:
 def ports() -> None:
     """List the serial ports, and the one that `auto` takes."""
     found = list_serial_ports()
-    table = Table(box=box.SIMPLE_HEAD)
-    for column in ("device", "setting by USB id", "serial number", "description"):
-        table.add_column(column)
+    table = table_of("device", "setting by USB id", "serial number", "description", left=4)
     for port in found:
         usb = f"usb:{port.usb_id}" if port.usb_id else ""
         table.add_row(port.device, usb, port.serial_number, port.description)
-    console = Console()
+    console = console_of()
     if found:
         console.print(table)
     try:

@@ -8,7 +8,6 @@ from typing import Final
 import msgspec
 import pandas as pd
 from rich import box
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -24,6 +23,8 @@ from gateway.analysis.sweep import COLUMN_OF, Axis, Contest, Metric, SweepError,
 from gateway.analysis.workers import Run, pool
 from gateway.cli.errors import refuse
 from gateway.cli.loading import Loading, load_flight
+from gateway.cli.recording_files import refusing
+from gateway.cli.terminal import console_of
 from gateway.config import GatewaySettings, render
 
 SHOWN: Final = 10
@@ -77,12 +78,14 @@ def run_sweep(path: Path | None, loading: Loading, wish: Wish) -> None:
         results = sweeping.tabulate(contest.keys, trials, wish.metric)
     except SweepError as error:
         refuse(str(error))
-    if wish.table is not None:
-        results.to_csv(wish.table, index=False)
     _show(results, contest, wish.metric)
     best = tuple(results.iloc[0][list(contest.keys)])
-    wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
-    print(wish.output)
+    with refusing():
+        wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
+        print(wish.output)
+        if wish.table is not None:
+            with wish.table.open("w", encoding="utf-8", newline="") as table:
+                results.to_csv(table, index=False)
 
 
 def _axes(wish: Wish) -> list[Axis]:
@@ -98,9 +101,10 @@ def _axes(wish: Wish) -> list[Axis]:
 
 
 def _progress() -> Progress:
+    console = console_of(stderr=True)
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=Console(stderr=True), transient=True,
+        console=console, transient=True, disable=not console.is_terminal,
     )  # fmt: skip
 
 
@@ -140,7 +144,7 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
         shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
     for row in results[names].head(SHOWN).itertuples(index=False):
         shown.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row))
-    Console().print(shown)
+    console_of().print(shown)
 
 
 def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:

@@ -51,7 +51,11 @@ def read_flight(path: Path) -> RecordedFlight:
         columns = _columns(csv.reader(_without_comments(lines, metadata)))
         latency_s = float(metadata.get("gps_latency_s", DEFAULT_LATENCY_S))
         return RecordedFlight.from_columns(columns, latency_s)
-    except (OSError, EOFError, zlib.error, csv.Error, ValueError) as error:
+    except OSError as error:
+        raise FlightFileError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise FlightFileError(f"{path}: is no CSV: it holds bytes that are no text") from error
+    except (EOFError, zlib.error, csv.Error, ValueError) as error:
         raise FlightFileError(f"{path}: {error}") from error
 
 

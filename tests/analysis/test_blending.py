@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +14,7 @@ from gateway.analysis.blending import (
 )
 from gateway.analysis.flight import FusionSettings
 from gateway.analysis.interpolation import withhold
+from gateway.analysis.sections.weights import weights
 from tests.analysis.flights import short_case, short_flight
 
 
@@ -59,3 +62,10 @@ def test_weights_choose_the_papers_estimator() -> None:
     assert (changed.estimator, changed.paper.alpha_accel, changed.paper.beta_velocity) == (
         "paper", 0.3, 0.7,
     )  # fmt: skip
+
+
+def test_no_table_where_no_fix_judges() -> None:
+    case = short_case()
+    blind = replace(case.flight, scored=np.zeros(len(case.flight.time_us), dtype=bool))
+    assert weights(case) is not None
+    assert weights(replace(case, flight=blind)) is None

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import io
 import json
 import threading
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from gateway.cli import clients
@@ -84,6 +86,13 @@ class Name(msgspec.Struct):
     name: str
 
 
+class Place(msgspec.Struct):
+    lat_deg: float | None
+    lon_deg: float | None
+    alt_amsl_m: float | None
+    vehicle_id: int | None
+
+
 class Gateway:
     """A control socket in a loop of its own, as the command would meet it."""
 
@@ -96,11 +105,16 @@ class Gateway:
         self.server.register("clients.add", Url, self._add)
         self.server.register("clients.remove", Name, self._remove)
         self.server.register("reload", NoParams, lambda _: "settings of the hub applied")
+        self.server.register("mark", Place, self._mark)
         self.thread = threading.Thread(target=self.loop.run_forever)
 
     def _add(self, params: Url) -> list[str]:
         self.asked.append(params)
         return ["udp:127.0.0.1:14550", params.url]
+
+    def _mark(self, params: Place) -> str:
+        self.asked.append(params)
+        return "marked"
 
     def _remove(self, params: Name) -> list[str]:
         raise ControlError(f"no endpoint is called {params.name!r}")
@@ -156,6 +170,39 @@ def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
     refused = run("clients", "remove", "phone")
     assert refused.exit_code == 2
     assert "no endpoint is called 'phone'" in refused.output
+
+
+def test_client_stands_on_one_line_of_a_narrow_terminal() -> None:
+    client = dataclasses.replace(
+        CLIENT,
+        name="udp:127.0.0.1:14550",
+        state="refused",
+        sent=1234567,
+        systems=(),
+        heard_us=SNAPSHOT.time_us - 12_300_000,
+    )
+    paper = io.StringIO()
+    terminal = Console(file=paper, width=80, force_terminal=True, color_system=None)
+    found = json.loads(msgspec.json.encode([client]))
+    terminal.print(clients._clients(found, SNAPSHOT.time_us))
+    assert [line.split()[:3] for line in paper.getvalue().splitlines()[2:]] == [
+        ["udp:127.0.0.1:14550", "refused", "1234567"]
+    ]
+
+
+def test_piped_tables_and_texts_are_never_wrapped(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    lines = run("status").output.splitlines()
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in lines
+    assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
+
+
+def test_mark_takes_places_of_the_south_and_west(gateway: Gateway) -> None:
+    assert run("mark", "-7.76", "-110.4", "--alt", "-3").output == "marked\n"
+    assert gateway.asked == [Place(-7.76, -110.4, -3.0, None)]
+    assert run("mark", "--hight", "3").exit_code == 2
 
 
 def test_reload(gateway: Gateway) -> None:

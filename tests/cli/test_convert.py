@@ -235,10 +235,10 @@ def test_info_for_people(tlog: Path) -> None:
 def test_info_of_what_is_no_recording(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.tlog"
     path.write_bytes(content)
-    if content:
-        assert "holds no MAVLink" in " ".join(run("info", path, code=2).split())
-    else:
-        assert "0 records" in run("info", path)
+    for command in ("info", "recover", "play"):
+        assert f"{path}: is no recording" in run(command, path, code=2)
+    assert f"{path}: is no recording" in run("convert", path, "-o", tmp_path / "x.kml", code=2)
+    assert not list(tmp_path.glob("x.*.tlog"))
     assert "No such file" in run("info", tmp_path / "none.tlog", code=2)
 
 
@@ -320,3 +320,15 @@ def test_record_without_a_gateway(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["first flight_01.tlog"]
     run("record", "delete", "last", "--yes", "-c", config)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [[], ["--fuse"]])
+def test_remarks_stay_in_their_place(table: Path, tmp_path: Path, options: list[str]) -> None:
+    mark = '# mark: {"time_us":123456,"text":"over the wood"}'
+    lines = table.read_text().splitlines()
+    lines.insert(len(lines) // 2, mark)
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, *options)
+    assert out.read_text().splitlines().index(mark) == lines.index(mark)
+    run("convert", table, "-o", tmp_path / "again.tlog")

@@ -61,5 +61,5 @@ def test_parts_of_a_table_are_fused_as_one(tmp_path: Path, rng: np.random.Genera
 
 
 def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match=r"empty.tlog: holds no MAVLink"):
+    with pytest.raises(FlightError, match=r"empty.tlog: is no recording"):
         lay_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])

@@ -1,3 +1,4 @@
+import errno
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
@@ -5,6 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from gateway.analysis.page import Report
 from gateway.cli import report
 from gateway.cli.app import app
 from gateway.flightlog.row import row_to_line
@@ -46,4 +48,20 @@ def test_what_must_be_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(report, "find_spec", without)
     result = CliRunner().invoke(app, ["report"])
     assert result.exit_code == 2
-    assert "needs jinja2: install mavgate[plot]" in result.output
+    assert "needs jinja2;" in result.output
+    assert "-m pip install jinja2\n" in result.output
+
+
+def test_a_folder_that_cannot_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "page"))
+
+    monkeypatch.setattr("gateway.analysis.page.write_report", full)
+    monkeypatch.setattr("gateway.analysis.report.make_report", lambda *_: Report("", "", [], []))
+    monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_: None)
+    monkeypatch.setattr(report, "load_flight", lambda *_: None)
+    result = CliRunner().invoke(app, ["report", "-o", str(tmp_path / "page")])
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'page'}: No space left" in result.output

@@ -43,7 +43,7 @@ def test_reads_plain_and_gzipped(tmp_path: Path, packed: bool) -> None:
         (LOG.replace("0.04,", "0.01,").encode(), "goes back"),
         (LOG.replace("latency_s=0.15", "latency_s=soon").encode(), "soon"),
         (gzip.compress(LOG.encode())[:-9], "end-of-stream"),
-        (b"\xff\xfe\x00", "utf-8"),
+        (b"\xff\xfe\x00", "is no CSV"),
     ],
 )
 def test_says_what_is_wrong(tmp_path: Path, content: bytes, said: str) -> None:

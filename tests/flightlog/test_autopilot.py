@@ -122,3 +122,10 @@ def test_damage_is_counted() -> None:
     reader = AutopilotReader()
     assert reader.feed(bytes(frame), START_US) == []
     assert reader.undecoded == 1
+
+
+@pytest.mark.parametrize(("dt_us", "is_told"), [(2_000_000, True), (2_000_001, False)])
+def test_climb_is_told_of_heights_close_in_time(dt_us: int, is_told: bool) -> None:
+    later = (dt_us, gps(1_000 + dt_us, 431_000))
+    fixes = [r for r in read([(0, raw(0)), (0, gps(1_000)), later]) if isinstance(r, GpsFix)]
+    assert math.isfinite(fixes[1].vel_n_mps[2]) == is_told

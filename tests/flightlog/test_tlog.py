@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v10 import common as dialect_v1
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.flightlog.tlog import (
@@ -61,6 +62,19 @@ def test_mavlink_1_and_signed_frames_pass() -> None:
     records = [TlogRecord(START_US + i, frame) for i, frame in enumerate([old, signed, old])]
     assert len(signed) == 12 + 9 + 13
     assert records_of(scan(make_tlog(records), strict=True)) == records
+
+
+def test_a_damaged_mavlink_1_frame_is_left_out() -> None:
+    sender = dialect_v1.MAVLink(None, 1, 1)
+    message = dialect_v1.MAVLink_attitude_message(20, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    frames = [bytes(message.pack(sender)) for _ in range(3)]
+    records = [TlogRecord(START_US + i * STEP_US, frame) for i, frame in enumerate(frames)]
+    data = bytearray(make_tlog(records))
+    size = len(data) // 3
+    data[size + 20] ^= 1
+    batches = scan(bytes(data), strict=True)
+    assert records_of(batches) == [records[0], records[2]]
+    assert [run for batch in batches for run in batch.damage] == [Damage(size, size)]
 
 
 def test_every_prefix_opens_and_loses_at_most_the_cut_record() -> None:

@@ -139,6 +139,14 @@ def test_movement_fails(station: GroundStation, params: tuple[int, ...]) -> None
     assert station.of(CalibrationMeasured) == []
 
 
+@pytest.mark.parametrize(("noise_radps", "result"), [(0.03, ACCEPTED), (0.08, FAILED)])
+def test_trembling_of_a_hand_is_no_rest(
+    station: GroundStation, noise_radps: float, result: int
+) -> None:
+    station.command(CALIBRATE, *GYRO)
+    assert acks(run(station, 4.0, rest(noise=noise_radps)))[-1] == result
+
+
 def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     assert acks([m for m in station.wait(61.0) if m.get_type() == "COMMAND_ACK"]) == [FAILED]

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.sensing.calibration import NodeCalibration
-from gateway.settings import Settings, setting
+from gateway.settings import Settings, fields_of, setting
 from gateway.vehicle.actions import SaveSettings, SettingsChange
 from gateway.vehicle.parameter_names import parameter_name
 from gateway.vehicle.parameters import ParameterTable, decode_value
@@ -244,3 +244,10 @@ def test_the_gateways_own_settings_have_names_that_tell() -> None:
             parameter.to_number(parameter.field.default)
         ), "the default is within its own range"
         assert parameter.field.meaning, parameter.name
+
+
+def test_an_angle_of_a_mounting_is_described_by_the_first_sentence_of_the_mounting() -> None:
+    table = ParameterTable({"calibration": NodeCalibration()})
+    meaning = table.parameters[table.index["CAL_MNT_ROLL"]].field.meaning
+    told = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]
+    assert f" of the {told[0].lower()}{told[1:]}. Yaw is turned first" in meaning

@@ -90,6 +90,23 @@ def test_short_way_knows_plain_frames_only(name: str) -> None:
         assert not is_frame(frame[:at] + bytes((frame[at] ^ 1,)) + frame[at + 1 :])
 
 
+LARGE_IDS = {
+    dialect.MAVLINK_MSG_ID_PLAY_TUNE: dialect.MAVLink_play_tune_message(9, 3, b"a"),
+    dialect.MAVLINK_MSG_ID_OPEN_DRONE_ID_BASIC_ID: dialect.MAVLink_open_drone_id_basic_id_message(
+        9, 3, [1] * 20, 1, 2, [3] * 20
+    ),
+}
+
+
+@pytest.mark.parametrize("number", LARGE_IDS)
+def test_message_ids_of_two_bytes(number: int) -> None:
+    frame = bytes(LARGE_IDS[number].pack(link()))
+    assert number > 0xFF
+    assert is_frame(frame)
+    assert message_id_of(frame) == number
+    assert split_datagram(frame) == MavlinkSplitter().feed(frame) == [frame]
+
+
 def test_damaged_frame_is_a_crc_fault() -> None:
     damaged = V2[:-1] + bytes((V2[-1] ^ 1,))
     assert split_datagram(damaged) == [SplitFault(SplitFaultKind.CRC, len(V2))]

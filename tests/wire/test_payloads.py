@@ -10,6 +10,9 @@ import pytest
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.payloads import (
+    ACCEL_RANGES_G,
+    GYRO_RANGES_DPS,
+    MAG_LSB_PER_GAUSS,
     MAX_PAYLOAD,
     BaroPayload,
     GpsFixPayload,
@@ -32,6 +35,13 @@ STATUS = [vector for vector in VECTORS if vector["kind"] == "ReceiverStatus"]
 def as_json(record: object) -> dict:
     """Bring a record to what the table holds: lists for tuples, ISO text for times."""
     return json.loads(json.dumps(asdict(record), default=lambda moment: moment.isoformat()))
+
+
+def test_scales_are_those_of_the_data_sheets() -> None:
+    """HMC5883L, gain settings 0 to 7; MPU6050, full scales 0 to 3."""
+    assert MAG_LSB_PER_GAUSS == (1370, 1090, 820, 660, 440, 390, 330, 230)
+    assert ACCEL_RANGES_G == (2, 4, 8, 16)
+    assert GYRO_RANGES_DPS == (250, 500, 1000, 2000)
 
 
 @pytest.mark.parametrize("vector", RADIO, ids=lambda v: v["name"])

@@ -27,7 +27,8 @@ def acceleration(case: Case) -> Section:
     return Section(
         "Acceleration filters",
         f"Second-order low-passes at {cutoff:g} Hz, as in figures 9 and 10 of the paper. "
-        "Chebyshev cuts harder above the cutoff, but rings after a step and delays unevenly. "
+        "Chebyshev passes all up to the cutoff and falls faster from there, but rings after a "
+        "step and delays unevenly. "
         "The paper holds that it also takes longer; with the same order both are the same five "
         f"multiplications a sample, and the table tells what they take here.{note}",
         [

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from gateway.analysis import style
 from gateway.analysis.case import Case
 from gateway.analysis.flight import Flight, FloatArray, IntArray, fixes_of
+from gateway.analysis.interpolation import MAX_GAP_S
 from gateway.analysis.page import Picture, Section, Table
 from gateway.analysis.spectra import allan_deviation, longest_rest, power_density
 from gateway.units import US_PER_S
@@ -221,6 +222,8 @@ def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
         style.draw(above, flight.time_s, truth, style.REFERENCE, case.truth_name, lw=3, alpha=0.3)
     for name, (time_us, alt_m, colour) in _height_lines(case, offset_m).items():
         seconds = flight.seconds(time_us)
+        # Nothing was measured in a dropout: the line ends at its begin.
+        alt_m = np.where(np.diff(seconds, append=seconds[-1:]) > MAX_GAP_S, np.nan, alt_m)
         style.draw(above, seconds, alt_m, colour, name, lw=1.0)
         style.draw(below, seconds, alt_m - _height_reference(case, time_us), colour, name, lw=1.0)
     above.set_ylabel("height AMSL (m)")

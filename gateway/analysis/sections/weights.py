@@ -17,11 +17,13 @@ COLOUR_MAP: Final = "cividis_r"
 
 
 def weights(case: Case) -> Section | None:
-    """Build the section; None without GPS."""
+    """Build the section; None without GPS that could judge the weights."""
     if case.frame is None:
         return None
     thinned = blend_table(case.flight, case.fusion, case.sensed, INTERVAL_S)
     full = blend_table(case.flight, case.fusion, case.sensed, 0.0)
+    if not (_is_judged(thinned) and _is_judged(full)):
+        return None
     return Section(
         "Alpha and beta: Table I",
         _lead(thinned),
@@ -68,6 +70,10 @@ def _lead(table: pd.DataFrame) -> str:
         "and each fix is carried forward by its latency. GPS is thinned to one fix a second here "
         "because with many fixes there is little between them to get wrong."
     )
+
+
+def _is_judged(table: pd.DataFrame) -> bool:
+    return bool(table[["north_m", "east_m"]].notna().all(axis=1).any())
 
 
 def _best(table: pd.DataFrame) -> int:

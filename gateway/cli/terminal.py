@@ -1,0 +1,31 @@
+"""Where the commands print to: a terminal, or a file or program that must get whole lines."""
+
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+ENDLESS: Final = 1000
+"""Width of what is no terminal: nobody wants a path or a table cut there."""
+NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
+"""Context settings of a command whose arguments may begin with a minus."""
+
+
+def console_of(*, stderr: bool = False) -> Console:
+    """Open a console that leaves long lines whole."""
+    console = Console(stderr=stderr, highlight=False, soft_wrap=True)
+    if not console.is_terminal:
+        console.width = ENDLESS
+    return console
+
+
+def table_of(*columns: str, left: int = 1) -> Table:
+    """Make an empty table; the first `left` columns are text, the others figures.
+
+    No frame and narrow padding: the table of clients fits a terminal of 80 columns.
+    """
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number < left else "right", overflow="fold")
+    return table
