@@ -7,8 +7,10 @@ from gateway.estimation.complementary.state import ComplementarySettings
 from gateway.estimation.eskf.estimator import EskfEstimator
 from gateway.estimation.eskf.settings import EskfSettings
 from gateway.estimation.interface import Estimator
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 
 EstimatorName = Literal["paper", "complementary", "eskf"]
@@ -21,6 +23,8 @@ class EstimationSettings(Settings, frozen=True):
         "complementary"
     )
     reference: ReferenceSettings = ReferenceSettings()
+    rest: RestSettings = RestSettings()
+    compass: CompassSettings = CompassSettings()
     paper: PaperSettings = PaperSettings()
     complementary: ComplementarySettings = ComplementarySettings()
     eskf: EskfSettings = EskfSettings()
@@ -39,8 +43,9 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     Estimator
         Fresh, for one aircraft.
     """
+    reference, rest, compass = settings.reference, settings.rest, settings.compass
     if settings.estimator == "complementary":
-        return ComplementaryEstimator(settings.complementary, settings.reference)
+        return ComplementaryEstimator(settings.complementary, reference, rest, compass)
     if settings.estimator == "eskf":
-        return EskfEstimator(settings.eskf, settings.reference)
-    return PaperEstimator(settings.paper, settings.reference)
+        return EskfEstimator(settings.eskf, reference, rest, compass)
+    return PaperEstimator(settings.paper, reference, rest)

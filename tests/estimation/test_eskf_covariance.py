@@ -28,10 +28,12 @@ from gateway.estimation.eskf.state import (
     WANDER,
     State,
 )
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.record import new_record
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 
-GAINS = make_gains(EskfSettings(), ReferenceSettings())
+GAINS = make_gains(EskfSettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 
 
 def cross(v: np.ndarray) -> np.ndarray:

@@ -12,7 +12,9 @@ from gateway.estimation.complementary.state import (
     make_gains,
 )
 from gateway.estimation.kernel import KernelEstimator, Kernels
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 
 KERNELS: Final[Kernels[State, Gains]] = Kernels(
     declaration=State,
@@ -34,7 +36,17 @@ class ComplementaryEstimator(KernelEstimator[State, Gains]):
         Time constants and thresholds.
     reference : ReferenceSettings
         GPS latency and declination.
+    rest : RestSettings
+        What is taken for rest.
+    compass : CompassSettings
+        When the compass is taken for disturbed.
     """
 
-    def __init__(self, settings: ComplementarySettings, reference: ReferenceSettings) -> None:
-        super().__init__(KERNELS, make_gains(settings, reference), reference)
+    def __init__(
+        self,
+        settings: ComplementarySettings,
+        reference: ReferenceSettings,
+        rest: RestSettings,
+        compass: CompassSettings,
+    ) -> None:
+        super().__init__(KERNELS, make_gains(settings, reference, rest, compass), reference)

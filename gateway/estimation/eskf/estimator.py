@@ -9,7 +9,9 @@ from gateway.estimation.eskf.settings import EskfSettings, Gains, make_gains
 from gateway.estimation.eskf.start import start
 from gateway.estimation.eskf.state import State
 from gateway.estimation.kernel import KernelEstimator, Kernels
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 
 KERNELS: Final[Kernels[State, Gains]] = Kernels(
     declaration=State,
@@ -31,7 +33,17 @@ class EskfEstimator(KernelEstimator[State, Gains]):
         What the filter believes of its sensors.
     reference : ReferenceSettings
         GPS latency and declination.
+    rest : RestSettings
+        What is taken for rest.
+    compass : CompassSettings
+        When the compass is taken for disturbed.
     """
 
-    def __init__(self, settings: EskfSettings, reference: ReferenceSettings) -> None:
-        super().__init__(KERNELS, make_gains(settings, reference), reference)
+    def __init__(
+        self,
+        settings: EskfSettings,
+        reference: ReferenceSettings,
+        rest: RestSettings,
+        compass: CompassSettings,
+    ) -> None:
+        super().__init__(KERNELS, make_gains(settings, reference, rest, compass), reference)
