@@ -2,11 +2,14 @@
 
 from typing import Annotated, Literal
 
-from gateway.estimation.complementary.estimator import ComplementaryEstimator
+from gateway.estimation.complementary.kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.eskf.estimator import EskfEstimator
+from gateway.estimation.complementary.state import make_gains as complementary_gains
+from gateway.estimation.eskf.kernels import KERNELS as ESKF
 from gateway.estimation.eskf.settings import EskfSettings
+from gateway.estimation.eskf.settings import make_gains as eskf_gains
 from gateway.estimation.interface import Estimator
+from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
@@ -45,7 +48,9 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     """
     reference, rest, compass = settings.reference, settings.rest, settings.compass
     if settings.estimator == "complementary":
-        return ComplementaryEstimator(settings.complementary, reference, rest, compass)
+        complementary = complementary_gains(settings.complementary, reference, rest, compass)
+        return KernelEstimator(COMPLEMENTARY, complementary, reference)
     if settings.estimator == "eskf":
-        return EskfEstimator(settings.eskf, reference, rest, compass)
+        eskf = eskf_gains(settings.eskf, reference, rest, compass)
+        return KernelEstimator(ESKF, eskf, reference)
     return PaperEstimator(settings.paper, reference, rest)
