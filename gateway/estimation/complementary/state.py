@@ -1,6 +1,6 @@
 """Settings, gains and state of the complementary estimator."""
 
-from typing import Annotated, Final
+from typing import Annotated
 
 from gateway.estimation.alignment import MatchState
 from gateway.estimation.health import HealthState
@@ -10,6 +10,7 @@ from gateway.estimation.record import FloatArray, filled_record
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
 from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
 
 
 class ComplementarySettings(Settings, frozen=True):
@@ -207,9 +208,6 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     fix_force_i: Annotated[FloatArray, (3,)]
 
 
-DEG: Final = 0.017453292519943295
-
-
 def make_gains(
     settings: ComplementarySettings,
     reference: ReferenceSettings,
@@ -236,11 +234,11 @@ def make_gains(
     """
     values = {name: getattr(settings, name) for name in settings.__struct_fields__}
     values |= {
-        name.removesuffix("_degps") + "_radps": value * DEG
+        name.removesuffix("_degps") + "_radps": value * RAD_PER_DEG
         for name, value in values.items()
         if name.endswith("_degps")
     }
-    noise_rad = settings.heading_noise_deg * DEG
+    noise_rad = settings.heading_noise_deg * RAD_PER_DEG
     values["heading_process_rad2ps"] = noise_rad**2 / settings.tau_heading_s
     values["heading_noise_rad2s"] = noise_rad**2 * settings.tau_heading_s
     values["gps_latency_s"] = reference.gps_latency_s

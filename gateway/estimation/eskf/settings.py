@@ -1,14 +1,13 @@
 """Settings and gains of the error-state Kalman filter."""
 
-from typing import Annotated, Final
+from typing import Annotated
 
 from gateway.estimation.magfield import CompassSettings, FieldGains, field_gains
 from gateway.estimation.record import filled_record
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestGains, RestSettings, rest_gains
 from gateway.settings import Settings, setting
-
-DEG: Final = 0.017453292519943295
+from gateway.units import RAD_PER_DEG
 
 
 class EskfSettings(Settings, frozen=True):
@@ -204,15 +203,15 @@ def make_gains(
     """
     s = settings
     values = {
-        "gyro_density": (s.gyro_noise_degprs * DEG) ** 2,
+        "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_var": s.gyro_scale**2,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,
-        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * DEG) ** 2,
+        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,
         "accel_bias_density": s.accel_bias_walk_mps2prs**2,
-        "gyro_bias_var": (s.gyro_bias_degps * DEG) ** 2,
+        "gyro_bias_var": (s.gyro_bias_degps * RAD_PER_DEG) ** 2,
         "accel_bias_var": s.accel_bias_mps2**2,
         "gps_position_var": s.gps_position_m**2,
         "gps_height_var": s.gps_height_m**2,
@@ -222,7 +221,7 @@ def make_gains(
         "gps_velocity_var": s.gps_velocity_mps**2,
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
-        "mag_var": (s.mag_noise_deg * DEG) ** 2,
+        "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
         "mag_bias_var": s.mag_bias_ut**2,
         "mag_bias_density": s.mag_bias_walk_utprs**2,
         "baro_var": s.baro_noise_m**2,
