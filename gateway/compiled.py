@@ -31,6 +31,12 @@ def _files(dispatcher: object) -> Any:
     return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
 
 
+def is_kept(function: Callable[..., object]) -> bool:
+    """Tell whether machine code of the present source is kept; also where none is ever made."""
+    files = _files(function)
+    return files is None or bool(files._load_index())  # noqa: SLF001
+
+
 def _borrowed(names: dict[str, Any]) -> Iterator[tuple[str, object]]:
     """Tell what machine code may hold of other files: their constants, and what they compile."""
     for name, value in names.items():

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateway.compiled import is_kept
+
 SOURCE = """
 from gateway.compiled import compiled
 
@@ -53,6 +55,18 @@ def test_two_processes_compile_for_different_types_at_once(tmp_path: Path) -> No
     assert after(FAR) == 2.0
     assert after(NEAR) == 1.0
     assert after.stats.cache_hits[after.signatures[0]] == 1
+
+
+@pytest.mark.io
+def test_code_is_kept_until_the_source_changes(tmp_path: Path) -> None:
+    path = tmp_path / "raced.py"
+    path.write_text(SOURCE)
+    assert not is_kept(process(path))
+    process(path)(NEAR)
+    assert is_kept(process(path))
+    path.write_text(SOURCE + "    # Another source.\n")
+    assert not is_kept(process(path))
+    assert is_kept(len), "what is not compiled is never to be waited for"
 
 
 CALLED = """

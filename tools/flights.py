@@ -20,6 +20,7 @@ from gateway.estimation.columns import (
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
@@ -162,7 +163,7 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
 
 def run_paper(flight: Flight) -> np.ndarray:
     """Run the paper's estimator, which takes records one at a time, over a flight."""
-    estimator = PaperEstimator(PaperSettings(), flight.reference)
+    estimator = PaperEstimator(PaperSettings(), flight.reference, RestSettings())
     chain = SensorChain(SensingSettings(), NodeCalibration())
     log, fix = flight.log, 0
     out = np.full((len(log.imu_time_us), NAV_COLUMNS), np.nan)

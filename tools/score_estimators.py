@@ -32,10 +32,7 @@ from gateway.estimation.columns import (
     NAV_VEL,
     NAV_VEL_STD,
 )
-from gateway.estimation.complementary.estimator import ComplementaryEstimator
-from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.eskf.estimator import EskfEstimator
-from gateway.estimation.eskf.settings import EskfSettings
+from gateway.estimation.select import EstimationSettings, make_estimator
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
 from tools.peers import PEERS
 
@@ -67,12 +64,14 @@ TARGETS: dict[tuple[str, str], Scores] = {
 
 def run_complementary(flight: Flight) -> np.ndarray:
     """Run the default estimator."""
-    return ComplementaryEstimator(ComplementarySettings(), flight.reference).run(flight.log)
+    settings = EstimationSettings(estimator="complementary", reference=flight.reference)
+    return make_estimator(settings).run(flight.log)
 
 
 def run_eskf(flight: Flight) -> np.ndarray:
     """Run the Kalman filter."""
-    return EskfEstimator(EskfSettings(), flight.reference).run(flight.log)
+    settings = EstimationSettings(estimator="eskf", reference=flight.reference)
+    return make_estimator(settings).run(flight.log)
 
 
 OWN: dict[str, Run] = {"paper": run_paper, "complementary": run_complementary, "eskf": run_eskf}

@@ -73,7 +73,6 @@ class Air:
     listeners: list[Listener] = field(default_factory=list)
     sent: int = 0
     collisions: int = 0
-    missed: int = 0
     _packets: list[_OnAir] = field(default_factory=list)
 
     def send(self, packet: Packet, sender: Listener, done: Callable[[], None]) -> None:
@@ -108,8 +107,6 @@ class Air:
         for listener in self.listeners:
             if listener is sender:
                 continue
-            if listener.listens(packet.channel, packet.kbps, sent.start_ps):
-                if self.loss and self.rng.random() < self.loss:
-                    self.missed += 1
-                else:
-                    listener.hear(packet)
+            heard = listener.listens(packet.channel, packet.kbps, sent.start_ps)
+            if heard and not (self.loss and self.rng.random() < self.loss):
+                listener.hear(packet)

@@ -58,7 +58,6 @@ def library() -> ctypes.CDLL:
         "board_slept": (u64, (pointer,)),
         "board_resets": (u32, (pointer,)),
         "board_pc": (u32, (pointer,)),
-        "board_peek": (u8, (pointer, u16)),
         "board_poke": (None, (pointer, u16, u8)),
         "board_flash_word": (u16, (pointer, u32)),
         "board_patch_flash": (None, (pointer, u32, u16)),
@@ -198,12 +197,6 @@ class Mcu:
     def symbols(self) -> dict[str, int]:
         """Addresses by name."""
         return read_symbols(self.program.with_suffix(".elf"))
-
-    def read_variable(self, name: str, size: int) -> int:
-        """Read a variable of the program."""
-        start = self.symbols[name] - _SRAM_OFFSET
-        data = bytes(self._lib.board_peek(self._board, start + i) for i in range(size))
-        return int.from_bytes(data, "little")
 
     def write_variable(self, name: str, value: int, size: int) -> None:
         """Set a variable of the program."""

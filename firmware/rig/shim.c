@@ -353,7 +353,6 @@ uint64_t board_cycle(const board_t *board) { return board->avr->cycle; }
 uint64_t board_slept(const board_t *board) { return board->slept; }
 uint32_t board_resets(const board_t *board) { return board->resets; }
 uint32_t board_pc(const board_t *board) { return board->avr->pc; }
-uint8_t board_peek(const board_t *board, uint16_t address) { return board->avr->data[address]; }
 void board_poke(board_t *board, uint16_t address, uint8_t value) { board->avr->data[address] = value; }
 
 uint16_t board_flash_word(const board_t *board, uint32_t address)

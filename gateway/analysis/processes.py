@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from multiprocessing.pool import Pool
 from typing import Any, Final
@@ -34,9 +34,28 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
     Pool
         Open it before a thread is started, such as that of a progress bar.
     """
-    with warnings.catch_warnings():
-        # The threads that Python warns of are those of the linear algebra; they are idle here.
-        warnings.simplefilter("ignore", DeprecationWarning)
+    with _no_warning_of_threads():
         pool = multiprocessing.get_context(START).Pool(count, begin, arguments)
     with pool:
         yield pool
+
+
+def run_copies(work: Callable[[Any], None], arguments: Iterable[Any]) -> None:
+    """Do a work in one process an argument, and wait; one that is killed is not waited for.
+
+    Unlike those of a pool, they end by themselves where this process is killed.
+    """
+    processes = [multiprocessing.Process(target=work, args=(a,), daemon=True) for a in arguments]
+    with _no_warning_of_threads():
+        for process in processes:
+            process.start()
+    for process in processes:
+        process.join()
+
+
+@contextmanager
+def _no_warning_of_threads() -> Iterator[None]:
+    """Let processes fork: the threads that Python warns of, the linear algebra's, are idle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield

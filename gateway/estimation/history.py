@@ -70,8 +70,10 @@ def recall(
     float
         The time that `out` holds for: `time_s`, held within what is remembered.
     """
+    # Number by number: to assign one array to another, numba compiles the texts of numpy's errors.
     if time_s >= now_s or count == 0:
-        out[:] = now
+        for k in range(out.shape[0]):
+            out[k] = now[k]
         return now_s
     oldest = max(0, count - SLOTS)
     low, high = oldest, count
@@ -82,7 +84,8 @@ def recall(
         else:
             high = middle
     if low == oldest:
-        out[:] = ring[oldest % SLOTS, 1:]
+        for k in range(out.shape[0]):
+            out[k] = ring[oldest % SLOTS, 1 + k]
         return float(ring[oldest % SLOTS, 0])
     before = (low - 1) % SLOTS
     t0 = ring[before, 0]

@@ -7,7 +7,15 @@ from typing import Any, Generic, TypeVar, cast
 import msgspec
 import numpy as np
 
-from gateway.estimation.columns import IMU_COLUMNS, NAV_COLUMNS, GpsRow, gps_row, imu_row, nav_state
+from gateway.estimation.columns import (
+    GPS_COLUMNS,
+    IMU_COLUMNS,
+    NAV_COLUMNS,
+    GpsRow,
+    gps_row,
+    imu_row,
+    nav_state,
+)
 from gateway.estimation.record import (
     FloatArray,
     IntArray,
@@ -116,9 +124,11 @@ class KernelEstimator(Generic[State, Gains]):
         # A first call on a scrap state compiles, or loads, what `direct` then finds.
         scrap = copy_record(self._state)
         kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
+        kernels.baro(scrap, gains, 0.0)
+        kernels.gps(scrap, gains, 0, np.zeros(GPS_COLUMNS))
         kernels.tell(scrap, self._row)
-        self._imu = direct(kernels.imu)
-        self._tell = direct(kernels.tell)
+        self._imu, self._baro = direct(kernels.imu), direct(kernels.baro)
+        self._gps, self._tell = direct(kernels.gps), direct(kernels.tell)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -180,7 +190,7 @@ class KernelEstimator(Generic[State, Gains]):
         sample : BaroSample
             Its pressure altitude is used.
         """
-        self._kernels.baro(self._state, self._gains, sample.alt_pressure_m)
+        self._baro(self._held, self._held_gains, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
         """Take in one GPS fix at its arrival.
@@ -191,7 +201,7 @@ class KernelEstimator(Generic[State, Gains]):
             Fused as of the time it was valid.
         """
         row = gps_row(fix, self._reference, self._earth)
-        self._kernels.gps(self._state, self._gains, fix.time_us, np.array(row))
+        self._gps(self._held, self._held_gains, fix.time_us, np.array(row))
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""

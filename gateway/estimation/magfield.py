@@ -4,10 +4,12 @@ A field whose strength or dip is not the usual one is not believed for a minute;
 stays the same while the aircraft turns becomes the usual one.
 """
 
+import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
 from gateway.estimation.record import FloatArray
+from gateway.settings import Settings, setting
 
 SETTLE_S: Final = 0.5
 """An undisturbed field must last this long to be believed."""
@@ -27,11 +29,31 @@ LIKE_DIP_RAD: Final = 0.035
 """A field this much stronger or steeper than usual counts half."""
 
 
+class CompassSettings(Settings, frozen=True):
+    """When the compass is taken for disturbed; the same for complementary and eskf."""
+
+    norm_tolerance: Annotated[
+        float,
+        setting("Share by which the field may differ from its usual strength.", ge=0.01, le=1.0),
+    ] = 0.1
+    dip_tolerance_deg: Annotated[
+        float, setting("By how much its dip may differ.", "deg", ge=1.0, le=90.0)
+    ] = 10.0
+
+
 class FieldGains:
-    """How much the field may differ from the usual one."""
+    """The same in SI units."""
 
     mag_norm_tolerance: float
     mag_dip_tolerance_rad: float
+
+
+def field_gains(settings: CompassSettings) -> dict[str, float]:
+    """Tell the fields of `FieldGains`."""
+    return {
+        "mag_norm_tolerance": settings.norm_tolerance,
+        "mag_dip_tolerance_rad": math.radians(settings.dip_tolerance_deg),
+    }
 
 
 class FieldState:

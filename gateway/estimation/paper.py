@@ -34,7 +34,7 @@ References
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -53,7 +53,7 @@ from gateway.estimation.record import (
     unpack_record,
 )
 from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
-from gateway.estimation.rest import RestGains
+from gateway.estimation.rest import RestGains, RestSettings, rest_gains
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import IDENTITY
 from gateway.records import (
@@ -68,18 +68,6 @@ from gateway.records import (
 )
 from gateway.settings import Settings, setting
 from gateway.units import DEG_PER_DEGE7, US_PER_S
-
-REST: Final = filled_record(
-    RestGains,
-    {
-        "rest_gyro_radps": math.radians(2.0),
-        "rest_accel_mps2": 0.5,
-        "rest_time_s": 1.5,
-        "bias_limit_radps": math.radians(6.0),
-    },
-)
-"""What is taken for rest: so quiet, for so long, turning no faster."""
-HELD_REST: Final = Held(REST)
 
 
 class PaperSettings(Settings, frozen=True):
@@ -155,17 +143,27 @@ class PaperEstimator:
         Weights.
     reference : ReferenceSettings
         GPS latency and declination.
+    rest : RestSettings
+        What is taken for rest.
     """
 
-    def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
+    def __init__(
+        self,
+        settings: PaperSettings,
+        reference: ReferenceSettings,
+        rest: RestSettings,
+    ) -> None:
         self._settings = settings
         self._reference = reference
+        self._rest = Held(filled_record(RestGains, rest_gains(rest)))
         self._earth = EarthField(reference)
         self._s = PaperState()
         self._held = Held(new_record(kernels.Memory))
         # A first call on a scrap compiles, or loads, what `direct` then finds.
         nothing = (UNKNOWN_VEC3,) * 5
-        kernels.step(new_record(kernels.Memory), REST, 1.0, IDENTITY, *nothing, 0, 0, 0.0)
+        kernels.step(
+            new_record(kernels.Memory), self._rest.record, 1.0, IDENTITY, *nothing, 0, 0, 0.0
+        )
         self._step = direct(kernels.step)
 
     def reset(self) -> None:
@@ -294,7 +292,7 @@ class PaperEstimator:
         gains, latency_s = self._settings, self._reference.gps_latency_s
         return kernels.run(
             (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity, latency_s),
-            REST,
+            self._rest.record,
             new_record(kernels.Memory),
             gains.blend == "at_fix",
             declination_rad,
@@ -320,7 +318,7 @@ class PaperEstimator:
         s, now_us = self._s, _known(self._s.time_us)
         s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = self._step(
             self._held,
-            HELD_REST,
+            self._rest,
             self._settings.alpha_gyro,
             s.q_nb,
             accel,

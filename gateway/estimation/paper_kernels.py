@@ -39,8 +39,6 @@ POSITION_HOLD_US: Final = 30_000_000
 STALE_MAG_US: Final = 2_000_000
 MIN_COS_PITCH: Final = 0.05
 """Nose up or down, the accelerometer does not tell the roll."""
-REST_SPEED_MPS: Final = 0.7
-"""Nothing that GPS sees moving faster is at rest."""
 MAX_ACCEL_MPS2: Final = 500.0
 MAX_RATE_RADPS: Final = 50.0
 """No sensor of this kind tells more: such a value is a fault."""
@@ -124,7 +122,7 @@ def unbiased(
 ) -> Vec3:
     """Take off the rate what the gyroscope last showed at rest."""
     speed_sq = fix_vel[0] * fix_vel[0] + fix_vel[1] * fix_vel[1] + fix_vel[2] * fix_vel[2]
-    moving = fix_age_us < STALE_GPS_US and speed_sq > REST_SPEED_MPS * REST_SPEED_MPS
+    moving = fix_age_us < STALE_GPS_US and speed_sq > p.rest_speed_mps * p.rest_speed_mps
     watch_rest(s, p, gyro, accel, moving, dt_s)
     if s.at_rest == 1:
         # A mean while this rest is young, then a low-pass.

@@ -2,13 +2,18 @@
 
 from typing import Annotated, Literal
 
-from gateway.estimation.complementary.estimator import ComplementaryEstimator
+from gateway.estimation.complementary.kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.eskf.estimator import EskfEstimator
+from gateway.estimation.complementary.state import make_gains as complementary_gains
+from gateway.estimation.eskf.kernels import KERNELS as ESKF
 from gateway.estimation.eskf.settings import EskfSettings
+from gateway.estimation.eskf.settings import make_gains as eskf_gains
 from gateway.estimation.interface import Estimator
+from gateway.estimation.kernel import KernelEstimator
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 
 EstimatorName = Literal["paper", "complementary", "eskf"]
@@ -21,6 +26,8 @@ class EstimationSettings(Settings, frozen=True):
         "complementary"
     )
     reference: ReferenceSettings = ReferenceSettings()
+    rest: RestSettings = RestSettings()
+    compass: CompassSettings = CompassSettings()
     paper: PaperSettings = PaperSettings()
     complementary: ComplementarySettings = ComplementarySettings()
     eskf: EskfSettings = EskfSettings()
@@ -39,8 +46,11 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     Estimator
         Fresh, for one aircraft.
     """
+    reference, rest, compass = settings.reference, settings.rest, settings.compass
     if settings.estimator == "complementary":
-        return ComplementaryEstimator(settings.complementary, settings.reference)
+        complementary = complementary_gains(settings.complementary, reference, rest, compass)
+        return KernelEstimator(COMPLEMENTARY, complementary, reference)
     if settings.estimator == "eskf":
-        return EskfEstimator(settings.eskf, settings.reference)
-    return PaperEstimator(settings.paper, settings.reference)
+        eskf = eskf_gains(settings.eskf, reference, rest, compass)
+        return KernelEstimator(ESKF, eskf, reference)
+    return PaperEstimator(settings.paper, reference, rest)

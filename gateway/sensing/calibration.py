@@ -5,7 +5,7 @@ from typing import Annotated, Final
 from gateway.geometry.rotation import Matrix3
 from gateway.records import Int3, Vec3
 from gateway.settings import Settings, setting
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 IDENTITY3: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -17,7 +17,6 @@ GYRO_LSB_PER_DPS: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 UT_PER_GAUSS: Final = 100.0
 MAG_OVERFLOW: Final = -4096
 """The HMC5883L's own mark of an axis beyond its range."""
-RADPS_PER_DPS: Final = 0.017453292519943295
 
 _NO_OFFSET: Final[Vec3] = (0.0, 0.0, 0.0)
 
@@ -99,7 +98,7 @@ def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
 def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
     """Scale MPU6050 gyroscope counts to rad/s in sensor axes."""
     per_count_dps = 1.0 / GYRO_LSB_PER_DPS.get(range_dps, FULL_SCALE_COUNTS / max(range_dps, 1))
-    scale = per_count_dps * RADPS_PER_DPS
+    scale = per_count_dps * RAD_PER_DEG
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 

@@ -13,7 +13,8 @@ MAX_NAME: Final = 16
 UNITS: Final = frozenset(
     {
         "hz", "s", "ms", "us", "m", "mps", "mps2", "rad", "radps", "deg", "dps", "ut", "db", "pa",
-        "hpa", "g", "percent", "ppm", "degc",
+        "hpa", "g", "percent", "ppm", "degc", "degps", "degprs", "degpsprs", "mprs", "mpsprs",
+        "mps2prs", "utprs",
     }
 )  # fmt: skip
 
@@ -48,6 +49,7 @@ ABBREVIATIONS: Final = {
     "status": "STAT",
     "system": "SYS",
     "takeoff": "TKOFF",
+    "tolerance": "TOL",
     "vehicle": "VEH",
     "velocity": "VEL",
 }

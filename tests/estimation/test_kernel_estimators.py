@@ -16,13 +16,10 @@ from gateway.estimation.columns import (
     NAV_VEL,
     imu_row,
 )
-from gateway.estimation.complementary.estimator import ComplementaryEstimator
-from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.eskf.estimator import EskfEstimator
-from gateway.estimation.eskf.settings import EskfSettings
 from gateway.estimation.kernel import KernelEstimator, SampleLog, direct
 from gateway.estimation.record import layout
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import displacement_m
 from gateway.records import BaroSample, GpsFix, ImuSample, NavFlags, NavState
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G, fix, imu, times
@@ -35,11 +32,11 @@ MAG = (21.0, 1.3, 43.0)
 
 
 def make_complementary() -> KernelEstimator:
-    return ComplementaryEstimator(ComplementarySettings(), REFERENCE)
+    return make_estimator(EstimationSettings(estimator="complementary", reference=REFERENCE))
 
 
 def make_eskf() -> KernelEstimator:
-    return EskfEstimator(EskfSettings(), REFERENCE)
+    return make_estimator(EstimationSettings(estimator="eskf", reference=REFERENCE))
 
 
 MAKERS = {"complementary": make_complementary, "eskf": make_eskf}
@@ -288,7 +285,7 @@ def test_a_contradicting_fix_widens_what_is_told_only_when_repeated() -> None:
             if t % 200_000 == 0 and t > 1_000_000:
                 items.append(fix(t, north_m=offsets.get(t, 0.0)))
             items.append(sample)
-        states = feed(EskfEstimator(EskfSettings(), ReferenceSettings()), items)
+        states = feed(make_estimator(EstimationSettings(estimator="eskf")), items)
         return {s.time_us: s.pos_std_m[0] for s in states}
 
     once = stds({8_000_000: 300.0})

@@ -5,6 +5,7 @@ import pytest
 
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import from_euler, rotate_inverse, to_euler
 from gateway.records import GpsFixType, ImuSample, NavFlags, NavState, Vec3
@@ -14,7 +15,7 @@ NO_DECLINATION = ReferenceSettings(gps_latency_s=0.0, declination="fixed")
 
 
 def make(reference: ReferenceSettings = NO_DECLINATION, **settings: object) -> PaperEstimator:
-    return PaperEstimator(PaperSettings(**settings), reference)
+    return PaperEstimator(PaperSettings(**settings), reference, RestSettings())
 
 
 def run(estimator: PaperEstimator, samples: list[ImuSample]) -> NavState:

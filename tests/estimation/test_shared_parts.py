@@ -9,13 +9,19 @@ import pytest
 from gateway.estimation.alignment import MatchState, collect_match
 from gateway.estimation.complementary.state import ComplementarySettings, State, make_gains
 from gateway.estimation.health import HealthState, judge_sensors
-from gateway.estimation.magfield import LIKE_DIP_RAD, NEW_FIELD_S, judge_field, likeness
+from gateway.estimation.magfield import (
+    LIKE_DIP_RAD,
+    NEW_FIELD_S,
+    CompassSettings,
+    judge_field,
+    likeness,
+)
 from gateway.estimation.place import PlaceState, is_relocked, move_origin
 from gateway.estimation.record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import watch_rest
+from gateway.estimation.rest import RestSettings, watch_rest
 
-GAINS = make_gains(ComplementarySettings(), ReferenceSettings())
+GAINS = make_gains(ComplementarySettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 LEVEL = (0.0, 0.0, -9.81)
 
 

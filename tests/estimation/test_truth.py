@@ -12,8 +12,8 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_VEL,
 )
-from gateway.estimation.eskf.estimator import EskfEstimator
 from gateway.estimation.eskf.settings import EskfSettings
+from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
 from tools.flights import Flight, north_east_m, read_flight, simulated_flight
 from tools.score_estimators import (
@@ -102,7 +102,8 @@ def test_a_gyroscope_off_scale_is_learned_in_the_turns(flight: Flight) -> None:
     off_scale = replace(flight, log=replace(flight.log, imu=imu))
 
     def yaw(settings: EskfSettings) -> float:
-        out = EskfEstimator(settings, flight.reference).run(off_scale.log)
+        choice = EstimationSettings(estimator="eskf", reference=flight.reference, eskf=settings)
+        out = make_estimator(choice).run(off_scale.log)
         return attitude_scores(off_scale, out[:, :4])["yaw"]
 
     assert yaw(EskfSettings()) < 1.2

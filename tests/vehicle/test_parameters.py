@@ -43,6 +43,7 @@ def values(station: GroundStation) -> dict[str, float]:
         ("calibration", "mag_hard_iron", "X", "CAL_MG_HRD_IRN_X"),
         ("estimation", "estimator", "", "EST_ESTIMATOR"),
         ("alpha", "alpha", "", "ALPHA"),
+        ("compass", "norm_tolerance", "", "COMPASS_NORM_TOL"),
     ],
 )
 def test_names(section: str, key: str, axis: str, name: str) -> None:

@@ -9,14 +9,15 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.complementary.state import DEG, Gains, State
+from gateway.estimation.complementary.state import Gains, State
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
 from gateway.estimation.record import as_quat
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
+from gateway.units import RAD_PER_DEG
 
-DRIFT_RAD2PS: Final = (0.1 * DEG) ** 2 / 100.0
-CLIP_RADPS: Final = 2.0 * DEG
+DRIFT_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
+CLIP_RADPS: Final = 2.0 * RAD_PER_DEG
 """No single observation moves the bias by more than its gain times this."""
 
 

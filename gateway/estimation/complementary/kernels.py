@@ -28,6 +28,7 @@ from gateway.estimation.health import (
     judge_sensors,
 )
 from gateway.estimation.history import recall, remember
+from gateway.estimation.kernel import Kernels
 from gateway.estimation.place import (
     NEVER_S,
     fix_position,
@@ -310,3 +311,14 @@ def run(
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
         tell(s, out[i])
+
+
+KERNELS: Final[Kernels[State, Gains]] = Kernels(
+    declaration=State,
+    start=start,
+    imu=take_imu,
+    baro=take_baro,
+    gps=take_gps,
+    tell=tell,
+    run=run,
+)

@@ -29,7 +29,7 @@ from gateway.estimation.flagbits import (
 )
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.estimation.place import BARO_STALE_S, NEVER_S
-from gateway.estimation.record import FloatArray
+from gateway.estimation.record import FloatArray, as_quat, as_vec, put, put_quat
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
@@ -48,8 +48,8 @@ def tell(s: State, row: FloatArray) -> None:
     row : ndarray, shape (NAV_COLUMNS,)
         Filled; standard deviations are not known to this estimator.
     """
-    row[NAV_QUAT : NAV_QUAT + 4] = s.q_nb
-    row[NAV_RATE : NAV_RATE + 3] = s.rate_b
+    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
     row[NAV_FLAGS] = float(flags_of(s))
@@ -59,7 +59,7 @@ def tell(s: State, row: FloatArray) -> None:
         return
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
-    row[NAV_VEL : NAV_VEL + 3] = s.vel_n
+    put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
 
 
 @compiled

@@ -1,15 +1,16 @@
 """Settings, gains and state of the complementary estimator."""
 
-from typing import Annotated, Final
+from typing import Annotated
 
 from gateway.estimation.alignment import MatchState
 from gateway.estimation.health import HealthState
-from gateway.estimation.magfield import FieldGains, FieldState
+from gateway.estimation.magfield import CompassSettings, FieldGains, FieldState, field_gains
 from gateway.estimation.place import PlaceState
 from gateway.estimation.record import FloatArray, filled_record
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestGains, RestState
+from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
 from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
 
 
 class ComplementarySettings(Settings, frozen=True):
@@ -81,36 +82,6 @@ class ComplementarySettings(Settings, frozen=True):
             "The same at rest, against its drift of 0.1 deg/s in 100 s.", "deg/s", ge=0.001, le=5.0
         ),
     ] = 0.03
-    bias_limit_degps: Annotated[
-        float, setting("No gyroscope bias is larger than this.", "deg/s", ge=0.1, le=30.0)
-    ] = 6.0
-    rest_gyro_degps: Annotated[
-        float,
-        setting(
-            "At rest the angular rate stays this close to its average.", "deg/s", ge=0.01, le=10.0
-        ),
-    ] = 2.0
-    rest_accel_mps2: Annotated[
-        float,
-        setting(
-            "At rest the specific force stays this close to its average.", "m/s2", ge=0.01, le=5.0
-        ),
-    ] = 0.5
-    rest_time_s: Annotated[
-        float, setting("How long that must hold to be called rest.", "s", ge=0.2, le=30.0)
-    ] = 1.5
-    rest_speed_mps: Annotated[
-        float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
-    ] = 0.7
-    mag_norm_tolerance: Annotated[
-        float,
-        setting(
-            "Share by which the field may differ from its usual strength.", "", ge=0.01, le=1.0
-        ),
-    ] = 0.1
-    mag_dip_tolerance_deg: Annotated[
-        float, setting("By how much its dip may differ.", "deg", ge=1.0, le=90.0)
-    ] = 10.0
     tau_velocity_s: Annotated[
         float,
         setting(
@@ -175,7 +146,6 @@ class Gains(RestGains, FieldGains):
     bias_initial_radps: float
     bias_motion_radps: float
     bias_rest_radps: float
-    rest_speed_mps: float
     tau_velocity_s: float
     tau_position_s: float
     tau_baro_s: float
@@ -238,10 +208,12 @@ class State(HealthState, RestState, FieldState, PlaceState, MatchState):
     fix_force_i: Annotated[FloatArray, (3,)]
 
 
-DEG: Final = 0.017453292519943295
-
-
-def make_gains(settings: ComplementarySettings, reference: ReferenceSettings) -> Gains:
+def make_gains(
+    settings: ComplementarySettings,
+    reference: ReferenceSettings,
+    rest: RestSettings,
+    compass: CompassSettings,
+) -> Gains:
     """Turn the settings into a record of SI constants.
 
     Parameters
@@ -250,6 +222,10 @@ def make_gains(settings: ComplementarySettings, reference: ReferenceSettings) ->
         Time constants and thresholds.
     reference : ReferenceSettings
         GPS latency.
+    rest : RestSettings
+        What is taken for rest.
+    compass : CompassSettings
+        When the compass is taken for disturbed.
 
     Returns
     -------
@@ -258,13 +234,12 @@ def make_gains(settings: ComplementarySettings, reference: ReferenceSettings) ->
     """
     values = {name: getattr(settings, name) for name in settings.__struct_fields__}
     values |= {
-        name.removesuffix("_degps") + "_radps": value * DEG
+        name.removesuffix("_degps") + "_radps": value * RAD_PER_DEG
         for name, value in values.items()
         if name.endswith("_degps")
     }
-    noise_rad = settings.heading_noise_deg * DEG
+    noise_rad = settings.heading_noise_deg * RAD_PER_DEG
     values["heading_process_rad2ps"] = noise_rad**2 / settings.tau_heading_s
     values["heading_noise_rad2s"] = noise_rad**2 * settings.tau_heading_s
-    values["mag_dip_tolerance_rad"] = settings.mag_dip_tolerance_deg * DEG
     values["gps_latency_s"] = reference.gps_latency_s
-    return filled_record(Gains, values)
+    return filled_record(Gains, values | rest_gains(rest) | field_gains(compass))

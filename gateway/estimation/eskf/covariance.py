@@ -153,33 +153,7 @@ def distance_sq(s: State, innovation: float, variance: float) -> float:
 
 @compiled
 def absorb(s: State, innovation: float, variance: float, gate_sq: float) -> None:
-    """Update by one number whose row stands in `h`.
-
-    Parameters
-    ----------
-    s : State
-        `P` and `dx` are changed.
-    innovation : float
-        Measured less expected.
-    variance : float
-        Of the measurement.
-    gate_sq : float
-        An innovation further off counts as one so many squared standard deviations away: its
-        variance is raised until it is, so an outlier does little and a lasting one wins.
-    """
-    rest = remainder(s, innovation)
-    total = spread(s, variance)
-    total = max(total, rest * rest / gate_sq)
-    for i in range(STATES):
-        gain = s.Ph[i] / total
-        s.dx[i] += gain * rest
-        for j in range(STATES):
-            s.P[i, j] -= gain * s.Ph[j]
-
-
-@compiled
-def absorb_considering(s: State, innovation: float, variance: float, gate_sq: float) -> None:
-    """Update by the row in `h`, but let the states marked in `held` only be considered.
+    """Update by one number whose row stands in `h`; the states in `held` are only considered.
 
     Their gain is zero, their uncertainty still counts: the Schmidt-Kalman update. It is for
     measurements whose errors are not white, which other states would take the blame for.
@@ -193,7 +167,8 @@ def absorb_considering(s: State, innovation: float, variance: float, gate_sq: fl
     variance : float
         Of the measurement.
     gate_sq : float
-        See `absorb`.
+        An innovation further off counts as one so many squared standard deviations away: its
+        variance is raised until it is, so an outlier does little and a lasting one wins.
     """
     rest = remainder(s, innovation)
     total = max(spread(s, variance), rest * rest / gate_sq)

@@ -21,12 +21,14 @@ from gateway.estimation.eskf.start import (
     end_dead_reckoning,
     forget_times,
     restart_baro,
+    start,
     start_heading_by_compass,
 )
 from gateway.estimation.eskf.state import State
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.health import HOLD_S, judge_sensors
 from gateway.estimation.history import remember
+from gateway.estimation.kernel import Kernels
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field, likeness
 from gateway.estimation.place import (
     BARO_STALE_S,
@@ -299,3 +301,14 @@ def run(
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
         tell(s, out[i])
+
+
+KERNELS: Final[Kernels[State, Gains]] = Kernels(
+    declaration=State,
+    start=start,
+    imu=take_imu,
+    baro=take_baro,
+    gps=take_gps,
+    tell=tell,
+    run=run,
+)

@@ -14,7 +14,6 @@ from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
 from gateway.estimation.eskf.covariance import (
     absorb,
-    absorb_considering,
     clear,
     distance_sq,
     hold,
@@ -242,7 +241,7 @@ def absorb_compass(
         # The horizon rests on the accelerometer alone then: keep the field's dip out of it.
         hold(s, TILT, 2)
         hold(s, ACCEL_BIAS, 3)
-    absorb_considering(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
+    absorb(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
     inject(s)
 
 
@@ -266,7 +265,7 @@ def absorb_velocity(s: State, p: Gains, variance: float) -> None:
         s.h[VEL + k] = 1.0
         # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
         hold(s, ACCEL_BIAS, 3)
-        absorb_considering(s, -s.vel_n[k], variance, FAR_SQ)
+        absorb(s, -s.vel_n[k], variance, FAR_SQ)
     inject(s)
 
 

@@ -31,7 +31,7 @@ from gateway.estimation.flagbits import (
 )
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.estimation.place import BARO_STALE_S, NEVER_S
-from gateway.estimation.record import FloatArray
+from gateway.estimation.record import FloatArray, as_quat, as_vec, put, put_quat
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
@@ -58,8 +58,8 @@ def tell(s: State, row: FloatArray) -> None:
     row : ndarray, shape (NAV_COLUMNS,)
         Filled.
     """
-    row[NAV_QUAT : NAV_QUAT + 4] = s.q_nb
-    row[NAV_RATE : NAV_RATE + 3] = s.rate_b
+    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_VEL : NAV_VEL + 3] = NAN
     row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
     row[NAV_FLAGS] = float(flags_of(s))
@@ -73,13 +73,13 @@ def tell(s: State, row: FloatArray) -> None:
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
     if s.aided == 1:
-        row[NAV_VEL : NAV_VEL + 3] = s.vel_n
+        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
         put_std(row, NAV_VEL_STD, s, VEL)
         put_std(row, NAV_POS_STD, s, POS)
         for k in range(2):
             row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
     elif s.time_s - s.fix_s < FRESH_GPS_S:
-        row[NAV_VEL : NAV_VEL + 3] = s.fix_vel
+        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
 
 
 @compiled

@@ -1,14 +1,13 @@
 """Settings and gains of the error-state Kalman filter."""
 
-from typing import Annotated, Final
+from typing import Annotated
 
-from gateway.estimation.magfield import FieldGains
+from gateway.estimation.magfield import CompassSettings, FieldGains, field_gains
 from gateway.estimation.record import filled_record
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestGains
+from gateway.estimation.rest import RestGains, RestSettings, rest_gains
 from gateway.settings import Settings, setting
-
-DEG: Final = 0.017453292519943295
+from gateway.units import RAD_PER_DEG
 
 
 class EskfSettings(Settings, frozen=True):
@@ -96,13 +95,6 @@ class EskfSettings(Settings, frozen=True):
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.018
-    mag_norm_tolerance: Annotated[
-        float,
-        setting("Share by which the field may differ from its usual strength.", ge=0.01, le=1.0),
-    ] = 0.1
-    mag_dip_tolerance_deg: Annotated[
-        float, setting("By how much its dip may differ.", "deg", ge=1.0, le=90.0)
-    ] = 10.0
     baro_noise_m: Annotated[
         float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
     ] = 0.3
@@ -147,27 +139,6 @@ class EskfSettings(Settings, frozen=True):
             le=120.0,
         ),
     ] = 8.0
-    rest_gyro_degps: Annotated[
-        float,
-        setting(
-            "At rest the angular rate stays this close to its average.", "deg/s", ge=0.01, le=10.0
-        ),
-    ] = 2.0
-    rest_accel_mps2: Annotated[
-        float,
-        setting(
-            "At rest the specific force stays this close to its average.", "m/s2", ge=0.01, le=5.0
-        ),
-    ] = 0.5
-    rest_time_s: Annotated[
-        float, setting("How long that must hold to be called rest.", "s", ge=0.2, le=30.0)
-    ] = 1.5
-    rest_speed_mps: Annotated[
-        float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
-    ] = 0.7
-    bias_limit_degps: Annotated[
-        float, setting("No gyroscope bias is larger than this.", "deg/s", ge=0.1, le=30.0)
-    ] = 6.0
 
 
 class Gains(RestGains, FieldGains):
@@ -203,11 +174,15 @@ class Gains(RestGains, FieldGains):
     gate_sq: float
     gate_m: float
     gps_relock_s: float
-    rest_speed_mps: float
     gps_latency_s: float
 
 
-def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
+def make_gains(
+    settings: EskfSettings,
+    reference: ReferenceSettings,
+    rest: RestSettings,
+    compass: CompassSettings,
+) -> Gains:
     """Turn the settings into a record of variances.
 
     Parameters
@@ -216,6 +191,10 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         Standard deviations.
     reference : ReferenceSettings
         GPS latency.
+    rest : RestSettings
+        What is taken for rest.
+    compass : CompassSettings
+        When the compass is taken for disturbed.
 
     Returns
     -------
@@ -224,15 +203,15 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
     """
     s = settings
     values = {
-        "gyro_density": (s.gyro_noise_degprs * DEG) ** 2,
+        "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_var": s.gyro_scale**2,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,
-        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * DEG) ** 2,
+        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,
         "accel_bias_density": s.accel_bias_walk_mps2prs**2,
-        "gyro_bias_var": (s.gyro_bias_degps * DEG) ** 2,
+        "gyro_bias_var": (s.gyro_bias_degps * RAD_PER_DEG) ** 2,
         "accel_bias_var": s.accel_bias_mps2**2,
         "gps_position_var": s.gps_position_m**2,
         "gps_height_var": s.gps_height_m**2,
@@ -242,11 +221,9 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "gps_velocity_var": s.gps_velocity_mps**2,
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
-        "mag_var": (s.mag_noise_deg * DEG) ** 2,
+        "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
         "mag_bias_var": s.mag_bias_ut**2,
         "mag_bias_density": s.mag_bias_walk_utprs**2,
-        "mag_norm_tolerance": s.mag_norm_tolerance,
-        "mag_dip_tolerance_rad": s.mag_dip_tolerance_deg * DEG,
         "baro_var": s.baro_noise_m**2,
         "baro_density": s.baro_walk_mprs**2,
         "unaided_var": s.unaided_velocity_mps**2,
@@ -254,11 +231,6 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "gate_m": s.gate_m,
         "gate_sq": s.gate_sigma**2,
         "gps_relock_s": s.gps_relock_s,
-        "rest_gyro_radps": s.rest_gyro_degps * DEG,
-        "rest_accel_mps2": s.rest_accel_mps2,
-        "rest_time_s": s.rest_time_s,
-        "rest_speed_mps": s.rest_speed_mps,
-        "bias_limit_radps": s.bias_limit_degps * DEG,
         "gps_latency_s": reference.gps_latency_s,
     }
-    return filled_record(Gains, values)
+    return filled_record(Gains, values | rest_gains(rest) | field_gains(compass))
