@@ -5,12 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import GPS_COLUMNS, IMU_COLUMNS, NAV_ATTITUDE_STD
-from gateway.estimation.complementary.estimator import ComplementaryEstimator
-from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.eskf.estimator import EskfEstimator
-from gateway.estimation.eskf.settings import EskfSettings
-from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.select import EstimationSettings, EstimatorName, make_estimator
 from gateway.geometry.geodesy import radii_m
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -58,24 +55,17 @@ def flight() -> tuple[SampleLog, Rotation]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("estimator", "limit_deg"),
-    [
-        (EskfEstimator(EskfSettings(), REFERENCE), 0.4),
-        (ComplementaryEstimator(ComplementarySettings(), REFERENCE), 3.0),
-    ],
-    ids=["eskf", "complementary"],
-)
+@pytest.mark.parametrize(("name", "limit_deg"), [("eskf", 0.4), ("complementary", 3.0)])
 def test_the_last_ten_minutes_are_as_good_as_the_first(
-    flight: tuple[SampleLog, Rotation], estimator: KernelEstimator, limit_deg: float
+    flight: tuple[SampleLog, Rotation], name: EstimatorName, limit_deg: float
 ) -> None:
     log, attitude = flight
-    out = estimator.run(log)
+    out = make_estimator(EstimationSettings(estimator=name, reference=REFERENCE)).run(log)
     found = Rotation.from_quat(out[:, :4], scalar_first=True)
     off_deg = np.degrees((found * attitude.inv()).magnitude())
     span = 600 * RATE_HZ
     assert off_deg[-span:].mean() < limit_deg
     assert off_deg[-span:].mean() < 1.5 * off_deg[span : 2 * span].mean()
     stds = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
-    if isinstance(estimator, EskfEstimator):
+    if name == "eskf":
         assert (stds[-span:].mean(axis=0) < 1.2 * stds[span : 2 * span].mean(axis=0)).all()

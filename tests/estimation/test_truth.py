@@ -88,7 +88,8 @@ def test_iron_that_the_calibration_left_is_learned_in_flight(flight: Flight) -> 
     bent = replace(flight, log=replace(flight.log, imu=imu))
 
     def yaw(settings: EskfSettings) -> float:
-        out = EskfEstimator(settings, flight.reference).run(bent.log)
+        choice = EstimationSettings(estimator="eskf", reference=flight.reference, eskf=settings)
+        out = make_estimator(choice).run(bent.log)
         return attitude_scores(bent, out[:, :4])["yaw"]
 
     assert yaw(EskfSettings()) < 0.8 * yaw(EskfSettings(mag_bias_ut=0.01))
