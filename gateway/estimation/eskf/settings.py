@@ -16,7 +16,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_noise_degprs: Annotated[
         float,
         setting("Noise of the gyroscope, vibration included.", "deg/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.12
+    ] = 0.1
     gyro_roughness: Annotated[
         float,
         setting(
@@ -59,7 +59,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.025
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 1.0
+    ] = 1.2
     gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 1.2
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
@@ -88,10 +88,10 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.08
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
-    ] = 4.7
+    ] = 5.0
     mag_bias_ut: Annotated[
         float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
-    ] = 0.5
+    ] = 0.4
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.018
