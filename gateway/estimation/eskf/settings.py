@@ -16,7 +16,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_noise_degprs: Annotated[
         float,
         setting("Noise of the gyroscope, vibration included.", "deg/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.1
+    ] = 0.066
     gyro_roughness: Annotated[
         float,
         setting(
@@ -25,7 +25,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=10.0,
         ),
-    ] = 0.9
+    ] = 0.94
     gyro_scale: Annotated[
         float,
         setting(
@@ -33,49 +33,49 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.1,
         ),
-    ] = 0.06
+    ] = 0.088
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.12
+    ] = 0.14
     accel_roughness: Annotated[
         float, setting("The same of the specific force.", ge=0.0, le=10.0)
-    ] = 0.8
+    ] = 0.46
     accel_scale: Annotated[
         float,
         setting("Share by which the specific force beyond gravity is wrong.", ge=0.0, le=0.2),
-    ] = 0.005
+    ] = 0.0055
     gyro_bias_walk_degpsprs: Annotated[
         float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
     ] = 0.0045
     accel_bias_walk_mps2prs: Annotated[
         float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
-    ] = 0.0025
+    ] = 0.0018
     gyro_bias_degps: Annotated[
         float, setting("Gyroscope bias at the start.", "deg/s", ge=0.01, le=20.0)
     ] = 0.6
     accel_bias_mps2: Annotated[
         float, setting("Accelerometer bias at the start.", "m/s2", ge=0.001, le=2.0)
-    ] = 0.025
+    ] = 0.0195
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 1.2
-    gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 1.2
+    ] = 1.5
+    gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 1.9
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 0.8
+    ] = 0.92
     gps_height_wander_m: Annotated[
         float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
     ] = 2.5
     gps_wander_s: Annotated[
         float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
-    ] = 30.0
+    ] = 29.0
     gps_velocity_mps: Annotated[
         float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
     ] = 0.4
     gps_climb_mps: Annotated[
         float, setting("The same of its vertical velocity.", "m/s", ge=0.01, le=10.0)
-    ] = 0.3
+    ] = 0.25
     gps_jitter_s: Annotated[
         float,
         setting(
@@ -85,19 +85,19 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=0.5,
         ),
-    ] = 0.08
+    ] = 0.065
     mag_noise_deg: Annotated[
         float, setting("Noise of the compass, sample to sample.", "deg", ge=0.1, le=45.0)
-    ] = 5.0
+    ] = 4.7
     mag_bias_ut: Annotated[
         float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
-    ] = 0.4
+    ] = 0.3
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
-    ] = 0.018
+    ] = 0.005
     baro_noise_m: Annotated[
         float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
-    ] = 0.3
+    ] = 0.26
     baro_walk_mprs: Annotated[
         float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
     ] = 1.2
