@@ -250,10 +250,8 @@ class Daemon:
             # After its first heartbeat, before which ground stations hear nothing of it.
             self._tell_kept(vehicle_id, self._broken_places.pop(vehicle_id))
         self._recorder.set_in_flight(self._pipeline.in_flight)
-        status = self._recorder.status()
-        trouble = status.reason if status.state == "blocked" else ""
-        told = self._pipeline.on_recorder(trouble, now_us, recording=self._recorder.recording)
-        self._perform(told)
+        trouble, recording = self._recorder.trouble, self._recorder.recording
+        self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
         self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)

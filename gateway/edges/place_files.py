@@ -8,13 +8,14 @@ and left alone: it may hold a mission that a person can mend.
 import asyncio
 import contextlib
 import logging
-import os
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
+from gateway.edges.flight_files import write_new
+from gateway.edges.reasons import reason_of
 from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
 
 log = logging.getLogger(__name__)
@@ -108,7 +109,7 @@ class PlaceFiles:
             try:
                 await loop.run_in_executor(self._worker, self._write, vehicle_id, places)
             except OSError as error:
-                self._note_failure(vehicle_id, places, error.strerror or str(error))
+                self._note_failure(vehicle_id, places, reason_of(error))
             else:
                 self._note_success(vehicle_id, places)
         if self._pending:
@@ -135,12 +136,7 @@ class PlaceFiles:
         if vehicle_id in self.broken and file.exists():
             raise OSError(None, _broken(file))
         self._folder.mkdir(parents=True, exist_ok=True)
-        fresh = file.with_suffix(".new")
-        with fresh.open("w", encoding="utf-8") as stream:
-            stream.write(encode_places(places))
-            stream.flush()
-            os.fsync(stream.fileno())
-        fresh.replace(file)
+        write_new(file, [encode_places(places).encode()], overwrite=True)
 
 
 def _broken(file: Path) -> str:

@@ -202,6 +202,11 @@ class Recorder:
         )
 
     @property
+    def trouble(self) -> str:
+        """Why nothing can be recorded at the moment, or nothing."""
+        return self._session.reason if self._session.state is SessionState.BLOCKED else ""
+
+    @property
     def recording(self) -> bool:
         """Whether a recording runs, and the disk has taken its first bytes."""
         return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
