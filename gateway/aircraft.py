@@ -46,9 +46,9 @@ from gateway.vehicle.actions import (
     SettingsChange,
 )
 from gateway.vehicle.home import Home, Place
-from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 
 @dataclass(frozen=True, slots=True)

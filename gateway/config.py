@@ -15,14 +15,14 @@ import msgspec
 import tomlkit
 
 from gateway.aircraft import AircraftSettings
-from gateway.edges.serial_link import SerialSettings
+from gateway.edges.receiver.serial_port import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.session import RecordingSettings
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
-from gateway.simulator.settings import SimulatorSettings
-from gateway.vehicle.settings import VehicleSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)

@@ -17,16 +17,16 @@ from gateway.config import (
     save_aircraft,
 )
 from gateway.edges.clock import GatewayClock, unix_time_us
-from gateway.edges.control_socket import ControlError, ControlServer, socket_path
-from gateway.edges.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
-from gateway.edges.hub import Hub
-from gateway.edges.metrics import MetricsServer
-from gateway.edges.place_files import PlaceFiles
-from gateway.edges.pty_port import PtyPort
-from gateway.edges.recorder import Recorder
-from gateway.edges.serial_link import SerialLink
-from gateway.edges.service import ServiceNotifier, set_realtime_priority
-from gateway.flightlog.table import TableHeader
+from gateway.edges.disk.place_files import PlaceFiles
+from gateway.edges.disk.recorder import Recorder
+from gateway.edges.hub.hub import Hub
+from gateway.edges.operator.control_socket import ControlError, ControlServer, socket_path
+from gateway.edges.operator.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
+from gateway.edges.operator.prometheus import MetricsServer
+from gateway.edges.operator.service import ServiceNotifier, set_realtime_priority
+from gateway.edges.receiver.pty_port import PtyPort
+from gateway.edges.receiver.serial_port import SerialPort
+from gateway.flightlog.table.table import TableHeader
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
@@ -41,8 +41,8 @@ from gateway.simulator.receiver import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
-from gateway.vehicle.events import NOTICE, WARNING, Told
 from gateway.vehicle.home import Place
+from gateway.vehicle.telemetry.events import NOTICE, WARNING, Told
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class Daemon:
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
         self._notifier = ServiceNotifier()
-        self._serial = SerialLink(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
+        self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
 

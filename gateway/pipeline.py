@@ -24,11 +24,11 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.events import Told
 from gateway.vehicle.home import Place
 from gateway.vehicle.reader import BAD_SIGNATURE
 from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.telemetry.events import Told
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import Signer
 from gateway.wire.mavlink_splitter import origin_of, restamp

@@ -8,8 +8,8 @@ import msgspec
 
 from gateway import __version__
 from gateway.aircraft import Action, AircraftSettings
-from gateway.flightlog.row import TableRow
-from gateway.flightlog.table import TableHeader
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableHeader
 from gateway.pipeline import Pipeline
 from gateway.records import (
     BaroRaw,

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gateway.records import LinkReport, NavState
-from gateway.routing.clients import ClientStats, HubCounters, ListenerStats
+from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.home import Place
-from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 

@@ -9,8 +9,8 @@ import pytest
 
 from gateway.aircraft import AircraftSettings, SettingsChanged
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.row import RowBuilder, TableRow, row_to_line
-from gateway.flightlog.table import (
+from gateway.flightlog.table.row import RowBuilder, TableRow, row_to_line
+from gateway.flightlog.table.table import (
     TableHeader,
     TableReader,
     encode_head,
@@ -35,7 +35,7 @@ from gateway.replay import InterpolatedPosition, Replay, header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.actions import SettingsChange
-from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 IMU_US = 16_000
 CALIBRATION = NodeCalibration(

@@ -10,12 +10,12 @@ import time
 from pathlib import Path
 
 from gateway.analysis.case import make_case, with_estimator
-from gateway.analysis.page import write_report
 from gateway.analysis.processes import cores
-from gateway.analysis.report import make_report
+from gateway.analysis.reporting.compose import make_report
+from gateway.analysis.reporting.page import write_report
 from gateway.analysis.sources import simulated_flight
-from gateway.analysis.sweep import grid, make_contest, parse_axis
-from gateway.analysis.workers import pool
+from gateway.analysis.tuning.contest import grid, make_contest, parse_axis
+from gateway.analysis.tuning.workers import pool
 from gateway.estimation.select import make_estimator
 from gateway.records import GpsFix
 

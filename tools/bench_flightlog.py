@@ -26,13 +26,13 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.clock import GatewayClock, unix_time_us
-from gateway.edges.hub import Hub
-from gateway.edges.player import PlayerEdge, TlogFile
-from gateway.edges.recorder import Recorder
+from gateway.edges.disk.player import PlayerEdge, TlogFile
+from gateway.edges.disk.recorder import Recorder
+from gateway.edges.hub.hub import Hub
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
 from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table import TableHeader
-from gateway.flightlog.tlog import encode_record
+from gateway.flightlog.table.table import TableHeader
+from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flightlog.track import Track
 from gateway.records import (
     FusedSample,
@@ -44,7 +44,7 @@ from gateway.records import (
     NodeId,
     Outgoing,
 )
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 from gateway.wire.mavlink_splitter import message_id_of
 
 START_US = 1_781_187_930_000_000

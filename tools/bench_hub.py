@@ -62,8 +62,8 @@ while True:
 HUB = """
 import asyncio, sys
 from gateway.edges.clock import GatewayClock
-from gateway.edges.hub import Hub
-from gateway.routing.settings import HubSettings
+from gateway.edges.hub.hub import Hub
+from gateway.routing.hub_settings import HubSettings
 
 async def main():
     clients = tuple(f"udp:127.0.0.1:{port}" for port in sys.argv[2:])

@@ -15,9 +15,9 @@ from pymavlink.dialects.v20 import common as mavlink
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.units import US_PER_S
-from gateway.vehicle.messages import attitude_quaternion
-from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.telemetry.messages import attitude_quaternion
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.samples import FIX, STATE, sample_at, state_at
 
 SECONDS = 20

@@ -6,13 +6,13 @@ import matplotlib as mpl
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.cli.demo import calibrated_aircraft
+from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import to_euler
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
-from gateway.simulator.flight import Aircraft
+from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.trajectory import FLIGHT_S
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -52,7 +52,7 @@ def main() -> None:
     settings = GatewaySettings()
     seen = fly(settings)
     home = (settings.simulator.home_lat_deg, settings.simulator.home_lon_deg)
-    truth = Aircraft(settings.simulator).trajectory.truth_at(seen["attitude"][:, 0])
+    truth = SimulatedAircraft(settings.simulator).trajectory.truth_at(seen["attitude"][:, 0])
     truth_deg = np.degrees([to_euler(tuple(q)) for q in truth.q_nb])
     figure, panels = plt.subplot_mosaic(
         [["map", "roll"], ["map", "height"]], figsize=(11, 5), width_ratios=[1, 1.15]

@@ -40,8 +40,8 @@ HUB = """
 import asyncio, signal, sys
 import msgspec
 from gateway.edges.clock import GatewayClock
-from gateway.edges.hub import Hub
-from gateway.routing.settings import HubSettings
+from gateway.edges.hub.hub import Hub
+from gateway.routing.hub_settings import HubSettings
 
 async def main():
     port, tcp_port, closed_port, far, *clients = sys.argv[1:]

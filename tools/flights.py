@@ -18,7 +18,7 @@ from gateway.estimation.columns import (
     imu_row,
 )
 from gateway.estimation.kernel import SampleLog
-from gateway.estimation.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
@@ -26,7 +26,7 @@ from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeI
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.simulator.flight import fly
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
 QUAT_NAMES = ["ref_qw", "ref_qx", "ref_qy", "ref_qz"]

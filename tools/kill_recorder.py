@@ -21,11 +21,11 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.clock import GatewayClock, unix_time_us
-from gateway.edges.recorder import Recorder
-from gateway.flightlog.row import TableRow
+from gateway.edges.disk.recorder import Recorder
 from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table import TableFault, TableHeader, TableReader
-from gateway.flightlog.tlog import Batch, TlogScanner
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableFault, TableHeader, TableReader
+from gateway.flightlog.tlog.tlog import Batch, TlogScanner
 from gateway.records import (
     FusedSample,
     ImuFlags,

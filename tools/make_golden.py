@@ -22,7 +22,7 @@ from gateway.cli.app import app
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.simulator.flight import fly
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 GOLDEN = Path(__file__).resolve().parent.parent / "tests" / "golden"
 SEED = 77

@@ -24,7 +24,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation, Slerp
 
 from gateway.config import GatewaySettings
-from gateway.edges import flight_file
+from gateway.edges.disk import tracker_csv
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
@@ -38,7 +38,7 @@ MAX_START_S = 1.0
 
 def through_pipeline(file: Path) -> Iterator[mavlink.MAVLink_message]:
     """Give the messages of a log that is pushed through the stages without waiting."""
-    log = flight_file.read_flight(file)
+    log = tracker_csv.read_flight(file)
     settings = GatewaySettings()
     aircraft = settings.default_aircraft
     reference = replace(aircraft.estimation.reference, gps_latency_s=log.gps_latency_s)

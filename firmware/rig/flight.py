@@ -6,7 +6,7 @@ from typing import Final
 import msgspec
 
 from firmware.rig.world import Moment, Solution, Vec3, World
-from gateway.simulator.flight import START_UNIX_US, Aircraft
+from gateway.simulator.flight import START_UNIX_US, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ
 from gateway.simulator.sensors import (
     ACCEL_RANGE,
@@ -15,7 +15,7 @@ from gateway.simulator.sensors import (
     MAG_GAIN,
     UT_PER_GAUSS,
 )
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
@@ -48,7 +48,7 @@ class FlightWorld:
         start_unix_us: int = START_UNIX_US,
     ) -> None:
         fast = msgspec.structs.replace(settings, imu_rate_hz=SAMPLE_HZ, clock_skew_ppm=0.0)
-        self.aircraft = Aircraft(fast, start_unix_us=start_unix_us)
+        self.aircraft = SimulatedAircraft(fast, start_unix_us=start_unix_us)
         self.start_s = start_s
         self._geoid_separation_m = settings.geoid_separation_m
         self.world = World(self.moment, self.solution, start_unix_us + round(start_s * 1e6))

@@ -7,7 +7,7 @@ from firmware.rig.build import build
 from firmware.rig.flight import FlightWorld
 from firmware.rig.tracker import Tracker
 from gateway.simulator.receiver import TimedFrame
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 
 def frames(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:

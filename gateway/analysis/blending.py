@@ -14,13 +14,13 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from gateway.analysis.flight import (
+from gateway.analysis.flight_arrays import (
     BoolArray,
     Fixes,
     Flight,
+    FlightTrack,
     FloatArray,
     FusionSettings,
-    Track,
     fixes_of,
 )
 from gateway.analysis.fusion import Sensed, fuse
@@ -52,7 +52,7 @@ class Judge:
 
     fused: Flight
     """The flight with only the fixes that are fused."""
-    interpolated: Track
+    interpolated: FlightTrack
     """Straight lines between those."""
     held_flight: Flight
     """The flight with only the fixes that are not fused."""
@@ -81,12 +81,12 @@ def judge_of(fused: Flight, held: Flight) -> Judge:
     return Judge(fused, interpolate(fixes_of(fused), fused.time_us), held, fixes_of(held))
 
 
-def score(track: Track, judge: Judge) -> dict[str, float]:
+def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
     """Score one track.
 
     Parameters
     ----------
-    track : Track
+    track : FlightTrack
         Fused from `judge.fused`.
     judge : Judge
 
@@ -162,7 +162,7 @@ def grows(table: pd.DataFrame, column: str) -> bool:
     return bool(np.all(np.diff(grid, axis=0) > 0.0) and np.all(np.diff(grid, axis=1) > 0.0))
 
 
-def _scored_fix_errors(track: Track, judge: Judge) -> FloatArray:
+def _scored_fix_errors(track: FlightTrack, judge: Judge) -> FloatArray:
     """Errors at the held fixes that fall among the scored samples."""
     errors = error_at_fixes_m(track, judge.held)
     times = judge.fused.time_us

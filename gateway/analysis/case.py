@@ -5,7 +5,13 @@ from typing import Final, get_args
 
 import msgspec
 
-from gateway.analysis.flight import Flight, FusionSettings, LocalFrame, Track, local_frame
+from gateway.analysis.flight_arrays import (
+    Flight,
+    FlightTrack,
+    FusionSettings,
+    LocalFrame,
+    local_frame,
+)
 from gateway.analysis.fusion import Sensed, fuse, sense
 from gateway.estimation.select import EstimationSettings, EstimatorName
 
@@ -22,7 +28,7 @@ class Case:
     flight: Flight
     fusion: FusionSettings
     sensed: Sensed
-    tracks: dict[str, Track]
+    tracks: dict[str, FlightTrack]
     """By estimator."""
     frame: LocalFrame | None
     """Metres about the first fix; None in a flight without GPS."""
@@ -33,7 +39,7 @@ class Case:
         return self.fusion.estimation.estimator
 
     @property
-    def track(self) -> Track:
+    def track(self) -> FlightTrack:
         """The track of the chosen estimator."""
         return self.tracks[self.chosen]
 

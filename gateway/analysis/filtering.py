@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import signal
 
-from gateway.analysis.flight import FloatArray
+from gateway.analysis.flight_arrays import FloatArray
 from gateway.sensing.chain import SensingSettings
 from gateway.sensing.filters import Coefficients, Kind, VectorFilter, design_lowpass
 

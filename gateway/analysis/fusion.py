@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from gateway.analysis.flight import (
+from gateway.analysis.flight_arrays import (
     Flight,
+    FlightTrack,
     FloatArray,
     FusionSettings,
-    Track,
     track_of_states,
 )
 from gateway.estimation.columns import (
@@ -30,7 +30,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
-from gateway.estimation.paper import PaperEstimator
+from gateway.estimation.paper.paper import PaperEstimator
 from gateway.estimation.select import make_estimator
 from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample
 from gateway.sensing.calibration import NodeCalibration
@@ -43,8 +43,8 @@ class Sensed:
 
     samples: tuple[ImuSample, ...]
     table: FloatArray
-    """The same, shape (N, 9), as `gateway.estimation.paper_kernels` takes it: specific force and
-    rate behind their filters, NaN where the unfiltered sample is not sound; magnetic field."""
+    """The same, shape (N, 9), as `gateway.estimation.paper.paper_kernels` takes it: specific force
+    and rate behind their filters, NaN where the unfiltered sample is not sound; magnetic field."""
 
 
 def sense(flight: Flight, settings: SensingSettings) -> Sensed:
@@ -76,7 +76,7 @@ def sense(flight: Flight, settings: SensingSettings) -> Sensed:
     return Sensed(samples, table)
 
 
-def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> Track:
+def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> FlightTrack:
     """Fuse a flight with the estimator that the settings name.
 
     Parameters
@@ -91,7 +91,7 @@ def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None)
 
     Returns
     -------
-    Track
+    FlightTrack
         One row per IMU sample.
     """
     estimator = make_estimator(settings.estimation)
@@ -123,7 +123,7 @@ def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog
     )
 
 
-def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> Track:
+def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> FlightTrack:
     out = estimator.run(sample_log(flight, estimator.fix_row))
     return _track(
         flight,
@@ -136,12 +136,12 @@ def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> Track
 
 def _track(
     flight: Flight, q_nb: FloatArray, place: FloatArray, vel: FloatArray, flags: FloatArray
-) -> Track:
-    track = Track(flight.time_us, q_nb, place[:, 0], place[:, 1], place[:, 2], vel)
+) -> FlightTrack:
+    track = FlightTrack(flight.time_us, q_nb, place[:, 0], place[:, 1], place[:, 2], vel)
     return track.where_valid(flags.astype(np.int64))
 
 
-def _fuse_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> Track:
+def _fuse_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> FlightTrack:
     others: list[BaroSample | GpsFix] = [
         *flight.fixes,
         *(

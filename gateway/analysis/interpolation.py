@@ -4,7 +4,14 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.flight import BoolArray, Fixes, Flight, FloatArray, IntArray, Track
+from gateway.analysis.flight_arrays import (
+    BoolArray,
+    Fixes,
+    Flight,
+    FlightTrack,
+    FloatArray,
+    IntArray,
+)
 from gateway.estimation.reference import is_usable
 from gateway.geometry.geodesy import radii_m
 from gateway.records import GpsFix
@@ -14,7 +21,7 @@ MAX_GAP_S: Final = 2.0
 """Across a longer gap a straight line is no reference for a curved flight."""
 
 
-def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -> Track:
+def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -> FlightTrack:
     """Draw straight lines between the fixes, as of the times at which they were valid.
 
     Parameters
@@ -28,14 +35,14 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
 
     Returns
     -------
-    Track
+    FlightTrack
         Places and velocities; NaN before the first fix, after the last and in long gaps. The
         attitude is not known.
     """
     size = len(time_us)
     if len(fixes) < 2:
         unknown = np.full(size, np.nan)
-        return Track(
+        return FlightTrack(
             time_us,
             np.full((size, 4), np.nan),
             unknown,
@@ -52,7 +59,7 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
         np.where(known, np.interp(time_us, fixes.valid_us, column), np.nan) for column in columns
     )
     lon = (lon + 180.0) % 360.0 - 180.0
-    return Track(time_us, np.full((size, 4), np.nan), lat, lon, alt, np.column_stack(vel))
+    return FlightTrack(time_us, np.full((size, 4), np.nan), lat, lon, alt, np.column_stack(vel))
 
 
 def thin(flight: Flight, interval_s: float) -> BoolArray:
@@ -98,7 +105,7 @@ def split(flight: Flight, keep: BoolArray) -> tuple[Flight, Flight]:
     return flight.with_fixes(fused), flight.with_fixes(held)
 
 
-def error_at_fixes_m(track: Track, fixes: Fixes) -> FloatArray:
+def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     """Compare a track with fixes, each at the time at which it was valid.
 
     Returns

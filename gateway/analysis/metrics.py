@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gateway.analysis.flight import FloatArray, Track
+from gateway.analysis.flight_arrays import FlightTrack, FloatArray
 from gateway.geometry.geodesy import radii_m
 
 
@@ -84,7 +84,7 @@ def wrap_pi(angle_rad: FloatArray) -> FloatArray:
     return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def position_error_m(track: Track, reference: Track) -> FloatArray:
+def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
     """Displacement from the reference to the estimate, shape (N, 3): north, east, up."""
     known = np.isfinite(reference.lat_deg)
     if not known.any():
@@ -103,7 +103,7 @@ def position_error_m(track: Track, reference: Track) -> FloatArray:
     )
 
 
-def errors_over_time(track: Track, reference: Track) -> dict[str, FloatArray]:
+def errors_over_time(track: FlightTrack, reference: FlightTrack) -> dict[str, FloatArray]:
     """Compute every error at every sample, in the units that their names tell."""
     turned = rotation_error(track.q_nb, reference.q_nb)
     angles = np.degrees(wrap_pi(euler_rad(track.q_nb) - euler_rad(reference.q_nb)))

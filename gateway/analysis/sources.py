@@ -7,26 +7,26 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from gateway.analysis.flight import (
+from gateway.analysis.flight_arrays import (
     Flight,
+    FlightTrack,
     FloatArray,
     FusionSettings,
     IntArray,
     Reference,
-    Track,
     flight_of_records,
     track_of_states,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.row import TableRow
+from gateway.flightlog.table.row import TableRow
 from gateway.records import ImuCalibrated, NavState, RawRecord
 from gateway.replay import records_of
 from gateway.sensing.calibration import NodeCalibration
-from gateway.simulator.flight import Aircraft
+from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.sensors import SensorErrors
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 from gateway.units import US_PER_S
 from gateway.wire.link import Link
@@ -62,7 +62,7 @@ def simulated_flight(
         With exact truth as its reference.
     """
     settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
-    aircraft = Aircraft(settings)
+    aircraft = SimulatedAircraft(settings)
     flight = flight_of_records(
         _received(settings, duration_s),
         ideal_calibration(aircraft.errors),
@@ -87,7 +87,7 @@ def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
 
 def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
     truth = trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
-    track = Track(
+    track = FlightTrack(
         time_us=flight.time_us,
         q_nb=truth.q_nb,
         lat_deg=truth.lat_deg,
@@ -182,19 +182,19 @@ def judged_by(flight: Flight, rows: Iterable[TableRow], name: str) -> Flight:
     )
 
 
-def at_times(track: Track, time_us: IntArray) -> Track:
+def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
     """Take the rows of a track that are nearest to given times.
 
     Parameters
     ----------
-    track : Track
+    track : FlightTrack
         In the order of time.
     time_us : ndarray, shape (N,)
         Where it has no row within `NEAR_US`, nothing is known.
 
     Returns
     -------
-    Track
+    FlightTrack
         One row for each of the times.
     """
     after = np.searchsorted(track.time_us, time_us).clip(1, max(len(track.time_us) - 1, 1))
@@ -207,7 +207,7 @@ def at_times(track: Track, time_us: IntArray) -> Track:
     def chosen(values: FloatArray) -> FloatArray:
         return np.where(near if values.ndim == 1 else near[:, np.newaxis], values[nearest], np.nan)
 
-    return Track(
+    return FlightTrack(
         time_us=time_us,
         q_nb=chosen(track.q_nb),
         lat_deg=chosen(track.lat_deg),

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from scipy import signal
 
-from gateway.analysis.flight import FloatArray
+from gateway.analysis.flight_arrays import FloatArray
 
 SEGMENT_S: Final = 8.0
 ALLAN_POINTS: Final = 40

@@ -9,20 +9,8 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli import (
-    calibrate,
-    clients,
-    convert,
-    demo,
-    fuse,
-    info,
-    play,
-    record,
-    report,
-    run,
-    setup,
-    sweep,
-)
+from gateway.cli.live import calibrate, clients, demo, record, run, setup
+from gateway.cli.recorded import convert, fuse, info, play, report, sweep
 
 app = typer.Typer(
     name="mavgate",

@@ -6,7 +6,7 @@ A live sample is one row, a log many of the same: this is why both give the same
 import math
 from typing import Final
 
-from gateway.estimation.record import FloatArray
+from gateway.estimation.kernel_record import FloatArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.records import (
     NAN,

@@ -7,7 +7,7 @@ what the inertial sensors saw between two times, whatever corrections came in be
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.record import FloatArray
+from gateway.estimation.kernel_record import FloatArray
 
 SLOTS: Final = 512
 """At `SPACING_S` they span 2.5 s: the greatest latency that can be set, and some."""

@@ -16,7 +16,7 @@ from gateway.estimation.columns import (
     imu_row,
     nav_state,
 )
-from gateway.estimation.record import (
+from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
     Packed,

@@ -8,7 +8,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.record import FloatArray
+from gateway.estimation.kernel_record import FloatArray
 from gateway.settings import Settings, setting
 
 SETTLE_S: Final = 0.5

@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.record import FloatArray
+from gateway.estimation.kernel_record import FloatArray
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
 

@@ -2,16 +2,16 @@
 
 from typing import Annotated, Literal
 
-from gateway.estimation.complementary.kernels import KERNELS as COMPLEMENTARY
-from gateway.estimation.complementary.state import ComplementarySettings
-from gateway.estimation.complementary.state import make_gains as complementary_gains
-from gateway.estimation.eskf.kernels import KERNELS as ESKF
-from gateway.estimation.eskf.settings import EskfSettings
-from gateway.estimation.eskf.settings import make_gains as eskf_gains
+from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
+from gateway.estimation.complementary.complementary_state import ComplementarySettings
+from gateway.estimation.complementary.complementary_state import make_gains as complementary_gains
+from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
+from gateway.estimation.eskf.eskf_settings import EskfSettings
+from gateway.estimation.eskf.eskf_settings import make_gains as eskf_gains
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.magfield import CompassSettings
-from gateway.estimation.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from gateway.flightlog.row import TableRow
-from gateway.flightlog.table import TableEvent, TableFault, TableHeader, TableMark
-from gateway.flightlog.tlog import Batch, TlogIndex
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, TableMark
+from gateway.flightlog.tlog.tlog import Batch, TlogIndex
 from gateway.geometry.geodesy import displacement_m
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_NAMES

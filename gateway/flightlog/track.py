@@ -7,8 +7,8 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from gateway.flightlog.readdress import readdress
-from gateway.flightlog.tlog import (
+from gateway.flightlog.tlog.readdress import readdress
+from gateway.flightlog.tlog.tlog import (
     SEEK_BYTES,
     STRIDE,
     Batch,

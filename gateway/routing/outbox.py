@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from gateway.routing.table import MAX_ORIGINS, Origin
+from gateway.routing.routing_table import MAX_ORIGINS, Origin
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of

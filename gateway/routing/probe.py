@@ -9,7 +9,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.routing.table import Origin
+from gateway.routing.routing_table import Origin
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import message_id_of, restamp

@@ -6,7 +6,7 @@ any number: of them only a few are named in a minute, lest an attack drown what 
 
 from typing import Final
 
-from gateway.routing.clients import ClientStats, ListenerStats
+from gateway.routing.client_table import ClientStats, ListenerStats
 from gateway.routing.digest import Digest
 from gateway.units import US_PER_S
 

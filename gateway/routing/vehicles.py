@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from gateway.routing.table import Origin
+from gateway.routing.routing_table import Origin
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of

@@ -1,8 +1,8 @@
 """Simulated aircraft: exact truth and the sensors' samples beside it, for scoring.
 
 `fly` gives a whole flight as arrays; `SimulatedFlight.records` gives the same samples as the raw
-records that come out of the wire, without clocks and losses between. An `Aircraft`'s samplers,
-asked second by second, feed the simulated nodes with the very same numbers.
+records that come out of the wire, without clocks and losses between. The samplers of a
+`SimulatedAircraft`, asked second by second, feed the simulated nodes with the very same numbers.
 """
 
 import heapq
@@ -33,7 +33,7 @@ from gateway.simulator.sensors import (
     SensorErrors,
     errors_of,
 )
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, MAG_LSB_PER_GAUSS
 
@@ -48,7 +48,7 @@ NEIGHBOUR_DEG: Final = 0.0006
 """Each further aircraft's home is this much further south."""
 
 
-class Aircraft:
+class SimulatedAircraft:
     """One aircraft with its sensors, for as long as it is asked.
 
     Parameters
@@ -180,7 +180,7 @@ def fly(
     -------
     SimulatedFlight
     """
-    aircraft = Aircraft(settings, index)
+    aircraft = SimulatedAircraft(settings, index)
     return SimulatedFlight(
         settings=settings,
         vehicle_id=aircraft.vehicle_id,

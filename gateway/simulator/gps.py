@@ -10,7 +10,7 @@ from gateway.geometry.geodesy import radii_m
 from gateway.records import GpsFixType
 from gateway.simulator.noise import FloatArray, Wander, White
 from gateway.simulator.sensors import BoolArray, IntArray
-from gateway.simulator.settings import GpsOutages, SimulatorSettings
+from gateway.simulator.simulator_settings import GpsOutages, SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 
 GPS_RATE_HZ: Final = 5

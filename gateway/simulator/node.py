@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
-from gateway.simulator.flight import GPS_NODE, IMU_NODE, Aircraft
+from gateway.simulator.flight import GPS_NODE, IMU_NODE, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
 from gateway.simulator.noise import FloatArray
 from gateway.simulator.samplers import BaroSamples, DeviceClock, ImuSamples
 from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, IntArray
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
     BaroPayload,
     GpsFixPayload,
@@ -144,7 +144,7 @@ class Node(ABC):
 class ImuNode(Node):
     """MPU6050, HMC5883L and BMP180 of a simulated aircraft."""
 
-    def __init__(self, aircraft: Aircraft, rate_hz: int) -> None:
+    def __init__(self, aircraft: SimulatedAircraft, rate_hz: int) -> None:
         node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
         ahead_s = min(IMU_AHEAD / rate_hz, IMU_AHEAD_S)
         super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz, ahead_s)
@@ -158,7 +158,7 @@ class ImuNode(Node):
 class GpsNode(Node):
     """M8N of a simulated aircraft."""
 
-    def __init__(self, aircraft: Aircraft, geoid_separation_m: float) -> None:
+    def __init__(self, aircraft: SimulatedAircraft, geoid_separation_m: float) -> None:
         node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
         super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ, GPS_AHEAD_S)
         self._aircraft = aircraft
@@ -169,7 +169,7 @@ class GpsNode(Node):
         yield from gps_payloads(gps, self._clock, self._geoid_separation_m)
 
 
-def nodes_of(aircraft: Aircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
+def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
     """Put the two nodes into an aircraft."""
     imu = ImuNode(aircraft, settings.imu_rate_hz)
     imu.restart_s = settings.imu_restart_s

@@ -18,10 +18,10 @@ from typing import Final
 import numpy as np
 
 from gateway.records import PipeCounters
-from gateway.simulator.flight import START_UNIX_US, Aircraft
+from gateway.simulator.flight import START_UNIX_US, SimulatedAircraft
 from gateway.simulator.node import Node, Sent, nodes_of
 from gateway.simulator.samplers import Chance, DeviceClock, generator
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.framing import encode_frame
 from gateway.wire.payloads import (
     PIPES,
@@ -252,7 +252,7 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
         raise ValueError(f"vehicle ids up to {last_id}; the protocol ends at {LAST_VEHICLE_ID}")
     nodes: list[Node] = []
     for index in range(settings.vehicles):
-        nodes += nodes_of(Aircraft(settings, index, start_unix_us), settings)
+        nodes += nodes_of(SimulatedAircraft(settings, index, start_unix_us), settings)
     return SimulatedReceiver(settings, nodes)
 
 

@@ -44,7 +44,7 @@ from gateway.simulator.sensors import (
     temperature_counts,
     to_int16,
 )
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 

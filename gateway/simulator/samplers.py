@@ -29,7 +29,7 @@ from gateway.simulator.sensors import (
     IntArray,
     Mpu6050,
 )
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Trajectory, Truth
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS

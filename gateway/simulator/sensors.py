@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gateway.geometry.geomagnetism import magnetic_field
 from gateway.records import Vec3
 from gateway.simulator.noise import FloatArray, Walk, Wander, White
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import CRUISE_MPS, Truth, rotate_inverse
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS

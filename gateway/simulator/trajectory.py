@@ -28,7 +28,7 @@ from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
 from gateway.geometry.geodesy import radii_m
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 FloatArray = NDArray[np.float64]

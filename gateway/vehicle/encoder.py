@@ -7,7 +7,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Outgoing
-from gateway.vehicle.fields import FLOAT32_MAX
+from gateway.vehicle.telemetry.fields import FLOAT32_MAX
 
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""

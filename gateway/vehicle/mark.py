@@ -11,10 +11,10 @@ import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NAN, NavState
-from gateway.vehicle import fields
+from gateway.vehicle.client_place import is_on_earth
 from gateway.vehicle.home import Place
-from gateway.vehicle.mission_items import Item
-from gateway.vehicle.place import is_on_earth
+from gateway.vehicle.services.missions.mission_items import Item
+from gateway.vehicle.telemetry import fields
 
 
 class Mark:

@@ -11,8 +11,9 @@ from typing import Final, Literal
 
 import msgspec
 
+from gateway.vehicle.client_place import is_on_earth
 from gateway.vehicle.home import Place
-from gateway.vehicle.mission_items import (
+from gateway.vehicle.services.missions.mission_items import (
     ACCEPTED,
     FENCE,
     MAX_ITEMS,
@@ -21,7 +22,6 @@ from gateway.vehicle.mission_items import (
     Item,
     check_item,
 )
-from gateway.vehicle.place import is_on_earth
 
 KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 

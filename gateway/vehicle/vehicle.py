@@ -18,9 +18,6 @@ from gateway.records import (
 from gateway.settings import Settings
 from gateway.vehicle import identity
 from gateway.vehicle.actions import Action, Answer, Reply, Request, SettingsChange
-from gateway.vehicle.announcements import Announcements
-from gateway.vehicle.calibrator import Calibrator
-from gateway.vehicle.commands import CommandService
 from gateway.vehicle.dialect import (
     MAVLINK_MSG_ID_AVAILABLE_MODES,
     MAVLINK_MSG_ID_COMPONENT_METADATA,
@@ -28,23 +25,26 @@ from gateway.vehicle.dialect import (
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
 )
 from gateway.vehicle.encoder import Encoder
-from gateway.vehicle.events import INFO, NOTICE, Announcer, Told
-from gateway.vehicle.ftp import FtpService
-from gateway.vehicle.health import Health
 from gateway.vehicle.home import Place
-from gateway.vehicle.intervals import IntervalService
-from gateway.vehicle.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
-from gateway.vehicle.motion import IN_AIR
-from gateway.vehicle.parameter_service import ParameterService
-from gateway.vehicle.parameters import ParameterTable
-from gateway.vehicle.places import PlaceService
 from gateway.vehicle.reader import RequestReader
-from gateway.vehicle.recording import RecordingService
-from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.services.calibrator import Calibrator
+from gateway.vehicle.services.commands import CommandService
+from gateway.vehicle.services.ftp import FtpService
+from gateway.vehicle.services.intervals import IntervalService
+from gateway.vehicle.services.missions.places import PlaceService
+from gateway.vehicle.services.parameters.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
+from gateway.vehicle.services.parameters.parameter_service import ParameterService
+from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.services.recording import RecordingService
+from gateway.vehicle.services.timing import TimingService
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry import Telemetry
-from gateway.vehicle.timing import TimingService
+from gateway.vehicle.telemetry.announcements import Announcements
+from gateway.vehicle.telemetry.events import INFO, NOTICE, Announcer, Told
+from gateway.vehicle.telemetry.health import Health
+from gateway.vehicle.telemetry.motion import IN_AIR
+from gateway.vehicle.telemetry.telemetry import Telemetry
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 OWN_SECTION: Final = "vehicle"
 HOME_SECTION: Final = "home"

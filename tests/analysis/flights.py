@@ -3,9 +3,9 @@
 from functools import cache
 
 from gateway.analysis.case import Case, make_case
-from gateway.analysis.flight import Flight
+from gateway.analysis.flight_arrays import Flight
 from gateway.analysis.sources import simulated_flight
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 DURATION_S = 60.0
 

@@ -12,9 +12,9 @@ from gateway.analysis.blending import (
     score,
     with_weights,
 )
-from gateway.analysis.flight import FusionSettings
+from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.interpolation import withhold
-from gateway.analysis.sections.weights import weights
+from gateway.analysis.reporting.sections.weights import weights
 from tests.analysis.flights import short_case, short_flight
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from gateway.analysis.case import ESTIMATORS, with_estimator
-from gateway.analysis.flight import Track
+from gateway.analysis.flight_arrays import FlightTrack
 from gateway.analysis.fusion import fuse, sense
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.estimation.select import make_estimator
@@ -56,7 +56,7 @@ def test_the_fused_track_is_near_the_truth(name: str) -> None:
 
 
 def test_what_an_estimator_does_not_vouch_for_is_not_known() -> None:
-    track: Track = short_case().tracks["paper"]
+    track: FlightTrack = short_case().tracks["paper"]
     first_s = short_flight().seconds(
         np.array([f.time_us for f in short_flight().fixes if f.fix_ok])
     )

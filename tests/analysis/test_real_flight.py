@@ -1,4 +1,4 @@
-"""Table I on a real fixed-wing flight with its GPS thinned to one fix a second."""
+"""RecordedTable I on a real fixed-wing flight with its GPS thinned to one fix a second."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from gateway.analysis.blending import blend_table, grows
-from gateway.analysis.flight import FusionSettings
+from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_rows
-from gateway.analysis.sweep import with_value
-from gateway.cli.flights import TRACKER_LOG
-from gateway.edges.flight_files import read_chunks
-from gateway.flightlog.foreign import ColumnMap, ForeignReader
+from gateway.analysis.tuning.contest import with_value
+from gateway.edges.disk.recording_streams import read_chunks
+from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
+from gateway.flights.reading import TRACKER_LOG
 from gateway.sensing.calibration import NodeCalibration
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

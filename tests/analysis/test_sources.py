@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from gateway.analysis.case import make_case
-from gateway.analysis.flight import Track, fixes_of
+from gateway.analysis.flight_arrays import FlightTrack, fixes_of
 from gateway.analysis.fusion import fuse
-from gateway.analysis.report import make_report
+from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.sources import at_times, flight_of_rows, ideal_calibration, judged_by
 from gateway.estimation.select import make_estimator
-from gateway.flightlog.row import TableRow
+from gateway.flightlog.table.row import TableRow
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedFlight, fly
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import short_case, short_flight
 
 SIMULATED: SimulatedFlight = fly(
@@ -103,7 +103,7 @@ def test_a_reference_without_states_is_refused() -> None:
 def test_the_nearest_row_is_taken_if_it_is_near() -> None:
     time_us = np.array([0, 100_000, 400_000])
     values = np.array([1.0, 2.0, 3.0])
-    track = Track(
+    track = FlightTrack(
         time_us, np.outer(values, [1, 0, 0, 0]), values, values, values, np.outer(values, [1, 1, 1])
     )
     found = at_times(track, np.array([10_000, 60_000, 200_000, 399_000, 500_000]))

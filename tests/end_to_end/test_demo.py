@@ -9,7 +9,7 @@ from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 
 HOME = SimulatorSettings()

@@ -23,7 +23,7 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Gateway, MavProxy
 from tests.end_to_end.station import Station
 from tests.vehicle.test_start_up import qgroundcontrol

@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.edges.control_socket import request
-from gateway.flightlog.tlog import TlogRecord, TlogScanner
-from gateway.simulator.settings import SimulatorSettings
+from gateway.edges.operator.control_socket import request
+from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, free_udp_ports
 from tests.flightlog.frames import START_US, make_tlog
 

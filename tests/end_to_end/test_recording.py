@@ -10,18 +10,18 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import Action
 from gateway.cli.app import app
-from gateway.cli.demo import calibrated_aircraft
-from gateway.cli.flights import Wishes
-from gateway.cli.refusion import Refusion
+from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
-from gateway.edges.player import TlogFile
-from gateway.edges.recorder import Recorder
+from gateway.edges.disk.player import TlogFile
+from gateway.edges.disk.recorder import Recorder
 from gateway.flightlog.playback import Player
-from gateway.flightlog.row import TableRow
 from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table import TableReader
-from gateway.flightlog.tlog import TlogScanner
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableReader
+from gateway.flightlog.tlog.tlog import TlogScanner
 from gateway.flightlog.track import Track
+from gateway.flights.reading import Wishes
+from gateway.flights.refusion import Refusion
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
 from gateway.replay import header_for

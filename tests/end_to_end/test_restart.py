@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.cli.prepare import compile_everything
+from gateway.cli.support.warm_up import compile_everything
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 from gateway.simulator.receiver import simulate
 from tests.end_to_end.station import Station
-from tests.vehicle.test_mission import RALLY, content, download, item, upload
+from tests.vehicle.services.missions.test_mission import RALLY, content, download, item, upload
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.edges.control_socket import ControlError, request, socket_path
+from gateway.edges.operator.control_socket import ControlError, request, socket_path
 from tests.end_to_end.processes import CONFIG, Client, Gateway, free_udp_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

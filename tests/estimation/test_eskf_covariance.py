@@ -13,9 +13,8 @@ from gateway.estimation.eskf.covariance import (
     inject,
     propagate,
 )
-from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
-from gateway.estimation.eskf.settings import EskfSettings, make_gains
-from gateway.estimation.eskf.state import (
+from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
+from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
     GYRO_BIAS,
     GYRO_SCALE,
@@ -25,10 +24,11 @@ from gateway.estimation.eskf.state import (
     TILT,
     VEL,
     WANDER,
-    State,
+    EskfState,
 )
+from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
+from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
-from gateway.estimation.record import new_record
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 
@@ -40,8 +40,8 @@ def cross(v: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def state(rng: np.random.Generator) -> State:
-    s = new_record(State)
+def state(rng: np.random.Generator) -> EskfState:
+    s = new_record(EskfState)
     root = rng.normal(size=(STATES, STATES))
     s.P[:] = root @ root.T
     s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
@@ -61,7 +61,7 @@ def transition(
     return F
 
 
-def test_propagation_is_the_matrix_product(state: State, rng: np.random.Generator) -> None:
+def test_propagation_is_the_matrix_product(state: EskfState, rng: np.random.Generator) -> None:
     force, turn, dt = rng.normal(size=3), rng.normal(size=(3, 3)), 0.02
     scaled = rng.normal(size=(3, 3))
     state.P[TILT + 2, TILT + 2] = 0.5
@@ -83,7 +83,7 @@ def test_propagation_is_the_matrix_product(state: State, rng: np.random.Generato
     assert state.pending_s == 0.0
 
 
-def test_update_is_the_kalman_update(state: State, rng: np.random.Generator) -> None:
+def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator) -> None:
     before, h = state.P.copy(), rng.normal(size=STATES)
     clear(state)
     state.h[:] = h
@@ -93,7 +93,9 @@ def test_update_is_the_kalman_update(state: State, rng: np.random.Generator) -> 
     np.testing.assert_allclose(state.P, before - np.outer(gain, h @ before), atol=1e-8)
 
 
-def test_held_states_are_considered_but_not_changed(state: State, rng: np.random.Generator) -> None:
+def test_held_states_are_considered_but_not_changed(
+    state: EskfState, rng: np.random.Generator
+) -> None:
     before, h = state.P.copy(), rng.normal(size=STATES)
     clear(state)
     state.h[:] = h
@@ -105,7 +107,7 @@ def test_held_states_are_considered_but_not_changed(state: State, rng: np.random
     assert np.linalg.eigvalsh(state.P).min() > -1e-8
 
 
-def test_an_outlier_moves_little_and_is_never_ignored(state: State) -> None:
+def test_an_outlier_moves_little_and_is_never_ignored(state: EskfState) -> None:
     moves = []
     for innovation in (1.0, 10.0, 1000.0):
         s = state.copy()
@@ -119,7 +121,7 @@ def test_an_outlier_moves_little_and_is_never_ignored(state: State) -> None:
 
 
 def test_a_late_row_is_the_present_error_carried_back(rng: np.random.Generator) -> None:
-    s = new_record(State)
+    s = new_record(EskfState)
     s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
     lag, steps = 0.3, 3000
     dt = lag / steps
@@ -143,7 +145,7 @@ def test_a_late_row_is_the_present_error_carried_back(rng: np.random.Generator) 
 
 
 def test_the_compass_row_tells_what_iron_does_to_the_heading(rng: np.random.Generator) -> None:
-    s = new_record(State)
+    s = new_record(EskfState)
     q = rng.normal(size=4)
     s.q_nb[:] = q / np.linalg.norm(q)
     attitude = Rotation.from_quat(s.q_nb, scalar_first=True)
@@ -162,7 +164,7 @@ def test_the_compass_row_tells_what_iron_does_to_the_heading(rng: np.random.Gene
 
 
 def test_a_slow_error_of_the_fixes_has_an_end() -> None:
-    s = new_record(State)
+    s = new_record(EskfState)
     s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
     s.wander_var[:] = [1.0, 4.0, 9.0]
     s.dx[WANDER : WANDER + 3] = [100.0, -100.0, 1.0]

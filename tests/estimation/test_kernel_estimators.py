@@ -17,7 +17,7 @@ from gateway.estimation.columns import (
     imu_row,
 )
 from gateway.estimation.kernel import KernelEstimator, SampleLog, direct
-from gateway.estimation.record import layout
+from gateway.estimation.kernel_record import layout
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import displacement_m

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from gateway.estimation.alignment import MatchState, collect_match
-from gateway.estimation.complementary.state import ComplementarySettings, State, make_gains
-from gateway.estimation.health import HealthState, judge_sensors
+from gateway.estimation.complementary.complementary_state import (
+    ComplementarySettings,
+    ComplementaryState,
+    make_gains,
+)
+from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
+from gateway.estimation.local_position import PlaceState, is_relocked, move_origin
 from gateway.estimation.magfield import (
     LIKE_DIP_RAD,
     NEW_FIELD_S,
@@ -16,10 +21,9 @@ from gateway.estimation.magfield import (
     judge_field,
     likeness,
 )
-from gateway.estimation.place import PlaceState, is_relocked, move_origin
-from gateway.estimation.record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
+from gateway.estimation.sensor_faults import HealthState, judge_sensors
 
 GAINS = make_gains(ComplementarySettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 LEVEL = (0.0, 0.0, -9.81)
@@ -43,7 +47,7 @@ class TestRecord:
 
 class TestRest:
     def watch(self, gyro, accel=lambda t: LEVEL, moving: bool = False, seconds: float = 4.0) -> int:
-        state = new_record(State)
+        state = new_record(ComplementaryState)
         state.accel_lp[2] = LEVEL[2]
         for k in range(round(seconds * 100)):
             watch_rest(state, GAINS, gyro(k / 100), accel(k / 100), moving, 0.01)
@@ -72,14 +76,16 @@ class TestRest:
 
 
 class TestField:
-    def feed(self, state: State, norm: float, seconds: float, rate: float = 1.0) -> float:
+    def feed(
+        self, state: ComplementaryState, norm: float, seconds: float, rate: float = 1.0
+    ) -> float:
         state.rate_b[2] = rate
         for _ in range(round(seconds * 20)):
             weight = judge_field(state, GAINS, norm, 1.1, 0.05)
         return weight
 
     def test_a_strange_field_is_not_believed_and_a_lasting_one_is(self) -> None:
-        state = new_record(State)
+        state = new_record(ComplementaryState)
         assert self.feed(state, 45.0, 10.0) == 1.0
         assert state.mag_norm_ref == pytest.approx(45.0)
         assert self.feed(state, 70.0, 2.0) == 0.0
@@ -89,13 +95,13 @@ class TestField:
         assert state.mag_norm_ref == pytest.approx(70.0, rel=0.05)
 
     def test_a_strange_field_at_a_standstill_stays_strange(self) -> None:
-        state = new_record(State)
+        state = new_record(ComplementaryState)
         self.feed(state, 45.0, 10.0)
         self.feed(state, 70.0, NEW_FIELD_S + 5.0, rate=0.0)
         assert state.mag_disturbed == 1
 
     def test_a_field_counts_by_its_likeness_to_the_usual_one(self) -> None:
-        state = new_record(State)
+        state = new_record(ComplementaryState)
         assert likeness(state, 45.0, 1.1) == 1.0
         self.feed(state, 45.0, 10.0)
         assert likeness(state, 45.0, 1.1) == pytest.approx(1.0)

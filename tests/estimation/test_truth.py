@@ -12,7 +12,7 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_VEL,
 )
-from gateway.estimation.eskf.settings import EskfSettings
+from gateway.estimation.eskf.eskf_settings import EskfSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
 from tools.flights import Flight, north_east_m, read_flight, simulated_flight

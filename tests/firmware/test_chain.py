@@ -21,7 +21,7 @@ from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import START_UNIX_US
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

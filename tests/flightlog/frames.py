@@ -2,7 +2,7 @@
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.flightlog.tlog import TlogRecord, encode_record
+from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
 
 START_US = 1_760_000_000_000_000
 STEP_US = 20_000

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from gateway.flightlog.playback import Player, PlayState
-from gateway.flightlog.tlog import TlogRecord
+from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
 from tests.flightlog.frames import START_US, STEP_US, make_frames, make_records, make_tlog
 from tests.flightlog.test_track import make_track

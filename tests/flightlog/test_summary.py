@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.flightlog.row import RowBuilder, row_to_line
 from gateway.flightlog.summary import FileInfo, Rate, TableSummary, TlogSummary
-from gateway.flightlog.table import TableHeader, TableMark, TableReader, encode_head, encode_mark
-from gateway.flightlog.tlog import TlogRecord, TlogScanner
+from gateway.flightlog.table.row import RowBuilder, row_to_line
+from gateway.flightlog.table.table import (
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_head,
+    encode_mark,
+)
+from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
 from tests.flightlog.frames import START_US, make_tlog
 from tests.flightlog.samples import make_baro, make_fused
 

@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.flightlog.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
+from gateway.flightlog.tlog.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
 from gateway.flightlog.track import Track
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog

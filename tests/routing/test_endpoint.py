@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from gateway.routing.endpoint import NO_MESSAGES, EndpointKind, parse_endpoint
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 
 
 @pytest.mark.parametrize(

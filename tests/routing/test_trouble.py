@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gateway.routing.clients import ClientStats, ListenerStats
+from gateway.routing.client_table import ClientStats, ListenerStats
 from gateway.routing.trouble import PATIENCE_US, QUIET_US, TroubleWatch
 
 S = 1_000_000

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw
-from gateway.simulator.flight import Aircraft, SimulatedFlight, fly
+from gateway.simulator.flight import SimulatedAircraft, SimulatedFlight, fly
 from gateway.simulator.samplers import DeviceClock
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
 
 SETTINGS = SimulatorSettings()
@@ -92,8 +92,8 @@ class TestSamples:
 class TestPieces:
     @pytest.mark.parametrize("sensor", ["imu", "baro", "gps"])
     def test_equal_the_whole(self, sensor: str) -> None:
-        whole = columns(getattr(Aircraft(SETTINGS), sensor).take(24.0))
-        sampler = getattr(Aircraft(SETTINGS), sensor)
+        whole = columns(getattr(SimulatedAircraft(SETTINGS), sensor).take(24.0))
+        sampler = getattr(SimulatedAircraft(SETTINGS), sensor)
         pieces = [columns(sampler.take(until)) for until in (0.003, 0.003, 7.0, 7.5, 24.0)]
         for name, values in whole.items():
             joined = np.concatenate([piece[name] for piece in pieces])
@@ -102,7 +102,7 @@ class TestPieces:
     def test_seeds_and_aircraft_differ(self) -> None:
         def start(seed: int, index: int) -> np.ndarray:
             settings = msgspec.structs.replace(SETTINGS, seed=seed)
-            return Aircraft(settings, index).imu.take(2.0).accel_raw
+            return SimulatedAircraft(settings, index).imu.take(2.0).accel_raw
 
         first = start(1, 0)
         np.testing.assert_array_equal(first, start(1, 0))
@@ -110,7 +110,7 @@ class TestPieces:
         assert (first != start(1, 1)).any()
 
     def test_a_second_flight_goes_on(self) -> None:
-        gps = Aircraft(SETTINGS).gps.take(2.0 * FLIGHT_S)
+        gps = SimulatedAircraft(SETTINGS).gps.take(2.0 * FLIGHT_S)
         assert (np.diff(gps.valid_time_s) > 0.19).all()
         again = (gps.valid_time_s >= FLIGHT_S) & (gps.valid_time_s < FLIGHT_S + 5.0)
         assert gps.has_fix[again].all(), "the receiver stays on between flights"

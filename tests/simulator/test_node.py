@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
-from gateway.simulator.flight import Aircraft, fly
+from gateway.simulator.flight import SimulatedAircraft, fly
 from gateway.simulator.node import GpsNode, ImuNode, Sent, nodes_of
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
     BaroPayload,
     GpsFixPayload,
@@ -23,7 +23,7 @@ SECONDS = 20.0
 
 
 def nodes() -> tuple[ImuNode, GpsNode]:
-    return nodes_of(Aircraft(SETTINGS), SETTINGS)
+    return nodes_of(SimulatedAircraft(SETTINGS), SETTINGS)
 
 
 @pytest.fixture(scope="module")

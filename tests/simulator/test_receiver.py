@@ -14,7 +14,7 @@ import gateway
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
 from gateway.simulator.flight import fly
 from gateway.simulator.receiver import TimedFrame, damage, simulate
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame
 from gateway.wire.link import Link
 from gateway.wire.payloads import RadioFrame, ReceiverStatusFrame, decode_content

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gateway.edges.flight_file import read_flight
+from gateway.edges.disk.tracker_csv import read_flight
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
 from gateway.simulator.recorded import RecordedFlight, replay
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.link import Link
 
 ROWS = 500

@@ -17,7 +17,7 @@ from gateway.simulator.sensors import (
     temperature_counts,
     to_int16,
 )
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Truth
 
 SETTINGS = SimulatorSettings()

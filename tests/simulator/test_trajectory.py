@@ -9,7 +9,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
 from gateway.geometry import geodesy
-from gateway.simulator.settings import SimulatorSettings
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, Trajectory, Truth
 from gateway.units import STANDARD_GRAVITY_MPS2
 

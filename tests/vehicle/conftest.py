@@ -4,8 +4,8 @@ import pytest
 
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
-from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import BARO, FIX, sample_at, state_at

@@ -11,11 +11,11 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
-from gateway.vehicle import messages
-from gateway.vehicle.health import Health
 from gateway.vehicle.home import Place
-from gateway.vehicle.settings import VehicleSettings
+from gateway.vehicle.telemetry import messages
+from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.samples import (
     BARO,
     FIX,

@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.settings import VehicleSettings
 from gateway.vehicle.signing import (
     EPOCH_2015_US,
     KEY_BYTES,
@@ -15,6 +14,7 @@ from gateway.vehicle.signing import (
     key_from_passphrase,
 )
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation
 

@@ -7,9 +7,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming, NavFlags, Outgoing
 from gateway.vehicle.home import Place
-from gateway.vehicle.settings import RateSettings, VehicleSettings
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.samples import (
     BARO,
     GPS_NODE,

@@ -9,9 +9,12 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.complementary.state import Gains, State
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
-from gateway.estimation.record import as_quat
+from gateway.estimation.kernel_record import as_quat
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -22,14 +25,14 @@ CLIP_RADPS: Final = 2.0 * RAD_PER_DEG
 
 
 @compiled
-def update_bias(s: State, p: Gains, tau_s: float, dt: float) -> None:
+def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: float) -> None:
     """Update the bias at the end of an epoch.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place; `tilt_sum` is used up.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     tau_s : float
         Time constant of gravity's low-pass in this epoch.
@@ -63,7 +66,7 @@ def noise_for(accuracy: float, growth: float) -> float:
 
 
 @compiled
-def watch_turn(s: State, tau_s: float, dt: float) -> None:
+def watch_turn(s: ComplementaryState, tau_s: float, dt: float) -> None:
     """Low-pass the level rows of `R_eb`, and the level rates that the bias makes up."""
     q = as_quat(s.q_eb)
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
@@ -77,7 +80,7 @@ def watch_turn(s: State, tau_s: float, dt: float) -> None:
 
 
 @compiled
-def settle(s: State, k: int, u: float, cutoff: float, dt: float, tau_s: float) -> None:
+def settle(s: ComplementaryState, k: int, u: float, cutoff: float, dt: float, tau_s: float) -> None:
     """Low-pass one channel; while gravity's filter is still a mean, follow at once."""
     if s.force_lp_s < tau_s:
         s.turn_lp[k], s.turn_in[k], s.turn_lp_rate[k] = u, u, 0.0
@@ -86,7 +89,9 @@ def settle(s: State, k: int, u: float, cutoff: float, dt: float, tau_s: float) -
 
 
 @compiled
-def correct_bias(s: State, p: Gains, row: Vec3, measured: float, variance: float) -> None:
+def correct_bias(
+    s: ComplementaryState, p: ComplementaryGains, row: Vec3, measured: float, variance: float
+) -> None:
     """Scalar Kalman update of the three bias states by `row @ bias = measured`."""
     P, b = s.bias_cov, s.bias_b
     column = (

@@ -12,9 +12,12 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment import collect_match, information_of
-from gateway.estimation.complementary.state import Gains, State
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
+from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field
-from gateway.estimation.record import as_quat
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 
@@ -25,13 +28,13 @@ GOOD_VAR: Final = 0.07
 
 
 @compiled
-def is_heading_good(s: State) -> bool:
+def is_heading_good(s: ComplementaryState) -> bool:
     """Tell whether horizontal vectors may be turned by the heading."""
     return s.heading_known == 1 and s.heading_var < GOOD_VAR
 
 
 @compiled
-def correct_heading(s: State, measured_rad: float, variance: float) -> None:
+def correct_heading(s: ComplementaryState, measured_rad: float, variance: float) -> None:
     """Blend one measured heading in, the shortest way round."""
     if s.heading_known == 0:
         s.heading_rad, s.heading_var, s.heading_known = measured_rad, variance, 1
@@ -42,14 +45,14 @@ def correct_heading(s: State, measured_rad: float, variance: float) -> None:
 
 
 @compiled
-def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
+def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     """Correct the heading by one magnetometer sample.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     mag_b : tuple of 3 floats
         Calibrated field in body FRD, uT.
@@ -76,14 +79,16 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
 
 
 @compiled
-def take_match(s: State, p: Gains, force_e: Vec3, accel_n: Vec3, dt: float) -> None:
+def take_match(
+    s: ComplementaryState, p: ComplementaryGains, force_e: Vec3, accel_n: Vec3, dt: float
+) -> None:
     """Correct the heading by matching the horizontal force with the GPS acceleration.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     force_e : tuple of 3 floats
         Mean specific force in the level frame, m/s2.

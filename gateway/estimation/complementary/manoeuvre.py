@@ -10,10 +10,13 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
 from gateway.estimation.complementary.heading import is_heading_good, take_match
-from gateway.estimation.complementary.state import Gains, State
 from gateway.estimation.complementary.tilt import take_gravity
-from gateway.estimation.record import as_quat, as_vec, put
+from gateway.estimation.kernel_record import as_quat, as_vec, put
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
 
@@ -24,14 +27,16 @@ MAX_BASELINE_S: Final = 2.5
 
 
 @compiled
-def take_fix_velocity(s: State, p: Gains, valid_s: float, vel: Vec3, force_i: Vec3) -> float:
+def take_fix_velocity(
+    s: ComplementaryState, p: ComplementaryGains, valid_s: float, vel: Vec3, force_i: Vec3
+) -> float:
     """Use the change of the GPS velocity since the last fix as the acceleration.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     valid_s : float
         When the fix was valid.

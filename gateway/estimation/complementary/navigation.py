@@ -10,9 +10,12 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC
-from gateway.estimation.complementary.state import Gains, State
-from gateway.estimation.place import BARO_STALE_S
-from gateway.estimation.record import FloatArray, as_quat, put
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
+from gateway.estimation.kernel_record import FloatArray, as_quat, put
+from gateway.estimation.local_position import BARO_STALE_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -28,12 +31,12 @@ REST_DECAY_S: Final = 0.5
 
 
 @compiled
-def dead_reckon(s: State, force_b: Vec3, dt: float) -> None:
+def dead_reckon(s: ComplementaryState, force_b: Vec3, dt: float) -> None:
     """Integrate the acceleration twice: the inertial path of eq. 1, 2, 7 and 8.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
     force_b : tuple of 3 floats
         Specific force in body FRD, m/s2.
@@ -54,7 +57,7 @@ def dead_reckon(s: State, force_b: Vec3, dt: float) -> None:
 
 
 @compiled
-def restart_at(s: State, pos: Vec3, vel: Vec3, lag: float) -> None:
+def restart_at(s: ComplementaryState, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix alone."""
     put(s.vel_n, vel)
     for k in range(2):
@@ -70,7 +73,9 @@ def restart_at(s: State, pos: Vec3, vel: Vec3, lag: float) -> None:
 
 
 @compiled
-def is_plausible(s: State, p: Gains, row: FloatArray, off_m: float, off_mps: float) -> bool:
+def is_plausible(
+    s: ComplementaryState, p: ComplementaryGains, row: FloatArray, off_m: float, off_mps: float
+) -> bool:
     """Judge a fix by its distance from dead reckoning, the wider the longer that has run."""
     age = min(s.time_s - s.fix_s, 120.0)
     h_acc = row[GPS_H_ACC]
@@ -82,15 +87,20 @@ def is_plausible(s: State, p: Gains, row: FloatArray, off_m: float, off_mps: flo
 
 @compiled
 def blend_fix(
-    s: State, p: Gains, pos: Vec3, vel: Vec3, past: tuple[Vec3, Vec3], lag: float
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    pos: Vec3,
+    vel: Vec3,
+    past: tuple[Vec3, Vec3],
+    lag: float,
 ) -> None:
     """Blend one accepted fix: eq. 1, 2, 7 and 8 at the time the fix was valid.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     pos, vel : tuple of 3 floats
         The fix.
@@ -121,7 +131,7 @@ def blend_fix(
 
 
 @compiled
-def learn_accel_bias(s: State, gain_vel: float, vel: Vec3, past_vel: Vec3) -> None:
+def learn_accel_bias(s: ComplementaryState, gain_vel: float, vel: Vec3, past_vel: Vec3) -> None:
     """Take what the fixes keep moving the level velocity by for an error fixed in the body.
 
     Only dead reckoning is relieved of it: the attitude holds its own against such an error.
@@ -133,14 +143,14 @@ def learn_accel_bias(s: State, gain_vel: float, vel: Vec3, past_vel: Vec3) -> No
 
 
 @compiled
-def take_baro(s: State, p: Gains, alt_m: float) -> None:
+def take_baro(s: ComplementaryState, p: ComplementaryGains, alt_m: float) -> None:
     """Blend one barometer height.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
-    p : Gains
+    p : ComplementaryGains
         Constants.
     alt_m : float
         Pressure altitude, positive up.
@@ -168,7 +178,7 @@ def take_baro(s: State, p: Gains, alt_m: float) -> None:
 
 
 @compiled
-def stand_still(s: State, dt: float) -> None:
+def stand_still(s: ComplementaryState, dt: float) -> None:
     """Let the velocity fade while the aircraft stands."""
     kept = math.exp(-dt / REST_DECAY_S)
     for k in range(3):

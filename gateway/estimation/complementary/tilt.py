@@ -13,8 +13,8 @@ References
 import math
 
 from gateway.compiled import compiled
-from gateway.estimation.complementary.state import State
-from gateway.estimation.record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.complementary.complementary_state import ComplementaryState
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -60,7 +60,7 @@ def cutoff_radps(tau_s: float) -> float:
 
 
 @compiled
-def strapdown(s: State, gyro: Vec3, dt: float) -> None:
+def strapdown(s: ComplementaryState, gyro: Vec3, dt: float) -> None:
     """Integrate the angular rate: eq. 13 with a rotation vector."""
     rate = (gyro[0] - s.bias_b[0], gyro[1] - s.bias_b[1], gyro[2] - s.bias_b[2])
     put(s.rate_b, rate)
@@ -69,7 +69,7 @@ def strapdown(s: State, gyro: Vec3, dt: float) -> None:
 
 
 @compiled
-def refresh(s: State) -> None:
+def refresh(s: ComplementaryState) -> None:
     """Put the parts of the attitude together: heading, level, gyroscope."""
     level = multiply(as_quat(s.q_ei), as_quat(s.q_ib))
     put_quat(s.q_eb, level)
@@ -78,12 +78,12 @@ def refresh(s: State) -> None:
 
 
 @compiled
-def take_gravity(s: State, force_i: Vec3, tau_s: float, dt: float) -> None:
+def take_gravity(s: ComplementaryState, force_i: Vec3, tau_s: float, dt: float) -> None:
     """Feed one observation of minus gravity to the low-pass and level the attitude by it.
 
     Parameters
     ----------
-    s : State
+    s : ComplementaryState
         Changed in place.
     force_i : tuple of 3 floats
         Specific force less acceleration in the inertial frame, m/s2.
@@ -106,7 +106,7 @@ def take_gravity(s: State, force_i: Vec3, tau_s: float, dt: float) -> None:
 
 
 @compiled
-def level(s: State) -> None:
+def level(s: ComplementaryState) -> None:
     """Turn the level frame the shortest way so that the low-passed force points up."""
     x, y, z = rotate(as_quat(s.q_ei), as_vec(s.force_lp_i))
     norm = math.sqrt(x * x + y * y + z * z)

@@ -13,8 +13,8 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import (
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
@@ -25,9 +25,9 @@ from gateway.estimation.eskf.state import (
     TILT,
     VEL,
     WANDER,
-    State,
+    EskfState,
 )
-from gateway.estimation.record import FloatArray, as_quat, put_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, put_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
 SCALE_S: Final = 1.0
@@ -39,7 +39,7 @@ MAX_TILT_VAR: Final = 3.0
 
 
 @compiled
-def propagate(s: State, p: Gains) -> None:
+def propagate(s: EskfState, p: EskfGains) -> None:
     """Carry the covariance over the pending time: `F P F^T + Q`.
 
     With `R` the integral of `R_nb`, `f` that of the specific force in NED and `dt` the time:
@@ -73,7 +73,7 @@ def propagate(s: State, p: Gains) -> None:
 
 
 @compiled
-def transit(s: State, P: FloatArray) -> None:
+def transit(s: EskfState, P: FloatArray) -> None:
     """Multiply `P` by the transition matrix from the left; given `P^T`, `P` from the right."""
     R, W, dt = s.pending_turn, s.pending_scaled, s.pending_s
     f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
@@ -117,14 +117,14 @@ def forget(P: FloatArray, k: int, variance: float) -> None:
 
 
 @compiled
-def clear(s: State) -> None:
+def clear(s: EskfState) -> None:
     """Begin a measurement: an empty row, no state held."""
     s.h[:] = 0.0
     s.held[:] = 0.0
 
 
 @compiled
-def remainder(s: State, innovation: float) -> float:
+def remainder(s: EskfState, innovation: float) -> float:
     """Take from an innovation what the measurements before it in the group have explained."""
     for j in range(STATES):
         innovation -= s.h[j] * s.dx[j]
@@ -132,7 +132,7 @@ def remainder(s: State, innovation: float) -> float:
 
 
 @compiled
-def spread(s: State, variance: float) -> float:
+def spread(s: EskfState, variance: float) -> float:
     """Compute `P h` and the variance of the innovation, `h^T P h` and the noise."""
     total = variance
     for i in range(STATES):
@@ -145,14 +145,14 @@ def spread(s: State, variance: float) -> float:
 
 
 @compiled
-def distance_sq(s: State, innovation: float, variance: float) -> float:
+def distance_sq(s: EskfState, innovation: float, variance: float) -> float:
     """Tell the normalised innovation squared of the row in `h`."""
     rest = remainder(s, innovation)
     return rest * rest / spread(s, variance)
 
 
 @compiled
-def absorb(s: State, innovation: float, variance: float, gate_sq: float) -> None:
+def absorb(s: EskfState, innovation: float, variance: float, gate_sq: float) -> None:
     """Update by one number whose row stands in `h`; the states in `held` are only considered.
 
     Their gain is zero, their uncertainty still counts: the Schmidt-Kalman update. It is for
@@ -160,7 +160,7 @@ def absorb(s: State, innovation: float, variance: float, gate_sq: float) -> None
 
     Parameters
     ----------
-    s : State
+    s : EskfState
         `P` and `dx` are changed.
     innovation : float
         Measured less expected.
@@ -180,13 +180,13 @@ def absorb(s: State, innovation: float, variance: float, gate_sq: float) -> None
 
 
 @compiled
-def hold(s: State, first: int, count: int) -> None:
+def hold(s: EskfState, first: int, count: int) -> None:
     """Mark states as only considered."""
     s.held[first : first + count] = 1.0
 
 
 @compiled
-def inject(s: State) -> None:
+def inject(s: EskfState) -> None:
     """Move the errors found into the nominal state."""
     d = s.dx
     turn = from_rotation_vector((d[TILT], d[TILT + 1], d[TILT + 2]))

@@ -7,23 +7,23 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment import collect_match
 from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.eskf.covariance import propagate
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import EskfState
 from gateway.estimation.eskf.measure import (
     absorb_fix,
     lag_integrals,
     learn_wander,
     place_distance_sq,
 )
-from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.start import (
     relock_at,
     restart_at,
     start_heading_by_match,
     turn_heading,
 )
-from gateway.estimation.eskf.state import State
-from gateway.estimation.health import is_sound
 from gateway.estimation.history import recall
-from gateway.estimation.place import (
+from gateway.estimation.kernel_record import FloatArray, as_vec, put
+from gateway.estimation.local_position import (
     NEVER_S,
     fix_position,
     fix_velocity,
@@ -31,7 +31,7 @@ from gateway.estimation.place import (
     move_origin,
     past_state,
 )
-from gateway.estimation.record import FloatArray, as_vec, put
+from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
 
 MIN_BASELINE_S: Final = 0.15
@@ -43,14 +43,14 @@ ZERO: Final = (0.0, 0.0, 0.0)
 
 
 @compiled
-def take_gps(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
+def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     """Take in one fix at its arrival.
 
     Parameters
     ----------
-    s : State
+    s : EskfState
         Changed in place.
-    p : Gains
+    p : EskfGains
         Constants.
     time_us : int
         Arrival on the gateway clock.
@@ -82,7 +82,7 @@ def take_gps(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
 
 
 @compiled
-def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
+def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Update by a fix that lies near, reject one that does not, relock on those that insist."""
     propagate(s, p)
     past_pos, past_vel = past_state(s, s.then, lag)
@@ -106,14 +106,14 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
 
 
 @compiled
-def note_contradiction(s: State, off_m: float) -> None:
+def note_contradiction(s: EskfState, off_m: float) -> None:
     """Note how far off the fixes are: two in a row, for one alone may be nonsense."""
     s.contradiction_m = min(off_m, s.off_last_m)
     s.off_last_m = off_m
 
 
 @compiled
-def accept(s: State, vel: Vec3) -> None:
+def accept(s: EskfState, vel: Vec3) -> None:
     """Note that a fix was used."""
     s.fix_s = s.time_s
     put(s.fix_vel, vel)
@@ -121,7 +121,7 @@ def accept(s: State, vel: Vec3) -> None:
 
 
 @compiled
-def show_fix(s: State, pos: Vec3, vel: Vec3) -> None:
+def show_fix(s: EskfState, pos: Vec3, vel: Vec3) -> None:
     """Show a fix as it is while it cannot be fused: without a heading."""
     put(s.fix_vel, vel)
     s.fix_s = s.time_s
@@ -131,7 +131,7 @@ def show_fix(s: State, pos: Vec3, vel: Vec3) -> None:
 
 
 @compiled
-def match_heading(s: State, valid_s: float, vel: Vec3, integral: Vec3) -> None:
+def match_heading(s: EskfState, valid_s: float, vel: Vec3, integral: Vec3) -> None:
     """Collect the match of GPS and inertial accelerations; it may give the first heading."""
     dt = valid_s - s.fix_valid_s
     if dt < MIN_BASELINE_S:
@@ -148,7 +148,7 @@ def match_heading(s: State, valid_s: float, vel: Vec3, integral: Vec3) -> None:
 
 
 @compiled
-def learn_declination(s: State, declination_rad: float) -> None:
+def learn_declination(s: EskfState, declination_rad: float) -> None:
     """Turn a magnetic heading to true north when the declination becomes known."""
     if not math.isfinite(declination_rad):
         return

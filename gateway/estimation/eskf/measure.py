@@ -20,8 +20,8 @@ from gateway.estimation.eskf.covariance import (
     inject,
     propagate,
 )
-from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import (
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
@@ -30,9 +30,9 @@ from gateway.estimation.eskf.state import (
     TILT,
     VEL,
     WANDER,
-    State,
+    EskfState,
 )
-from gateway.estimation.record import FloatArray, as_quat, as_vec
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -56,7 +56,7 @@ FAR_SQ: Final = 1e12
 
 
 @compiled
-def set_turned(s: State, k: int, w: Vec3) -> None:
+def set_turned(s: EskfState, k: int, w: Vec3) -> None:
     """Put the dependence of `(tilt x w)[k]` on the tilt into the row."""
     a, b = (k + 1) % 3, (k + 2) % 3
     s.h[TILT + a] = w[b]
@@ -64,7 +64,7 @@ def set_turned(s: State, k: int, w: Vec3) -> None:
 
 
 @compiled
-def set_bias_row(s: State, k: int, share: float) -> None:
+def set_bias_row(s: EskfState, k: int, share: float) -> None:
     """Put `share` times row `k` of `R_nb` at the accelerometer bias."""
     q = as_quat(s.q_nb)
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
@@ -74,12 +74,12 @@ def set_bias_row(s: State, k: int, share: float) -> None:
 
 
 @compiled
-def lag_integrals(s: State, then: FloatArray, lag: float) -> tuple[Vec3, Vec3]:
+def lag_integrals(s: EskfState, then: FloatArray, lag: float) -> tuple[Vec3, Vec3]:
     """Integrate the specific force in NED once and twice over the lag.
 
     Parameters
     ----------
-    s : State
+    s : EskfState
         Present integrals.
     then : ndarray, shape (INTEGRALS,)
         Integrals when the fix was valid.
@@ -103,7 +103,7 @@ def lag_integrals(s: State, then: FloatArray, lag: float) -> tuple[Vec3, Vec3]:
 
 
 @compiled
-def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
+def velocity_row(s: EskfState, k: int, once: Vec3, lag: float) -> None:
     """Write the row of one component of a late velocity."""
     clear(s)
     set_turned(s, k, (-once[0], -once[1], -once[2]))
@@ -112,7 +112,7 @@ def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
 
 
 @compiled
-def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
+def position_row(s: EskfState, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
     """Write the row of one component of a late position; GPS adds its slow error."""
     clear(s)
     w = (lag * once[0] - twice[0], lag * once[1] - twice[1], lag * once[2] - twice[2])
@@ -130,7 +130,7 @@ def told(variance: float, accuracy: float, share: float) -> float:
 
 
 @compiled
-def learn_wander(s: State, p: Gains, row: FloatArray) -> None:
+def learn_wander(s: EskfState, p: EskfGains, row: FloatArray) -> None:
     """Take the size of the GPS position's slow error from a fix's own accuracies."""
     for k in range(3):
         usual = p.gps_wander_var if k < 2 else p.gps_height_wander_var
@@ -139,7 +139,7 @@ def learn_wander(s: State, p: Gains, row: FloatArray) -> None:
 
 
 @compiled
-def lateness(s: State, p: Gains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
+def lateness(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
     """Compute the variances that the jitter of the latency adds to position and velocity."""
     v, j = s.vel_n, p.gps_jitter_sq
     span = max(lag, 0.02)
@@ -152,7 +152,7 @@ def lateness(s: State, p: Gains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
 
 @compiled
 def place_distance_sq(
-    s: State, p: Gains, row: FloatArray, off_pos: Vec3, once: Vec3, twice: Vec3, lag: float
+    s: EskfState, p: EskfGains, row: FloatArray, off_pos: Vec3, once: Vec3, twice: Vec3, lag: float
 ) -> float:
     """Tell how unlikely the horizontal place of a fix is, before any of its numbers is used.
 
@@ -172,8 +172,8 @@ def place_distance_sq(
 
 @compiled
 def absorb_fix(
-    s: State,
-    p: Gains,
+    s: EskfState,
+    p: EskfGains,
     row: FloatArray,
     off_pos: Vec3,
     off_vel: Vec3,
@@ -185,9 +185,9 @@ def absorb_fix(
 
     Parameters
     ----------
-    s : State
+    s : EskfState
         Changed in place.
-    p : Gains
+    p : EskfGains
         Constants.
     row : ndarray, shape (GPS_COLUMNS,)
         The fix, for its accuracies.
@@ -214,7 +214,7 @@ def absorb_fix(
 
 
 @compiled
-def compass_row(s: State, field_n: Vec3) -> None:
+def compass_row(s: EskfState, field_n: Vec3) -> None:
     """Write the row of a compass: the heading, and the tilt through the field's dip."""
     clear(s)
     north, east, down = field_n
@@ -230,7 +230,7 @@ def compass_row(s: State, field_n: Vec3) -> None:
 
 @compiled
 def absorb_compass(
-    s: State, p: Gains, field_n: Vec3, declination: float, weight: float, dt: float
+    s: EskfState, p: EskfGains, field_n: Vec3, declination: float, weight: float, dt: float
 ) -> None:
     """Update by the direction of the horizontal field, `dt` after the last such update."""
     propagate(s, p)
@@ -246,7 +246,7 @@ def absorb_compass(
 
 
 @compiled
-def absorb_baro(s: State, p: Gains, down_m: float) -> None:
+def absorb_baro(s: EskfState, p: EskfGains, down_m: float) -> None:
     """Update by the barometer's depth below zero height."""
     propagate(s, p)
     clear(s)
@@ -257,7 +257,7 @@ def absorb_baro(s: State, p: Gains, down_m: float) -> None:
 
 
 @compiled
-def absorb_velocity(s: State, p: Gains, variance: float) -> None:
+def absorb_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
     """Update by a velocity of about zero, for want of better."""
     propagate(s, p)
     for k in range(3):
@@ -270,7 +270,7 @@ def absorb_velocity(s: State, p: Gains, variance: float) -> None:
 
 
 @compiled
-def absorb_rest(s: State, p: Gains) -> None:
+def absorb_rest(s: EskfState, p: EskfGains) -> None:
     """Update by standing still: no velocity, and a rate that is the bias."""
     propagate(s, p)
     rate = as_vec(s.gyro_rest)

@@ -5,9 +5,8 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import forget, propagate
-from gateway.estimation.eskf.measure import compass_row
-from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import (
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
@@ -18,11 +17,12 @@ from gateway.estimation.eskf.state import (
     TILT,
     VEL,
     WANDER,
-    State,
+    EskfState,
 )
-from gateway.estimation.health import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
-from gateway.estimation.place import NEVER_S
-from gateway.estimation.record import as_quat, as_vec, put, put_quat
+from gateway.estimation.eskf.measure import compass_row
+from gateway.estimation.kernel_record import as_quat, as_vec, put, put_quat
+from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.sensor_faults import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
 from gateway.geometry.quaternion import from_euler, multiply, normalise
 from gateway.records import NAN, Vec3
 
@@ -37,7 +37,7 @@ RELOCK_HEADING_VAR: Final = 0.3**2
 
 
 @compiled
-def start(s: State, p: Gains) -> None:
+def start(s: EskfState, p: EskfGains) -> None:
     """Set a fresh state."""
     put_quat(s.q_nb, (1.0, 0.0, 0.0, 0.0))
     for k in range(3):
@@ -52,7 +52,7 @@ def start(s: State, p: Gains) -> None:
 
 
 @compiled
-def forget_times(s: State) -> None:
+def forget_times(s: EskfState) -> None:
     """Drop all that is tied to the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.fix_valid_s = s.baro_s = s.pseudo_s = NEVER_S
     s.reject_last[0] = NEVER_S
@@ -61,7 +61,7 @@ def forget_times(s: State) -> None:
 
 
 @compiled
-def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
+def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first sound sample, level by its specific force."""
     s.fault = 0 if is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2) else 1
     if s.fault == 1:
@@ -82,7 +82,7 @@ def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
 
 
 @compiled
-def turn_heading(s: State, turn_rad: float) -> None:
+def turn_heading(s: EskfState, turn_rad: float) -> None:
     """Turn the whole attitude about down."""
     half = 0.5 * turn_rad
     turn = (math.cos(half), 0.0, 0.0, math.sin(half))
@@ -93,7 +93,7 @@ def turn_heading(s: State, turn_rad: float) -> None:
 
 
 @compiled
-def start_heading_by_compass(s: State, p: Gains, turn_rad: float) -> None:
+def start_heading_by_compass(s: EskfState, p: EskfGains, turn_rad: float) -> None:
     """Take the heading from the compass."""
     turn_heading(s, turn_rad)
     forget(s.P, TILT + 2, p.mag_var)
@@ -101,7 +101,7 @@ def start_heading_by_compass(s: State, p: Gains, turn_rad: float) -> None:
 
 
 @compiled
-def doubt_iron(s: State, p: Gains) -> None:
+def doubt_iron(s: EskfState, p: EskfGains) -> None:
     """Look for iron that the calibration left, once the GPS can tell it from the heading.
 
     A heading that came from the compass has the iron's error, reversed.
@@ -121,7 +121,7 @@ def doubt_iron(s: State, p: Gains) -> None:
 
 
 @compiled
-def start_heading_by_match(s: State, turn_rad: float, variance: float) -> None:
+def start_heading_by_match(s: EskfState, turn_rad: float, variance: float) -> None:
     """Take the heading from GPS against inertial acceleration."""
     turn_heading(s, turn_rad)
     forget(s.P, TILT + 2, variance)
@@ -129,14 +129,14 @@ def start_heading_by_match(s: State, turn_rad: float, variance: float) -> None:
 
 
 @compiled
-def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
+def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix alone.
 
     Parameters
     ----------
-    s : State
+    s : EskfState
         Changed in place.
-    p : Gains
+    p : EskfGains
         Constants.
     pos, vel : tuple of 3 floats
         The fix, metres from the origin and m/s.
@@ -161,7 +161,7 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
 
 
 @compiled
-def restart_baro(s: State, p: Gains) -> None:
+def restart_baro(s: EskfState, p: EskfGains) -> None:
     """Take the barometer's offset from the present height."""
     propagate(s, p)
     s.baro_bias_m = s.pos_n[2] - s.baro_down_m
@@ -172,13 +172,13 @@ def restart_baro(s: State, p: Gains) -> None:
 
 
 @compiled
-def tie(s: State, i: int, j: int, covariance: float) -> None:
+def tie(s: EskfState, i: int, j: int, covariance: float) -> None:
     """Set one covariance."""
     s.P[i, j] = s.P[j, i] = covariance
 
 
 @compiled
-def start_position(s: State, k: int, value: float, noise_var: float) -> None:
+def start_position(s: EskfState, k: int, value: float, noise_var: float) -> None:
     """Start one coordinate at a fix: the fix's slow error is then its own, reversed."""
     wander_var = s.wander_var[k]
     s.pos_n[k], s.wander_n[k] = value, 0.0
@@ -188,14 +188,14 @@ def start_position(s: State, k: int, value: float, noise_var: float) -> None:
 
 
 @compiled
-def relock_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
+def relock_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Start anew where fixes have insisted; whatever was wrong may be the heading."""
     restart_at(s, p, pos, vel, lag)
     s.P[TILT + 2, TILT + 2] += RELOCK_HEADING_VAR
 
 
 @compiled
-def end_dead_reckoning(s: State, p: Gains) -> None:
+def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
     """Give position and velocity up; from here on the velocity only keeps the attitude level."""
     propagate(s, p)
     s.aided = 0
@@ -205,7 +205,7 @@ def end_dead_reckoning(s: State, p: Gains) -> None:
 
 
 @compiled
-def bridge_gap(s: State, p: Gains, dt: float) -> None:
+def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: straight ahead, and much less sure."""
     propagate(s, p)
     s.fault = 1

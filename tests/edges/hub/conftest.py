@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.edges.hub import Hub
+from gateway.edges.hub.hub import Hub
 from gateway.records import Incoming, Outgoing
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import message_id_of, restamp
 

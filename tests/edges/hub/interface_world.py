@@ -13,9 +13,9 @@ import sys
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.edges.clock import GatewayClock
-from gateway.edges.hub import Hub
+from gateway.edges.hub.hub import Hub
 from gateway.records import Outgoing
-from gateway.routing.settings import HubSettings
+from gateway.routing.hub_settings import HubSettings
 
 FAR_CLIENT = """
 import socket

@@ -153,7 +153,7 @@ async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> Non
     frame = rig.vehicle.attitude()
     hub.send(rig.out(frame))
     assert [await echo.receive(), await other.receive()] == [frame, frame]
-    echo.socket.sendto(frame, ("127.0.0.1", hub._links[1]._port))
+    echo.socket.sendto(frame, ("127.0.0.1", hub._clients[1]._port))
     await rig.until(lambda: hub.counters().looped == 1)
     assert other.is_silent()
 
@@ -306,7 +306,7 @@ class TestExpress:
             world.autopilot.say(frame)
             assert await world.first.receive() == frame
         assert (await late.receive())[7] == 30
-        hub.reconfigure(hub._links[hub.clients()[-1].client_id])
+        hub.reconfigure(hub._clients[hub.clients()[-1].client_id])
         hub.remove(f"udp:127.0.0.1:{late.port}")
         world.autopilot.say(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30

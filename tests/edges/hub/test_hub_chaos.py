@@ -137,5 +137,5 @@ async def test_chaos(rig: Any, seed: int) -> None:
     while await last.receive() != frame:
         pass
     assert errors == []
-    assert not chaos.hub._fanout._outlets.keys() - chaos.hub._links.keys()
-    assert set(chaos.hub._table._heard) <= set(chaos.hub._links)
+    assert not chaos.hub._fanout._outlets.keys() - chaos.hub._clients.keys()
+    assert set(chaos.hub._table._heard) <= set(chaos.hub._clients)

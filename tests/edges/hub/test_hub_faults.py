@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateway.edges.hub import VISITS_IN_FULL
+from gateway.edges.hub.hub import VISITS_IN_FULL
 from gateway.routing.digest import WINDOW_US
 
 pytestmark = pytest.mark.io

@@ -14,11 +14,11 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import Action
-from gateway.edges.hub import Hub
+from gateway.edges.hub.hub import Hub
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.settings import HubSettings
-from gateway.vehicle.settings import VehicleSettings
+from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.samples import FIX, sample_at, state_at
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

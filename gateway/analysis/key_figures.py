@@ -1,0 +1,97 @@
+"""One flight in a few numbers, so that two can stand side by side."""
+
+from typing import Final
+
+import numpy as np
+
+from gateway.analysis.blending import make_judge, score
+from gateway.analysis.case import Case, with_estimator
+from gateway.analysis.flight_arrays import FloatArray, FusionSettings, fixes_of
+from gateway.analysis.fusion import fuse
+from gateway.analysis.interpolation import withhold
+from gateway.analysis.metrics import errors_over_time, rms
+from gateway.settings import Settings, fields_of
+from gateway.units import US_PER_S
+
+HOLD_OUT: Final = 5
+"""Every so many-th fix is withheld to judge by."""
+
+
+def summarise(case: Case) -> dict[str, float]:
+    """Sum a flight up.
+
+    Parameters
+    ----------
+    case : Case
+
+    Returns
+    -------
+    dict of str to float
+        By what it is, unit included; NaN where it cannot be told.
+    """
+    flight, track = case.flight, case.track
+    fixes = fixes_of(flight)
+    gap_s = np.diff(fixes.arrival_us) / US_PER_S
+    shaking = flight.accel_b_mps2 - case.sensed.table[:, :3]
+    speed = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
+    found = {
+        "duration, s": flight.duration_s,
+        "IMU samples a second": flight.rate_hz,
+        "usable GPS fixes": float(len(fixes)),
+        "longest time without a fix, s": float(gap_s.max()) if len(gap_s) else float("nan"),
+        "distance flown, m": _distance_m(case),
+        "greatest height above the start, m": _climbed_m(track.alt_amsl_m[flight.scored]),
+        "greatest ground speed, m/s": _greatest(speed[flight.scored]),
+        "shaking above the low-pass, m/s² RMS": rms(shaking),
+        "error at withheld fixes, m RMS": withheld_error_m(case, case.chosen),
+    }
+    if flight.reference is not None:
+        errors = errors_over_time(track, flight.reference.track)
+        for key, name in (
+            ("tilt_deg", "tilt error, deg RMS"),
+            ("heading_deg", "heading error, deg RMS"),
+            ("horizontal_m", "horizontal error, m RMS"),
+            ("height_m", "height error, m RMS"),
+        ):
+            found[name] = rms(errors[key][flight.scored])
+    return found
+
+
+def withheld_error_m(case: Case, estimator: str) -> float:
+    """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
+    judge = make_judge(case.flight, withhold(case.flight, HOLD_OUT))
+    track = fuse(judge.fused, with_estimator(case.fusion, estimator), case.sensed)
+    return score(track, judge)["held_m"]
+
+
+def changed_settings(a: FusionSettings, b: FusionSettings) -> list[tuple[str, object, object]]:
+    """List the settings that differ: key, value in `a`, value in `b`."""
+    return _changes(a, b, "")
+
+
+def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, object]]:
+    found: list[tuple[str, object, object]] = []
+    for field in fields_of(type(a)):
+        of_a, of_b = getattr(a, field.name), getattr(b, field.name)
+        if field.section:
+            found += _changes(of_a, of_b, f"{prefix}{field.name}.")
+        elif of_a != of_b:
+            found.append((f"{prefix}{field.name}", of_a, of_b))
+    return found
+
+
+def _distance_m(case: Case) -> float:
+    """Way over ground, by the fused speed."""
+    speed = np.hypot(case.track.vel_n_mps[:, 0], case.track.vel_n_mps[:, 1])
+    dt_s = np.diff(case.flight.time_s, append=case.flight.time_s[-1])
+    return float(np.nansum(speed * dt_s))
+
+
+def _climbed_m(alt_m: FloatArray) -> float:
+    known = alt_m[np.isfinite(alt_m)]
+    return float(known.max() - known[0]) if len(known) else float("nan")
+
+
+def _greatest(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else float("nan")

@@ -1,0 +1,63 @@
+"""The report of one flight, put together from its sections."""
+
+from collections.abc import Callable
+from typing import Final
+
+from gateway.analysis.case import Case
+from gateway.analysis.flight_arrays import fixes_of
+from gateway.analysis.reporting.page import Fact, Report, Section
+from gateway.analysis.reporting.sections.acceleration import acceleration
+from gateway.analysis.reporting.sections.comparison import comparison
+from gateway.analysis.reporting.sections.estimators import estimators
+from gateway.analysis.reporting.sections.ground_track import gps_interpolation, ground_track
+from gateway.analysis.reporting.sections.orientation import orientation
+from gateway.analysis.reporting.sections.raw_sensors import heights, magnetometer, noise, timing
+from gateway.analysis.reporting.sections.weights import weights
+
+SECTIONS: Final[tuple[Callable[[Case], Section | None], ...]] = (
+    ground_track,
+    estimators,
+    orientation,
+    acceleration,
+    gps_interpolation,
+    weights,
+    heights,
+    magnetometer,
+    noise,
+    timing,
+)
+"""In the order of the page; a section that the flight has no data for is left out."""
+
+
+def make_report(case: Case, other: Case | None = None) -> Report:
+    """Build the report of one flight.
+
+    Parameters
+    ----------
+    case : Case
+    other : Case, optional
+        Another flight, or the same with other settings, to compare it with.
+
+    Returns
+    -------
+    Report
+        Its figures are not drawn yet.
+    """
+    compared = [comparison(case, other)] if other is not None else []
+    sections = compared + [section for build in SECTIONS if (section := build(case)) is not None]
+    return Report(
+        title=f"Flight report: {case.flight.name}",
+        story=case.flight.story,
+        facts=_facts(case),
+        sections=sections,
+    )
+
+
+def _facts(case: Case) -> list[Fact]:
+    flight = case.flight
+    return [
+        Fact(f"{flight.duration_s:.0f} s", "duration"),
+        Fact(f"{len(flight.time_us)}", f"IMU samples, {flight.rate_hz:.0f} a second"),
+        Fact(f"{len(fixes_of(flight))}", "usable GPS fixes"),
+        Fact(case.chosen, "estimator chosen by the settings"),
+    ]

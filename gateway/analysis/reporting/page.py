@@ -1,0 +1,201 @@
+"""The report as one HTML page that needs nothing else, and its figures and tables as files."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import jinja2
+import pandas as pd
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from gateway.analysis.processes import START, copies, cores
+from gateway.analysis.reporting.style import (
+    NARROW_IN,
+    WIDE_IN,
+    for_page,
+    stand_alone,
+    styled,
+    to_png,
+    to_svg,
+)
+
+PAGE_NAME: Final = "index.html"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One figure and the sentence that says what one sees."""
+
+    name: str
+    """File name without its ending."""
+    draw: Callable[[float], Figure]
+    """Draws it for a width in inches."""
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReportTable:
+    """One table; numbers are shown with `digits` decimals and written with all."""
+
+    name: str
+    frame: pd.DataFrame
+    caption: str
+    digits: int = 2
+    strong: tuple[int, ...] = ()
+    """Rows that are to be seen first."""
+
+    def rows(self) -> list[list[str]]:
+        """Write the cells as text."""
+        return [[self._text(value) for value in row] for row in self.frame.itertuples(index=False)]
+
+    def _text(self, value: object) -> str:
+        if isinstance(value, float):
+            return "–" if value != value else f"{value:z.{self.digits}f}"
+        return str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One topic of the report."""
+
+    title: str
+    lead: str
+    """A few sentences; what stands between backticks is code."""
+    pictures: list[Picture] = field(default_factory=list)
+    tables: list[ReportTable] = field(default_factory=list)
+
+    @property
+    def anchor(self) -> str:
+        """Its place in the page's address."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One number of the head of the page."""
+
+    value: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The whole page."""
+
+    title: str
+    story: str
+    facts: list[Fact]
+    sections: list[Section]
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A picture as it stands in the page."""
+
+    name: str
+    wide: Markup
+    narrow: Markup
+    caption: Markup
+
+
+def write_report(
+    report: Report,
+    folder: Path,
+    on_picture: Callable[[], None] = lambda: None,
+    jobs: int | None = None,
+) -> Path:
+    """Write the page, its figures as SVG and PNG, and its tables as CSV.
+
+    Parameters
+    ----------
+    report : Report
+    folder : Path
+        Made if it is not there.
+    on_picture : callable
+        Called after each figure, for a progress bar; it must not be a thread's.
+    jobs : int, optional
+        Processes that draw; one a core by default.
+
+    Returns
+    -------
+    Path
+        The page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for section in report.sections:
+        for table in section.tables:
+            table.frame.to_csv(folder / f"{table.name}.csv", index=False)
+    pictures = [picture for section in report.sections for picture in section.pictures]
+    drawn = {}
+    for picture in draw_all(pictures, folder, jobs or cores()):
+        drawn[picture.name] = picture
+        on_picture()
+    page = folder / PAGE_NAME
+    page.write_text(render_page(report, drawn), encoding="utf-8")
+    return page
+
+
+def render_page(report: Report, drawn: dict[str, Drawn]) -> str:
+    """Fill the page's template."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("gateway.analysis.reporting", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["prose"] = prose
+    return environment.get_template("page.html.j2").render(report=report, drawn=drawn)
+
+
+def prose(text: str) -> Markup:
+    """Escape a text and set what stands between backticks as code."""
+    escaped = str(jinja2.filters.do_forceescape(text))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped))
+
+
+def count_pictures(sections: Iterable[Section]) -> int:
+    """Count the figures of a report."""
+    return sum(len(section.pictures) for section in sections)
+
+
+def draw_all(pictures: Sequence[Picture], folder: Path, jobs: int) -> Iterator[Drawn]:
+    """Draw pictures into files, in any order."""
+    if jobs == 1 or START != "fork":
+        yield from (_write_picture(picture, folder) for picture in pictures)
+        return
+    with copies(jobs, _begin, pictures, folder) as pool:
+        yield from pool.imap_unordered(_draw_one, range(len(pictures)))
+
+
+_work: tuple[Sequence[Picture], Path] | None = None
+"""Of a process that draws."""
+
+
+def _begin(pictures: Sequence[Picture], folder: Path) -> None:
+    global _work
+    _work = (pictures, folder)
+
+
+def _draw_one(index: int) -> Drawn:
+    assert _work is not None
+    pictures, folder = _work
+    return _write_picture(pictures[index], folder)
+
+
+def _write_picture(picture: Picture, folder: Path) -> Drawn:
+    with styled():
+        wide = picture.draw(WIDE_IN)
+        wide_svg = to_svg(wide)
+        (folder / f"{picture.name}.png").write_bytes(to_png(wide))
+        narrow_svg = to_svg(picture.draw(NARROW_IN))
+    (folder / f"{picture.name}.svg").write_text(stand_alone(wide_svg), encoding="utf-8")
+    return Drawn(
+        picture.name,
+        Markup(for_page(wide_svg)),
+        Markup(for_page(narrow_svg)),
+        prose(picture.caption),
+    )

@@ -1,0 +1,302 @@
+"""The sensors themselves: noise, timing and loss, the magnetometer's sphere, heights."""
+
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from gateway.analysis.case import Case
+from gateway.analysis.flight_arrays import Flight, FloatArray, IntArray, fixes_of
+from gateway.analysis.interpolation import MAX_GAP_S
+from gateway.analysis.reporting import style
+from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.analysis.spectra import allan_deviation, longest_rest, power_density
+from gateway.units import US_PER_S
+
+AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
+MIN_REST_S: Final = 5.0
+MAX_DOTS: Final = 800
+NODE_WRAP_US: Final = 1 << 32
+LONGEST_LOSS_US: Final = 60 * US_PER_S
+
+
+def noise(case: Case) -> Section:
+    """Build the section of spectra and Allan deviations."""
+    flight = case.flight
+    rest = longest_rest(flight.accel_b_mps2, flight.gyro_b_radps, flight.rate_hz)
+    rest_s = (rest.stop - rest.start) / flight.rate_hz
+    pictures = [
+        Picture(
+            "spectrum",
+            lambda width: _draw_spectrum(flight, width),
+            "Power spectral density over the whole flight. Motion is on the left, the engine's "
+            "shaking and the sensor's own noise on the right.",
+        )
+    ]
+    if rest_s >= MIN_REST_S:
+        pictures.append(
+            Picture(
+                "allan_deviation",
+                lambda width: _draw_allan(flight, rest, width),
+                f"Allan deviation in the longest rest, {rest_s:.0f} s. A slope of -1/2 is white "
+                "noise; where the line turns up, the bias wanders. So short a rest shows averaging "
+                f"times up to {rest_s / 4.0:.1f} s only.",
+            )
+        )
+        tail = ""
+    else:
+        tail = " The flight has no rest long enough for an Allan deviation."
+    return Section(
+        "Noise",
+        "What the inertial sensors feel, by frequency, and how far averaging at rest helps." + tail,
+        pictures,
+    )
+
+
+def timing(case: Case) -> Section | None:
+    """Build the section of jitter and loss; None where the recording has no node times."""
+    node = case.flight.node_time_us
+    if node is None or len(node) < 3:
+        return None
+    table = loss_table(case.flight, node)
+    return Section(
+        "Timing and loss",
+        "How evenly samples come, on the gateway's clock and on the node's own, and what is "
+        "missing between them.",
+        [
+            Picture(
+                "timing",
+                lambda width: _draw_timing(case.flight, node, width),
+                "Left: interval between neighbouring samples; a sample that is lost doubles it, "
+                "jitter spreads it. Right: samples lost in each second.",
+            )
+        ],
+        [ReportTable("timing", table, "Samples lost are gaps in the node's own time.", digits=3)],
+    )
+
+
+def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
+    """Measure jitter and loss.
+
+    Returns
+    -------
+    DataFrame
+        One row.
+    """
+    interval_us = np.diff(node_time_us) % NODE_WRAP_US
+    nominal_us = float(np.median(interval_us))
+    missing = missing_samples(node_time_us)
+    count = len(node_time_us)
+    jitter_ms = (np.diff(flight.time_us) - interval_us) * 1e-3
+    return pd.DataFrame(
+        [
+            {
+                "samples": count,
+                "nominal interval, ms": nominal_us * 1e-3,
+                "lost": int(missing.sum()),
+                "lost, %": 100.0 * float(missing.sum()) / (count + float(missing.sum())),
+                "longest gap, ms": float(np.diff(flight.time_us).max()) * 1e-3,
+                "jitter of gateway time, ms RMS": float(np.sqrt(np.mean(jitter_ms**2))),
+            }
+        ]
+    )
+
+
+def missing_samples(node_time_us: IntArray) -> FloatArray:
+    """Count the samples missing before each but the first, by the node's own clock."""
+    interval_us = np.diff(node_time_us) % NODE_WRAP_US
+    missing = np.maximum(np.rint(interval_us / np.median(interval_us)) - 1.0, 0.0)
+    # So long a gap is a node that was switched off.
+    return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
+
+
+def magnetometer(case: Case) -> Section | None:
+    """Build the section of the magnetometer's sphere; None without one."""
+    before, after = case.flight.mag_uncalibrated_b_ut, case.flight.mag_b_ut
+    if before is None or not np.isfinite(after).any():
+        return None
+    before, after = before[np.isfinite(before[:, 0])], after[np.isfinite(after[:, 0])]
+    strengths = {"before": np.linalg.norm(before, axis=1), "after": np.linalg.norm(after, axis=1)}
+    table = pd.DataFrame(
+        [
+            {
+                "calibration": name,
+                "mean field, uT": float(strength.mean()),
+                "spread, uT": float(strength.std()),
+                "spread, %": 100.0 * float(strength.std() / strength.mean()),
+            }
+            for name, strength in strengths.items()
+        ]
+    )
+    return Section(
+        "Magnetometer before and after calibration",
+        "A magnetometer that turns in the Earth's field alone measures points on a sphere about "
+        "zero. The aircraft's own iron shifts and squeezes it; the calibration undoes that.",
+        [
+            Picture(
+                "magnetometer_sphere",
+                lambda width: _draw_sphere(before, after, width),
+                "Each dot is one sample, seen from two sides; the circle is the mean field after "
+                "calibration.",
+            )
+        ],
+        [
+            ReportTable(
+                "magnetometer", table, "On a sphere about zero the spread is the noise alone."
+            )
+        ],
+    )
+
+
+def heights(case: Case) -> Section | None:
+    """Build the section of height sources; None where there is only one."""
+    flight = case.flight
+    if case.frame is None or not len(flight.baro_time_us):
+        return None
+    offset_m = baro_offset_m(flight)
+    return Section(
+        "Height sources",
+        "Height above mean sea level by GPS, by the barometer and fused. The barometer tells the "
+        f"standard atmosphere's height; it is shifted by {offset_m:+.1f} m here, so that it agrees "
+        "with GPS in the mean.",
+        [
+            Picture(
+                "heights",
+                lambda width: _draw_heights(case, offset_m, width),
+                "Above: heights. Below: what each is away from "
+                + (f"the {case.truth_name}." if flight.reference else "the fused height."),
+            )
+        ],
+        [ReportTable("heights", _height_table(case, offset_m), "Height errors.")]
+        if flight.reference
+        else [],
+    )
+
+
+def baro_offset_m(flight: Flight) -> float:
+    """Mean difference of GPS height and barometer height."""
+    fixes = fixes_of(flight)
+    baro = np.interp(fixes.valid_us, flight.baro_time_us, flight.baro_alt_m)
+    return float(np.nanmean(fixes.alt_amsl_m - baro))
+
+
+def _height_table(case: Case, offset_m: float) -> pd.DataFrame:
+    rows = []
+    for name, (time_us, alt_m, _) in _height_lines(case, offset_m).items():
+        error = alt_m - _height_reference(case, time_us)
+        error = error[np.isfinite(error)]
+        rows.append(
+            {
+                "source": name,
+                "mean error, m": float(error.mean()),
+                "spread, m": float(error.std()),
+                "worst, m": float(np.abs(error).max()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _height_lines(case: Case, offset_m: float) -> dict[str, tuple[IntArray, FloatArray, str]]:
+    flight, fixes = case.flight, fixes_of(case.flight)
+    return {
+        "GPS": (fixes.valid_us, fixes.alt_amsl_m, style.ORANGE),
+        "barometer, shifted": (flight.baro_time_us, flight.baro_alt_m + offset_m, style.GREEN),
+        f"fused ({case.chosen})": (
+            flight.time_us,
+            np.where(flight.scored, case.track.alt_amsl_m, np.nan),
+            style.BLUE,
+        ),
+    }
+
+
+def _height_reference(case: Case, time_us: IntArray) -> FloatArray:
+    track = case.flight.reference.track if case.flight.reference else case.track
+    known = np.isfinite(track.alt_amsl_m)
+    return np.asarray(
+        np.interp(time_us, track.time_us[known], track.alt_amsl_m[known], left=np.nan, right=np.nan)
+    )
+
+
+def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
+    flight = case.flight
+    figure, (above, below) = style.panels(width_in, 2, 2.1)
+    if flight.reference is not None:
+        truth = flight.reference.track.alt_amsl_m
+        style.draw(above, flight.time_s, truth, style.REFERENCE, case.truth_name, lw=3, alpha=0.3)
+    for name, (time_us, alt_m, colour) in _height_lines(case, offset_m).items():
+        seconds = flight.seconds(time_us)
+        # Nothing was measured in a dropout: the line ends at its begin.
+        alt_m = np.where(np.diff(seconds, append=seconds[-1:]) > MAX_GAP_S, np.nan, alt_m)
+        style.draw(above, seconds, alt_m, colour, name, lw=1.0)
+        style.draw(below, seconds, alt_m - _height_reference(case, time_us), colour, name, lw=1.0)
+    above.set_ylabel("height AMSL (m)")
+    below.set(ylabel="difference (m)", xlabel="time (s)")
+    style.legend_above(above, 4 if width_in >= style.WIDE_IN else 2)
+    return figure
+
+
+def _draw_spectrum(flight: Flight, width_in: float) -> Figure:
+    figure, (left, right) = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
+    signals = (
+        (left, flight.accel_b_mps2, "specific force ((m/s²)²/Hz)"),
+        (right, flight.gyro_b_radps, "angular rate ((rad/s)²/Hz)"),
+    )
+    for panel, x, label in signals:
+        frequency, density = power_density(x, flight.rate_hz)
+        for axis, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
+            panel.loglog(frequency, density[:, axis], color=colour, lw=1.0, label=name)
+        panel.set(xlabel="frequency (Hz)", ylabel=label)
+        style.legend_above(panel)
+    return figure
+
+
+def _draw_allan(flight: Flight, rest: slice, width_in: float) -> Figure:
+    figure, (left, right) = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
+    signals = (
+        (left, flight.accel_b_mps2, "specific force (m/s²)"),
+        (right, np.degrees(flight.gyro_b_radps), "angular rate (deg/s)"),
+    )
+    for panel, x, label in signals:
+        tau, deviation = allan_deviation(x[rest], flight.rate_hz)
+        for axis, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
+            panel.loglog(tau, deviation[:, axis], color=colour, label=name)
+        panel.set(xlabel="averaging time (s)", ylabel=f"Allan deviation,\n{label}")
+        style.legend_above(panel)
+    return figure
+
+
+def _draw_timing(flight: Flight, node_time_us: IntArray, width_in: float) -> Figure:
+    figure, (left, right) = style.panels(width_in, 1, 2.5, columns=2, share_x=False)
+    gateway_ms = np.diff(flight.time_us) * 1e-3
+    node_ms = np.diff(node_time_us) % NODE_WRAP_US * 1e-3
+    top_ms = 3.5 * float(np.median(node_ms))
+    bins = np.linspace(0.0, top_ms, 141).tolist()
+    for x, colour, name in ((gateway_ms, style.BLUE, "gateway"), (node_ms, style.ORANGE, "node")):
+        left.hist(x.clip(0.0, top_ms), bins, histtype="step", color=colour, label=name, lw=1.3)
+    left.set_yscale("log")
+    left.set(xlabel="interval (ms)", ylabel="samples")
+    left.legend(loc="upper right")
+    seconds = np.arange(int(flight.duration_s) + 2).tolist()
+    lost, _ = np.histogram(flight.time_s[1:], seconds, weights=missing_samples(node_time_us))
+    right.stairs(lost, seconds, color=style.RED, fill=True)
+    right.set(xlabel="time (s)", ylabel="lost in each second")
+    return figure
+
+
+def _draw_sphere(before: FloatArray, after: FloatArray, width_in: float) -> Figure:
+    figure, axes = style.panels(width_in, 1, 3.5, columns=2, share_x=False)
+    radius = float(np.linalg.norm(after, axis=1).mean())
+    angle = np.linspace(0.0, 2.0 * np.pi, 121)
+    step = max(1, len(before) // MAX_DOTS)
+    for panel, (i, j) in zip(axes, ((0, 1), (0, 2)), strict=True):
+        panel.plot(
+            before[::step, i], before[::step, j], ".", color=style.ORANGE, ms=2, label="before"
+        )
+        panel.plot(after[::step, i], after[::step, j], ".", color=style.BLUE, ms=2, label="after")
+        panel.plot(radius * np.cos(angle), radius * np.sin(angle), color=style.INK, lw=0.8)
+        panel.plot(0.0, 0.0, "+", color=style.INK, ms=8)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.set(xlabel=f"{'xyz'[i]} (uT)", ylabel=f"{'xyz'[j]} (uT)")
+    style.legend_above(axes[0])
+    return figure

@@ -1,0 +1,221 @@
+"""How the report's figures look, and how one drawing serves a light page, a dark page and a file.
+
+A figure is drawn once, in the light theme and with no ground. Inside the page its few colours are
+replaced by CSS variables, so the page's own theme colours it.
+"""
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from gateway.analysis.flight_arrays import FloatArray
+
+BLUE: Final = "#0072b2"
+ORANGE: Final = "#e69f00"
+GREEN: Final = "#009e73"
+RED: Final = "#d55e00"
+PINK: Final = "#cc79a7"
+SKY: Final = "#56b4e9"
+INK: Final = "#1b1f24"
+MUTED: Final = "#6a737d"
+GRID: Final = "#dfe3e8"
+
+CSS_NAMES: Final = {
+    BLUE: "blue", ORANGE: "orange", GREEN: "green", RED: "red", PINK: "pink", SKY: "sky",
+    INK: "ink", MUTED: "muted", GRID: "grid",
+}  # fmt: skip
+"""The palette of Okabe and Ito, which colour-blind readers can tell apart, and the page's greys."""
+
+REFERENCE: Final = INK
+"""Truth or reference is always drawn in the colour of the text."""
+
+WIDE_IN: Final = 7.6
+NARROW_IN: Final = 3.9
+"""Widths of a figure for a desktop page and for a phone, where text must not shrink."""
+
+MAX_POINTS: Final = 1500
+"""Points of a line; a denser one is drawn by its envelope."""
+
+RC: Final = {
+    "figure.constrained_layout.use": True,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "lines.linewidth": 1.2,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mavgate",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.3,
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw in the report's style."""
+    with mpl.rc_context(RC):
+        yield
+
+
+def panels(
+    width_in: float, rows: int, row_height_in: float, *, columns: int = 1, share_x: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels one below the other, or side by side where there is room.
+
+    Parameters
+    ----------
+    width_in : float
+        `WIDE_IN` or `NARROW_IN`.
+    rows : int
+        Panels below each other on a wide page.
+    row_height_in : float
+        Height of one row.
+    columns : int
+        Panels side by side on a wide page; on a narrow one they go below each other.
+    share_x : bool
+        Whether all have the same x axis.
+
+    Returns
+    -------
+    Figure, list of Axes
+        The panels row by row.
+    """
+    if width_in < WIDE_IN:
+        rows, columns = rows * columns, 1
+    figure = Figure(figsize=(width_in, rows * row_height_in))
+    axes = figure.subplots(rows, columns, sharex=share_x, squeeze=False)
+    return figure, list(axes.ravel())
+
+
+def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Thin a long line to the least and the greatest value of each stretch.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (N,)
+        The line.
+
+    Returns
+    -------
+    x, y : ndarray
+        At most `MAX_POINTS` points; the line itself if it is short enough.
+    """
+    stretch = -(-len(x) // (MAX_POINTS // 2))
+    if stretch <= 2:
+        return x, y
+    whole = len(x) // stretch * stretch
+    parts = np.where(np.isfinite(y[:whole]), y[:whole], np.nan).reshape(-1, stretch)
+    dull = ~np.isfinite(parts).any(axis=1)
+    low = np.where(dull, 0, np.argmin(np.where(np.isfinite(parts), parts, np.inf), axis=1))
+    high = np.where(dull, 0, np.argmax(np.where(np.isfinite(parts), parts, -np.inf), axis=1))
+    index = np.sort(np.column_stack([low, high]), axis=1)
+    index = (index + np.arange(len(parts))[:, np.newaxis] * stretch).ravel()
+    index = np.append(index, len(x) - 1)
+    return x[index], y[index]
+
+
+def draw(
+    axes: Axes, x: FloatArray, y: FloatArray, colour: str, label: str, **style: object
+) -> None:
+    """Draw a line, thinned."""
+    axes.plot(*envelope(x, y), color=colour, label=label, **style)
+
+
+def legend_above(axes: Axes, columns: int = 4) -> None:
+    """Put the legend between title and panel, where it hides nothing."""
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=columns, borderaxespad=0.1,
+        handlelength=1.4, columnspacing=1.2,
+    )  # fmt: skip
+    title = axes.get_title(loc="left")
+    axes.set_title(title, loc="left", pad=20.0)
+
+
+def legend_outside(figure: Figure, axes: Axes, columns: int) -> None:
+    """Put the legend above everything that stands about a panel."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper left", ncols=columns, handlelength=1.4,
+        columnspacing=1.2,
+    )  # fmt: skip
+
+
+def fit_square(axes: Axes, x: FloatArray, y: FloatArray, margin: float = 0.06) -> None:
+    """Show all points at one scale in both directions."""
+    spread = max(float(np.ptp(x)), float(np.ptp(y)), 1e-9)
+    half = (0.5 + margin) * spread
+    middle_x, middle_y = 0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.min(y) + np.max(y))
+    axes.set_xlim(middle_x - half, middle_x + half)
+    axes.set_ylim(middle_y - half, middle_y + half)
+    axes.set_aspect("equal", adjustable="box")
+
+
+def to_svg(figure: Figure) -> str:
+    """Write a figure as an SVG with the colours of the light theme and no ground."""
+    buffer = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+    # It is laid out now; the next file of the same figure need not do it again.
+    figure.set_layout_engine("none")
+    return _tidy(buffer.getvalue())
+
+
+def to_png(figure: Figure, dpi: int = 130) -> bytes:
+    """Write a figure as a PNG on white."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    return buffer.getvalue()
+
+
+def stand_alone(svg: str) -> str:
+    """Give an SVG of `to_svg` a white ground, so that any viewer shows it well."""
+    return svg.replace("<svg ", '<svg style="background: #ffffff" ', 1)
+
+
+def for_page(svg: str) -> str:
+    """Let the page's theme colour an SVG of `to_svg`."""
+    svg = svg[svg.index("<svg ") :]
+    for colour, name in CSS_NAMES.items():
+        svg = svg.replace(colour, f"var(--{name})")
+    svg = re.sub(r"(font: [^;\"]*?px) [^;\"]*", r"\1 var(--font)", svg)
+    return re.sub(r' (?:width|height)="[0-9.]+pt"', "", svg, count=2)
+
+
+def _tidy(svg: str) -> str:
+    """Drop what only matplotlib itself needs; the groups' names repeat from figure to figure."""
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'<g id="[a-zA-Z]+[0-9_]*">', "<g>", svg)
+    # A hundredth of a point is finer than any screen shows; texts keep their digits.
+    svg = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d\.\d\d)\d+", r"\1", tag[0]), svg)
+    return re.sub(r"\n\s*", "\n", svg)

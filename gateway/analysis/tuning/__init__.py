@@ -1,0 +1,1 @@
+"""Settings tried out on flights."""

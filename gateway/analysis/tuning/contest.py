@@ -1,0 +1,340 @@
+"""Settings tried out on a flight: every point of a grid, or where an optimiser leads.
+
+Each trial fuses the flight causally, from the samples alone. Some GPS fixes are withheld from the
+fusion and judge it: a filter that only copies the GPS it was given, noise and all, gains nothing.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
+
+import msgspec
+import numpy as np
+import pandas as pd
+from scipy.optimize import OptimizeResult, differential_evolution
+
+from gateway.analysis.blending import Judge, judge_of, make_judge, score
+from gateway.analysis.case import ESTIMATORS
+from gateway.analysis.flight_arrays import Flight, FlightTrack, FusionSettings
+from gateway.analysis.fusion import Sensed, fuse, sense
+from gateway.analysis.interpolation import thin, withhold
+from gateway.analysis.metrics import rms, rotation_error, total_error_rad
+from gateway.sensing.chain import SensingSettings
+from gateway.settings import Settings, fields_of
+
+Metric = Literal["held", "interpolated", "reference", "attitude"]
+COLUMN_OF: Final[dict[Metric, str]] = {
+    "held": "held_m",
+    "interpolated": "interpolated_m",
+    "reference": "reference_m",
+    "attitude": "attitude_deg",
+}
+SHORT: Final = {
+    "alpha": "estimation.paper.alpha_accel",
+    "beta": "estimation.paper.beta_velocity",
+}
+"""The paper's own names."""
+LARGEST_GRID: Final = 100_000
+SEED: Final = 1
+
+Value = float | int | str | bool
+Values = tuple[Value, ...]
+
+
+class SweepError(ValueError):
+    """A sweep that cannot be done; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """One setting that is varied."""
+
+    key: str
+    """Path from the root of the settings, such as `estimation.paper.alpha_accel`."""
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """What all trials have in common; one copy goes to each process."""
+
+    flight: Flight
+    fusion: FusionSettings
+    keys: tuple[str, ...]
+    judge: Judge
+
+
+def known_keys() -> list[str]:
+    """List every setting that can be varied."""
+    return list(_leaves(FusionSettings, ""))
+
+
+def full_key(name: str) -> str:
+    """Find a setting by its path, the end of its path, or the paper's name.
+
+    Raises
+    ------
+    SweepError
+        If there is none, or more than one.
+    """
+    name = SHORT.get(name, name)
+    found = [key for key in known_keys() if key == name or key.endswith(f".{name}")]
+    if not found:
+        raise SweepError(f"no setting ends in {name!r}")
+    if len(found) > 1 and name not in found:
+        raise SweepError(f"{name!r} may be {' or '.join(found)}")
+    return name if name in found else found[0]
+
+
+def parse_axis(name: str, text: str) -> Axis:
+    """Read an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
+
+    Raises
+    ------
+    SweepError
+        If the text is neither, or a value is not allowed.
+    """
+    key = full_key(name)
+    parts = text.split(":")
+    try:
+        values: Values
+        if len(parts) == 3:
+            steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+            # The digits that a person would write, not those of the division.
+            values = tuple(float(f"{step:.12g}") for step in steps)
+        elif len(parts) == 2:
+            values = (float(parts[0]), float(parts[1]))
+        else:
+            values = tuple(_value(part.strip()) for part in text.split(","))
+    except ValueError as error:
+        raise SweepError(f"{name}: {text!r} is no low:high:count and no list: {error}") from error
+    if not values:
+        raise SweepError(f"{name}: {text!r} holds no value")
+    for value in values:
+        with_value(FusionSettings(), key, value)
+    return Axis(key, values)
+
+
+def with_value(settings: Any, key: str, value: Value) -> Any:
+    """Give settings with one value changed.
+
+    Raises
+    ------
+    SweepError
+        If the value is not allowed there; the text names the key.
+    """
+    name, _, rest = key.partition(".")
+    if rest:
+        return msgspec.structs.replace(
+            settings, **{name: with_value(getattr(settings, name), rest, value)}
+        )
+    field = next(f for f in fields_of(type(settings)) if f.name == name)
+    if isinstance(value, float) and value.is_integer() and isinstance(field.default, int):
+        value = int(value)
+    try:
+        checked = msgspec.convert(value, field.type)
+    except msgspec.ValidationError as error:
+        raise SweepError(f"{name} = {value}: {error}") from error
+    return msgspec.structs.replace(settings, **{name: checked})
+
+
+def settings_at(contest: Contest, values: Sequence[Value]) -> FusionSettings:
+    """Put the values of one trial into the settings."""
+    settings: FusionSettings = contest.fusion
+    for key, value in zip(contest.keys, values, strict=True):
+        settings = with_value(settings, key, value)
+    return settings
+
+
+def make_contest(
+    flight: Flight,
+    fusion: FusionSettings,
+    keys: Sequence[str],
+    *,
+    hold_out: int = 5,
+    interval_s: float = 0.0,
+) -> Contest:
+    """Prepare a sweep.
+
+    Parameters
+    ----------
+    flight : Flight
+    fusion : FusionSettings
+        All that is not varied. Where the settings of one estimator are, it is chosen.
+    keys : sequence of str
+        Settings to vary.
+    hold_out : int
+        Every so many-th fix is withheld from the fusion; 0 for none.
+    interval_s : float
+        Where it is not 0, fuse only a fix in so many seconds, and withhold all others.
+
+    Returns
+    -------
+    Contest
+
+    Raises
+    ------
+    SweepError
+        If the keys belong to several estimators.
+    """
+    named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
+    if len(named) > 1:
+        raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
+    if named:
+        fusion = with_value(fusion, "estimation.estimator", named.pop())
+    keep = np.ones(len(flight.fixes), np.bool_)
+    if interval_s:
+        # Not both: a comb through another comb leaves gaps, or nothing.
+        keep = thin(flight, interval_s)
+    elif hold_out:
+        keep = withhold(flight, hold_out)
+    return Contest(flight, fusion, tuple(keys), make_judge(flight, keep))
+
+
+class Trials:
+    """Runs trials of one contest, remembering what neighbouring trials share."""
+
+    def __init__(self, contest: Contest) -> None:
+        self._contest = contest
+        self._sensed: tuple[SensingSettings, Sensed] | None = None
+
+    def warm_up(self) -> None:
+        """Do what every process would otherwise do again: compile, and filter the samples."""
+        fusion, flight = self._contest.fusion, self._contest.judge.fused
+        self._sensed = (fusion.sensing, sense(flight, fusion.sensing))
+        fuse(flight, fusion, self._sensed[1])
+
+    def run(self, values: Sequence[Value]) -> dict[str, float]:
+        """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
+        settings = settings_at(self._contest, values)
+        judge = rejudged(self._contest.judge, settings)
+        if self._sensed is None or self._sensed[0] != settings.sensing:
+            self._sensed = (settings.sensing, sense(judge.fused, settings.sensing))
+        track = fuse(judge.fused, settings, self._sensed[1])
+        return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
+
+
+def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
+    """Judge by the trial's own idea of when the fixes were valid, lest it be given the answer."""
+    if settings.estimation.reference == judge.fused.fusion.estimation.reference:
+        return judge
+    fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))
+    return judge_of(fused, held)
+
+
+def grid(axes: Sequence[Axis]) -> list[Values]:
+    """List every point of a grid; the first axis varies slowest.
+
+    Raises
+    ------
+    SweepError
+        If there are too many.
+    """
+    size = math.prod(len(axis.values) for axis in axes)
+    if size > LARGEST_GRID:
+        raise SweepError(f"the grid has {size} points; at most {LARGEST_GRID} are tried")
+    return list(itertools.product(*(axis.values for axis in axes)))
+
+
+def tabulate(
+    keys: Sequence[str], trials: Sequence[tuple[Values, Mapping[str, float]]], metric: Metric
+) -> pd.DataFrame:
+    """Lay trials out as a table, the best first.
+
+    Raises
+    ------
+    SweepError
+        If no trial has a score of this metric.
+    """
+    rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]
+    table = pd.DataFrame(rows)
+    column = COLUMN_OF[metric]
+    if not table[column].notna().any():
+        raise SweepError(
+            f"nothing to judge by: the flight has no {_LACKING[metric]}; choose another --metric"
+        )
+    table = table.dropna(axis="columns", how="all")
+    return table.sort_values(column, kind="stable", ignore_index=True)
+
+
+_LACKING: Final[dict[Metric, str]] = {
+    "held": "withheld fixes",
+    "interpolated": "GPS",
+    "reference": "reference of the place",
+    "attitude": "reference of the attitude",
+}
+
+
+def optimise(
+    axes: Sequence[Axis],
+    evaluate: Callable[[list[Values]], list[float]],
+    generations: int,
+    on_generation: Callable[[float], None] = lambda _: None,
+) -> Values:
+    """Search between the least and greatest value of each axis by differential evolution.
+
+    Parameters
+    ----------
+    axes : sequence of Axis
+        Numbers only.
+    evaluate : callable
+        Scores many points at once, smaller is better; NaN is worst.
+    generations : int
+        How long to search.
+    on_generation : callable
+        Told the best score after each generation.
+
+    Returns
+    -------
+    tuple of float
+        The best point.
+
+    Raises
+    ------
+    SweepError
+        If an axis is no range of numbers.
+    """
+    bounds = []
+    for axis in axes:
+        numbers = [v for v in axis.values if isinstance(v, int | float)]
+        if len(numbers) < 2 or len(numbers) < len(axis.values) or min(numbers) == max(numbers):
+            raise SweepError(f"{axis.key}: an optimiser needs a range low:high")
+        bounds.append((min(numbers), max(numbers)))
+
+    def many(_: object, points: Any) -> list[float]:
+        scores = evaluate([tuple(float(v) for v in point) for point in points])
+        return [math.inf if math.isnan(s) else s for s in scores]
+
+    def told(intermediate_result: OptimizeResult) -> None:
+        on_generation(float(intermediate_result.fun))
+
+    found = differential_evolution(
+        lambda _: math.inf, bounds, maxiter=generations, popsize=6, rng=SEED, polish=False,
+        updating="deferred", workers=many, callback=told, tol=1e-3,
+    )  # fmt: skip
+    return tuple(float(v) for v in found.x)
+
+
+def _attitude_deg(track: FlightTrack, judge: Judge) -> float:
+    reference = judge.fused.reference
+    if reference is None:
+        return math.nan
+    error = total_error_rad(rotation_error(track.q_nb, reference.track.q_nb))
+    return rms(np.degrees(error[judge.fused.scored]))
+
+
+def _leaves(kind: type[Settings], prefix: str) -> Iterator[str]:
+    for field in fields_of(kind):
+        if field.section:
+            yield from _leaves(field.section, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}"
+
+
+def _value(text: str) -> Value:
+    try:
+        return float(text)
+    except ValueError:
+        return {"true": True, "false": False}.get(text, text)

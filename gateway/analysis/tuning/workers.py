@@ -1,0 +1,59 @@
+"""Trials of a sweep on all cores: one process each, which have the flight from the start."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from gateway.analysis.processes import copies, cores
+from gateway.analysis.tuning.contest import Contest, Trials, Values
+
+Scores = dict[str, float]
+Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
+
+_trials: Trials | None = None
+"""Of this process of the pool; it has no other place for it."""
+
+
+@contextmanager
+def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
+    """Open a pool of processes.
+
+    Parameters
+    ----------
+    contest : Contest
+        What all trials share.
+    jobs : int, optional
+        How many processes; one a core by default.
+
+    Yields
+    ------
+    callable
+        Runs many trials, and yields the index and scores of each as it is done.
+    """
+    trials = Trials(contest)
+    trials.warm_up()
+    count = jobs or cores()
+    if count == 1:
+        yield lambda points: ((k, trials.run(values)) for k, values in enumerate(points))
+        return
+    with copies(count, _begin, trials) as processes:
+
+        def run(points: Sequence[Values]) -> Iterator[tuple[int, Scores]]:
+            return processes.imap_unordered(_run, enumerate(points), _chunk(points, count))
+
+        yield run
+
+
+def _chunk(points: Sequence[Values], jobs: int) -> int:
+    """Neighbouring trials share their filtered samples, so they go to one process."""
+    return max(1, min(8, len(points) // (4 * jobs)))
+
+
+def _begin(trials: Trials) -> None:
+    global _trials
+    _trials = trials
+
+
+def _run(numbered: tuple[int, Values]) -> tuple[int, Scores]:
+    assert _trials is not None
+    index, values = numbered
+    return index, _trials.run(values)

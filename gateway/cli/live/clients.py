@@ -1,0 +1,168 @@
+"""`mavgate status`, `clients …`, `mark`, `reload`: a gateway that runs, and its clients."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Final
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from gateway.cli.live.record import JsonOption, ask
+from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, table_of
+from gateway.units import US_PER_S
+
+PANEL: Final = "A gateway that runs"
+UNKNOWN: Final = "—"
+US_PER_MS: Final = 1000
+
+Record = Mapping[str, Any]
+"""What a dataclass becomes on the control socket."""
+
+group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command(rich_help_panel=PANEL)(status)
+    app.add_typer(group, name="clients", rich_help_panel=PANEL)
+    app.command(rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(mark)
+    app.command(rich_help_panel=PANEL)(reload)
+
+
+def status(*, json: JsonOption = False) -> None:
+    """Tell how the gateway fares: receiver, nodes, aircraft, clients."""
+    snapshot = ask("status")
+    if json:
+        print(msgspec.json.encode(snapshot).decode())
+        return
+    console = console_of()
+    console.print(_summary(snapshot), markup=False)
+    if nodes := snapshot["report"]["nodes"]:
+        console.print()
+        console.print(_nodes(nodes))
+    _print_clients(console, snapshot)
+
+
+@group.command("list")
+def list_clients(*, json: JsonOption = False) -> None:
+    """List the clients with what was sent to them, and what got lost on this side."""
+    if json:
+        print(msgspec.json.encode(ask("clients.list")).decode())
+        return
+    _print_clients(console_of(), ask("status"))
+
+
+@group.command()
+def add(
+    url: Annotated[str, typer.Argument(help="As in the settings: udp:192.168.1.7:14550?name=…")],
+) -> None:
+    """Add a client or a source until the gateway ends."""
+    _show_endpoints(ask("clients.add", {"url": url}))
+    snapshot = ask("status")
+    for added in (*snapshot["listeners"], *snapshot["clients"]):
+        if added["endpoint"] == url and added["reason"]:
+            print(f"{added['name']}: {added['reason']}; trying again until it works")
+
+
+@group.command()
+def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -> None:
+    """Remove a client, a source or a listening port."""
+    _show_endpoints(ask("clients.remove", {"name": name}))
+
+
+def mark(
+    lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
+    lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
+    *,
+    alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
+    aircraft: Annotated[
+        int | None, typer.Option("--aircraft", help="For this one only; by default all.")
+    ] = None,
+) -> None:
+    """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""
+    place = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
+    print(ask("mark", place))
+
+
+def reload() -> None:
+    """Apply changed settings of the hub and of signing; clients that stay notice nothing."""
+    print(ask("reload"))
+
+
+def _show_endpoints(urls: Sequence[str]) -> None:
+    for url in urls:
+        print(url)
+
+
+def _summary(snapshot: Record) -> str:
+    report = snapshot["report"]
+    up_s = snapshot["time_us"] // US_PER_S
+    receiver = f"{report['port']} {'connected' if report['connected'] else 'not connected'}"
+    up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
+    frames = f"{report['frames']} frames, {report['frames_lost']} lost"
+    lines = [f"up {up}, receiver {receiver}, {frames}"]
+    lines += [
+        f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "
+        f"{_number(state['alt_amsl_m'], '.1f')} m"
+        for vehicle_id, state in snapshot["states"]
+    ]
+    hub = snapshot["hub"]
+    counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
+    lines.append("MAVLink frames: " + ", ".join(counts))
+    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
+    if requests:
+        lines.append("requests: " + ", ".join(requests))
+    return "\n".join(lines)
+
+
+def _nodes(nodes: Sequence[Record]) -> Table:
+    table = table_of("node", "rate Hz", "received", "lost", "restarts")
+    for node in nodes:
+        table.add_row(
+            f"{node['node']['vehicle_id']}.{node['node']['node_id']}",
+            _number(node["rate_hz"], ".0f"),
+            *(str(node[key]) for key in ("received", "lost", "restarts")),
+        )
+    return table
+
+
+def _print_clients(console: Console, snapshot: Record) -> None:
+    if listeners := snapshot["listeners"]:
+        console.print()
+        console.print(_listeners(listeners))
+    console.print()
+    console.print(_clients(snapshot["clients"], snapshot["time_us"]))
+    for client in snapshot["clients"]:
+        if client["reason"]:
+            console.print(f"{client['name']}: {client['reason']}", style="yellow", markup=False)
+
+
+def _listeners(listeners: Sequence[Record]) -> Table:
+    table = table_of("listening", "state", "clients", "turned away")
+    for port in listeners:
+        figures = (str(port[key]) for key in ("clients", "turned_away"))
+        table.add_row(port["name"], port["reason"] or port["state"], *figures)
+    return table
+
+
+def _clients(clients: Sequence[Record], now_us: int) -> Table:
+    table = table_of("client", "state", "sent", "dropped", "queued", "received", "age s", "trip ms")
+    for client in clients:
+        heard_us, trip_us = client["heard_us"], client["round_trip_us"]
+        table.add_row(
+            " ".join([client["name"], *(f"{s}.{c}" for s, c in client["systems"])]),
+            client["state"],
+            *(str(client[key]) for key in ("sent", "dropped", "queued", "received")),
+            UNKNOWN if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.1f}",
+            UNKNOWN if trip_us is None else f"{trip_us / US_PER_MS:.1f}",
+        )
+    return table
+
+
+def _place(lat_deg: float | None, lon_deg: float | None) -> str:
+    return f"{_number(lat_deg, '.6f')} {_number(lon_deg, '.6f')}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return UNKNOWN if value is None else format(value, form)

@@ -1,0 +1,110 @@
+"""`mavgate demo`: the whole gateway on a simulated receiver."""
+
+import asyncio
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from msgspec.structs import replace
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.live.run import (
+    ConfigOption,
+    EndpointOption,
+    PlainOption,
+    load_settings,
+    or_refuse,
+    serve,
+    with_endpoints,
+)
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.firmware_bench import BenchError, firmware_line
+from gateway.cli.support.warm_up import compile_everything
+from gateway.config import GatewaySettings
+from gateway.daemon import Daemon
+from gateway.edges.clock import unix_time_us
+from gateway.edges.disk.tracker_csv import FlightFileError, read_flight
+from gateway.sensing.calibration import NodeCalibration
+from gateway.simulator.flight import SimulatedAircraft
+from gateway.simulator.receiver import TimedFrame, simulate
+from gateway.simulator.recorded import replay
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(demo)
+
+
+def demo(
+    *,
+    config: ConfigOption = None,
+    endpoint: EndpointOption = None,
+    plain: PlainOption = False,
+    record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
+    flight: Annotated[
+        Path | None,
+        typer.Option("--flight", "-f", help="Send a recorded tracker log (CSV) in its place."),
+    ] = None,
+    firmware: Annotated[
+        bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
+    ] = False,
+) -> None:
+    """Fly the simulated tracker, over and over, until interrupted.
+
+    The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates.
+    """
+
+    def read() -> GatewaySettings:
+        return with_endpoints(load_settings(config), endpoint)
+
+    settings = or_refuse(read)
+    compile_everything()
+    try:
+        if flight is not None:
+            line, aircraft = recorded_line(settings, flight)
+        elif firmware:
+            line = firmware_line(settings.simulator, unix_time_us())
+            aircraft = calibrated_aircraft(settings)
+        else:
+            line = simulate(settings.simulator, unix_time_us()).frames()
+            aircraft = calibrated_aircraft(settings)
+    except (FlightFileError, BenchError, ValueError) as error:
+        refuse(str(error))
+    # What a ground station has the demo save must not become the real aircraft's calibration.
+    with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
+
+        def apart(settings: GatewaySettings) -> GatewaySettings:
+            # Nor is a flight that goes round and round worth a disk, unless it is asked for.
+            recording = replace(settings.recording, mode="always" if record else "manual")
+            return replace(settings, aircraft_folder=folder, recording=recording)
+
+        daemon = partial(Daemon, apart(settings), aircraft, lambda: apart(read()), line)
+        asyncio.run(serve(daemon, plain=plain))
+
+
+def recorded_line(
+    settings: GatewaySettings, file: Path
+) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
+    """Send a log as its nodes would have, and take its calibrated values as they are."""
+    flight = read_flight(file)
+    estimation = settings.estimation
+    reference = replace(estimation.reference, gps_latency_s=flight.gps_latency_s)
+    aircraft = replace(
+        settings.default_aircraft, estimation=replace(estimation, reference=reference)
+    )
+    receiver = replay(settings.simulator, flight, unix_time_us())
+    return receiver.frames(flight.duration_s), {settings.simulator.vehicle_id: aircraft}
+
+
+def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
+    """Calibrate the simulated aircraft as their owner would have done before the flight."""
+    found = {}
+    for index in range(settings.simulator.vehicles):
+        simulated = SimulatedAircraft(settings.simulator, index)
+        calibration = msgspec.convert(simulated.errors, NodeCalibration, from_attributes=True)
+        found[simulated.vehicle_id] = replace(settings.default_aircraft, calibration=calibration)
+    return found

@@ -1,0 +1,156 @@
+"""`mavgate record …`: orders to the recorder of a gateway that runs."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from gateway.cli.live.run import ConfigOption, read_settings
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.recording_options import PANEL
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.edges.disk.recordings import (
+    Recording,
+    RecordingError,
+    delete_recording,
+    list_recordings,
+    rename_recording,
+)
+from gateway.edges.operator.control_socket import ControlError, request, socket_path
+
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
+
+group = typer.Typer(help="Start, stop, name, list and delete recordings.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.add_typer(group, name="record", rich_help_panel=PANEL)
+
+
+@group.command()
+def start() -> None:
+    """Record from now on, whatever the settings say."""
+    _show(ask("record.start"))
+
+
+@group.command()
+def stop() -> None:
+    """Stop recording until the next order or flight."""
+    _show(ask("record.stop"))
+
+
+@group.command()
+def status(*, json: JsonOption = False) -> None:
+    """Tell what the recorder does."""
+    found = ask("record.status")
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        _show(found)
+
+
+@group.command()
+def save(
+    name: Annotated[str, typer.Argument(help="Letters, digits, spaces, dots, hyphens.")],
+    *,
+    recording: Annotated[
+        str | None,
+        typer.Option("--recording", help="Which one; by default the one that runs, or ran last."),
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Give a recording a name; nothing is ever overwritten."""
+    if recording is None and socket_path("run").exists():
+        _show(ask("record.save", {"name": name}))
+        return
+    try:
+        found = rename_recording(_folder(config), recording or "last", name)
+    except RecordingError as error:
+        refuse(str(error))
+    _list([found])
+
+
+@group.command()
+def delete(
+    name: NameArgument,
+    *,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    config: ConfigOption = None,
+) -> None:
+    """Delete a recording, after asking."""
+    if not yes:
+        typer.confirm(f"Delete the recording {name!r} for ever?", abort=True)
+    if socket_path("run").exists():
+        deleted = _recording(ask("record.delete", {"name": name}))
+    else:
+        try:
+            deleted = delete_recording(_folder(config), name)
+        except RecordingError as error:
+            refuse(str(error))
+    for path in deleted.files:
+        print(f"deleted {path}")
+
+
+@group.command("list")
+def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
+    """List the recordings, the newest last."""
+    if config is None and socket_path("run").exists():
+        found = [_recording(told) for told in ask("record.list")]
+    else:
+        found = list_recordings(_folder(config))
+    if json:
+        print(msgspec.json.encode(found, enc_hook=str).decode())
+    else:
+        _list(found)
+
+
+@group.command()
+def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
+    """Put a remark at this moment into the recording, and tell the ground stations."""
+    ask("record.note", {"text": text})
+
+
+def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
+    """Ask the gateway (or the player) that runs; end the command if that fails."""
+    try:
+        return request(socket_path(of), verb, params)
+    except ControlError as error:
+        refuse(str(error))
+
+
+def _recording(told: dict[str, Any]) -> Recording:
+    return Recording(**{**told, "files": tuple(Path(file) for file in told["files"])})
+
+
+def _folder(config: Path | None) -> Path:
+    return Path(read_settings(config).recording.folder).expanduser()
+
+
+def _show(status: dict[str, Any]) -> None:
+    console = console_of()
+    line = status["state"]
+    if status["name"]:
+        line += f": {status['name']}, part {status['part']}"
+    if status["part_bytes"]:
+        line += f", {status['part_bytes'] / 1e6:.1f} MB"
+    if status["reason"]:
+        line += f" ({status['reason']})"
+    console.print(line, markup=False)
+    console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free", markup=False)
+
+
+def _list(recordings: list[Recording]) -> None:
+    grid = table_of("recording", "files", "MB", "last written (UTC)")
+    for recording in recordings:
+        when = datetime.fromtimestamp(recording.modified_s, UTC)
+        grid.add_row(
+            recording.name,
+            str(len(recording.files)),
+            f"{recording.size / 1e6:.2f}",
+            f"{when:%Y-%m-%d %H:%M:%S}",
+        )
+    console_of().print(grid)

@@ -1,0 +1,170 @@
+"""The commands that run the gateway: on a real receiver, or on the simulated one."""
+
+import asyncio
+import logging
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import typer
+from rich.live import Live
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.warm_up import compile_everything
+from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
+from gateway.daemon import Daemon
+from gateway.edges.operator.live_view import LiveView, summary_line
+from gateway.pipeline import PipelineSettings
+
+log = logging.getLogger(__name__)
+
+USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
+VIEW_INTERVAL_S: Final = 0.5
+"""Twice a second: drawing takes some milliseconds, in which no frame is passed on."""
+LOG_INTERVAL_S: Final = 10.0
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", "-c", help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}."
+    ),
+]
+PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines in place of the live view.")]
+EndpointOption = Annotated[
+    list[str] | None,
+    typer.Option("--endpoint", "-e", help="Where MAVLink goes, in place of the settings'."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command("run")(run_gateway)
+
+
+def run_gateway(
+    *,
+    config: ConfigOption = None,
+    port: Annotated[
+        str | None, typer.Option("--port", "-p", help="Receiver's port, in place of the settings'.")
+    ] = None,
+    endpoint: EndpointOption = None,
+    plain: PlainOption = False,
+) -> None:
+    """Run the gateway on the receiver's serial port until interrupted."""
+
+    def read() -> GatewaySettings:
+        settings = load_settings(config)
+        if port is not None:
+            serial = msgspec.structs.replace(settings.serial, port=port)
+            settings = msgspec.structs.replace(settings, serial=serial)
+        return with_endpoints(settings, endpoint)
+
+    settings = or_refuse(read)
+    compile_everything()
+    aircraft = read_aircraft(settings)
+    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain))
+
+
+def load_settings(file: Path | None) -> GatewaySettings:
+    """Load the settings that a command was given, the user's own, or the defaults."""
+    if file is None:
+        file = USER_CONFIG.expanduser()
+        if not file.exists():
+            return GatewaySettings()
+    return load(file)
+
+
+def or_refuse(read: Callable[[], GatewaySettings]) -> GatewaySettings:
+    """Read settings at the start of a command, which ends if they are wrong."""
+    try:
+        return read()
+    except ConfigError as error:
+        refuse(str(error))
+
+
+def read_settings(file: Path | None) -> GatewaySettings:
+    """Load the settings; end the command if they are wrong."""
+    return or_refuse(lambda: load_settings(file))
+
+
+def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
+    """Load what is different for single aircraft."""
+    try:
+        return load_aircraft(settings)
+    except ConfigError as error:
+        refuse(str(error))
+
+
+def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:
+    """Take what the pipeline needs, the single aircraft's files included."""
+    return PipelineSettings(settings.default_aircraft, read_aircraft(settings))
+
+
+def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
+    """Put the endpoints of the command line in place of the settings'."""
+    if not endpoints:
+        return settings
+    try:
+        hub = msgspec.structs.replace(settings.hub, endpoints=tuple(endpoints))
+    except ValueError as error:
+        refuse(f"--endpoint: {error}")
+    return msgspec.structs.replace(settings, hub=hub)
+
+
+async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
+    """Run a daemon until SIGINT or SIGTERM, showing what it does; SIGHUP reloads the settings.
+
+    Parameters
+    ----------
+    daemon_of : callable
+        Builds the daemon; called inside the event loop.
+    plain : bool
+        Log lines even on a terminal.
+    """
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    view = None if plain or not sys.stdout.isatty() else LiveView()
+    if view is not None:
+        logging.getLogger().handlers[:] = [view.log]
+    daemon = daemon_of()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
+    daemon.start()
+    try:
+        if view is None:
+            await _log_lines(daemon, stopped)
+        else:
+            await _live_view(daemon, view, stopped)
+    finally:
+        daemon.close()
+
+
+def _reload(daemon: Daemon) -> None:
+    try:
+        daemon.reload()
+    except ConfigError as error:
+        log.warning("settings not reloaded: %s", error)
+
+
+async def _live_view(daemon: Daemon, view: LiveView, stopped: asyncio.Event) -> None:
+    # No thread of rich's own: it draws when it is told to, between two samples.
+    with Live(screen=True, auto_refresh=False) as live:
+        while not await _is_set_within(stopped, VIEW_INTERVAL_S):
+            live.update(view.draw(daemon.snapshot()), refresh=True)
+
+
+async def _log_lines(daemon: Daemon, stopped: asyncio.Event) -> None:
+    while not await _is_set_within(stopped, LOG_INTERVAL_S):
+        log.info(summary_line(daemon.snapshot()))
+
+
+async def _is_set_within(event: asyncio.Event, seconds: float) -> bool:
+    try:
+        async with asyncio.timeout(seconds):
+            return await event.wait()
+    except TimeoutError:
+        return False

@@ -1,0 +1,49 @@
+"""Commands that help to set the gateway up: ports and settings."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.config import ConfigError, GatewaySettings, load, render
+from gateway.edges.receiver.serial_port import PortNotFoundError, find_port, list_serial_ports
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command()(ports)
+    app.command()(check_config)
+
+
+def ports() -> None:
+    """List the serial ports, and the one that `auto` takes."""
+    found = list_serial_ports()
+    table = table_of("device", "setting by USB id", "serial number", "description", left=4)
+    for port in found:
+        usb = f"usb:{port.usb_id}" if port.usb_id else ""
+        table.add_row(port.device, usb, port.serial_number, port.description)
+    console = console_of()
+    if found:
+        console.print(table)
+    try:
+        console.print(f'port = "auto" takes {find_port("auto", found)}')
+    except PortNotFoundError as error:
+        console.print(f'port = "auto": {error}')
+
+
+def check_config(
+    file: Annotated[
+        Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
+    ] = None,
+) -> None:
+    """Check a settings file, or print all settings with their defaults and meanings."""
+    if file is None:
+        print(render(GatewaySettings()), end="")
+        return
+    try:
+        load(file)
+    except ConfigError as error:
+        refuse(str(error))
+    print(f"{file}: all settings are right")

@@ -1,0 +1,246 @@
+"""`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
+
+import gzip
+import itertools
+import math
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import numpy as np
+import typer
+
+from gateway.aircraft import AircraftSettings, make_fusion
+from gateway.cli.live.run import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.support.recording_options import (
+    PANEL,
+    ColumnsOption,
+    progress_of,
+    read_column_map,
+    refusing,
+)
+from gateway.cli.support.terminal import console_of
+from gateway.edges.disk.recording_streams import FileKind, kind_of, write_new
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_POS_STD,
+    NAV_QUAT,
+    NAV_VEL,
+    NAV_VEL_STD,
+)
+from gateway.estimation.interface import Estimator
+from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.select import EstimatorName
+from gateway.flights.reading import (
+    FlightError,
+    RecordedTable,
+    SettingsChoice,
+    Wishes,
+    aircraft_of,
+    open_rows,
+)
+from gateway.flights.refusion import SETTLES
+from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
+from gateway.replay import records_of
+from gateway.sensing.chain import SensorChain
+from gateway.units import US_PER_S
+
+Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
+
+_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
+HEAD_LINES: Final = 20
+
+HEADER: Final = (
+    "time_s,qw,qx,qy,qz,lat_deg,lon_deg,alt_amsl_m,vn_mps,ve_mps,vd_mps,"
+    "attitude_std_north_rad,attitude_std_east_rad,attitude_std_down_rad,"
+    "vel_std_north_mps,vel_std_east_mps,vel_std_down_mps,"
+    "pos_std_north_m,pos_std_east_m,pos_std_down_m,flags\n"
+)
+PICK: Final = [
+    *range(NAV_QUAT, NAV_QUAT + 4),
+    *range(NAV_LAT, NAV_ALT + 1),
+    *range(NAV_VEL, NAV_VEL + 3),
+    *range(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3),
+    *range(NAV_VEL_STD, NAV_VEL_STD + 3),
+    *range(NAV_POS_STD, NAV_POS_STD + 3),
+]
+LINES: Final = 2000
+"""Lines that are written at once."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command("fuse", rich_help_panel=PANEL)(fuse_log)
+
+
+def fuse_log(
+    file: Annotated[Path, typer.Argument(help="Recording or log, gzipped or not.")],
+    *,
+    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write; it is overwritten.")],
+    estimator: Annotated[
+        EstimatorName | None, typer.Option("--estimator", help="In place of the settings'.")
+    ] = None,
+    columns: ColumnsOption = None,
+    gps_latency_s: Annotated[
+        float | None,
+        typer.Option("--gps-latency", min=0.0, max=2.0, help="In place of the settings', s."),
+    ] = None,
+    settings: Annotated[
+        SettingsChoice, typer.Option("--settings", help="For recordings: those of then or today.")
+    ] = "recorded",
+    config: ConfigOption = None,
+) -> None:
+    """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
+
+    Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
+    ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
+    Without --config, the words gps_latency_s and declination_deg of such a file's # line count.
+    """
+    current = read_settings(config)
+    with progress_of([file]) as advance, refusing():
+        facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
+        wishes = Wishes(
+            current=pipeline_settings(current),
+            choice="current" if config is not None else settings,
+            columns=read_column_map(columns),
+            progress=advance,
+        )
+        table = open_rows(file, wishes)
+        aircraft = _adjusted(
+            aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
+        )
+        try:
+            chain, running = _begin(table, aircraft)
+            records = (record for row in table.plain_rows for record in records_of(row))
+            time_us, states = fuse(records, chain, running)
+        except ValueError as error:
+            raise FlightError(f"{file}: {error}") from error
+        write_new(out, _lines(time_us, states), overwrite=True)
+    name = aircraft.estimation.estimator
+    console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
+
+
+def _begin(table: RecordedTable, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
+    """Go on from the state at the table's begin where there is one that fits."""
+    first = next(table.rows)
+    if isinstance(first, FusionState):
+        try:
+            return make_fusion(aircraft, first)
+        except ValueError as error:
+            told = console_of(stderr=True)
+            told.print(SETTLES.format(error), markup=False)
+    else:
+        table.rows = itertools.chain([first], table.rows)
+    return make_fusion(aircraft)
+
+
+def fuse(
+    records: Iterable[Record], chain: SensorChain, estimator: Estimator
+) -> tuple[IntArray, FloatArray]:
+    """Run an estimator over records in the order in which they came, as live.
+
+    Parameters
+    ----------
+    records : iterable of record
+        Raw or calibrated samples and fixes.
+    chain : SensorChain
+        Calibration and filters.
+    estimator : Estimator
+        Fresh, or in a state to go on from.
+
+    Returns
+    -------
+    time_us : ndarray, shape (n,)
+        Of the IMU samples.
+    states : ndarray, shape (n, NAV_COLUMNS)
+        See `gateway.estimation.columns`.
+    """
+    times, rows = [], []
+    for record in records:
+        match record:
+            case BaroRaw():
+                estimator.update_baro(chain.baro(record))
+            case GpsFix():
+                estimator.update_gps(record)
+            case _:
+                times.append(record.time_us)
+                rows.append(_row(estimator.update_imu(_sample(chain, record))))
+    return np.array(times, np.int64), np.array(rows, float).reshape(-1, NAV_COLUMNS)
+
+
+def _sample(chain: SensorChain, record: ImuRaw | ImuCalibrated) -> ImuSample:
+    if isinstance(record, ImuRaw):
+        return chain.imu(record)
+    return chain.imu_si(
+        record.time_us,
+        record.accel_b_mps2,
+        record.gyro_b_radps,
+        record.mag_b_ut,
+        record.temperature_degc,
+        record.flags,
+    )
+
+
+def _row(s: NavState) -> list[float]:
+    return [
+        *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
+        *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
+    ]  # fmt: skip
+
+
+def _facts_of(path: Path) -> dict[str, float]:
+    """Read the `key=value` words of a foreign file's comments."""
+    facts: dict[str, float] = {}
+    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
+        for line, _ in zip(file, range(HEAD_LINES), strict=False):
+            if line.startswith("#"):
+                facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
+    return facts
+
+
+def _adjusted(
+    aircraft: AircraftSettings,
+    estimator: EstimatorName | None,
+    gps_latency_s: float | None,
+    facts: dict[str, float],
+) -> AircraftSettings:
+    estimation = aircraft.estimation
+    reference = estimation.reference
+    if gps_latency_s is None:
+        gps_latency_s = facts.get("gps_latency_s", reference.gps_latency_s)
+    reference = msgspec.structs.replace(reference, gps_latency_s=gps_latency_s)
+    if "declination_deg" in facts:
+        reference = msgspec.structs.replace(
+            reference, declination="fixed", declination_deg=facts["declination_deg"]
+        )
+    estimation = msgspec.structs.replace(
+        estimation, estimator=estimator or estimation.estimator, reference=reference
+    )
+    return msgspec.structs.replace(aircraft, estimation=estimation)
+
+
+def _lines(time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
+    """Write the rows; what is not known is left blank."""
+    yield HEADER.encode()
+    for begin in range(0, len(time_us), LINES):
+        chunk = slice(begin, begin + LINES)
+        yield "".join(
+            _line(when, values, int(flags))
+            for when, values, flags in zip(
+                time_us[chunk].tolist(),
+                states[chunk][:, PICK].tolist(),
+                states[chunk][:, NAV_FLAGS].tolist(),
+                strict=True,
+            )
+        ).encode()
+
+
+def _line(time_us: int, values: list[float], flags: int) -> str:
+    cells = ["" if math.isnan(value) else f"{value:.10g}" for value in values]
+    return f"{time_us / US_PER_S:.6f},{','.join(cells)},{flags}\n"

@@ -1,0 +1,226 @@
+"""`mavgate info` and `mavgate recover`: what a recording holds, and what can be saved of it."""
+
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import typer
+from pymavlink.dialects.v20 import common as mavlink
+from rich.table import Table
+
+from gateway.cli.support.recording_options import PANEL, ForceOption, progress_of, refusing
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.edges.disk.recording_streams import (
+    FileKind,
+    Progress,
+    kind_of,
+    read_batches,
+    read_events,
+    write_new,
+)
+from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import (
+    TableFault,
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_state,
+)
+from gateway.flightlog.tlog.tlog import encode_record
+from gateway.flights.reading import NO_RECORDING, FlightError
+from gateway.records import FusionState
+from gateway.units import US_PER_S
+
+SHOWN: Final = 8
+"""Gaps and damaged places that are told one by one."""
+
+Tell = Callable[[str], None]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command("info", rich_help_panel=PANEL)(info)
+    app.command("recover", rich_help_panel=PANEL)(recover)
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="Recording.", show_default=False)],
+    *,
+    json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Tell what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
+    with progress_of([file]) as advance, refusing():
+        found = describe(file, advance)
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        _show(file, found)
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output; by default NAME.recovered.EXT.")
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Write what is sound in a damaged recording to a new file, and tell what was left out.
+
+    The checksum of every frame is checked. The damaged file is never changed.
+    """
+    target = out or file.with_name(f"{file.stem}.recovered{file.suffix}")
+    console = console_of()
+    left_out: list[str] = []
+    with progress_of([file]) as advance, refusing():
+        sound = _sound_records if kind_of(file) is FileKind.TLOG else _sound_lines
+        size = write_new(target, sound(file, advance, left_out.append), overwrite=force)
+        before = file.stat().st_size
+    for line in left_out[:SHOWN]:
+        console.print(line, markup=False)
+    if len(left_out) > SHOWN:
+        console.print(f"and {len(left_out) - SHOWN} more places")
+    verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
+    console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
+
+
+def describe(file: Path, advance: Progress | None = None) -> FileInfo:
+    """Sum up a recording.
+
+    Parameters
+    ----------
+    file : Path
+        A tlog or a table.
+    advance : callable, optional
+        Told how many more bytes were read.
+
+    Returns
+    -------
+    FileInfo
+
+    Raises
+    ------
+    FlightError
+        If it is neither.
+    OSError
+        If it cannot be read.
+    """
+    kind, size = kind_of(file), file.stat().st_size
+    if kind is FileKind.TLOG:
+        tlog = TlogSummary()
+        for batch in read_batches(file, advance):
+            tlog.add(batch)
+        found = tlog.result(size)
+        if not found.records:
+            raise FlightError(f"{file}: {NO_RECORDING}")
+        return found
+    if kind is FileKind.FOREIGN:
+        raise FlightError(f"{file}: is a CSV of another program; convert it first")
+    table, reader = TableSummary(), TableReader()
+    for event in read_events(file, reader, advance):
+        table.add([event], reader.header)
+    return table.result(size)
+
+
+def _sound_records(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+    found = False
+    for batch in read_batches(file, advance, strict=True):
+        for run in batch.damage:
+            tell(f"at byte {run.offset}: {run.size} bytes that are no record")
+        yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
+        found = found or len(batch.starts) > 0
+    if not found:
+        raise FlightError(f"{file}: {NO_RECORDING}")
+
+
+def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+    reader = TableReader()
+    begun = False
+    for event in read_events(file, reader, advance):
+        if not begun and not isinstance(event, TableFault):
+            begun = True
+            if reader.header is None:
+                tell("the head is lost: settings and calibration of today will take its place")
+            yield encode_head(reader.header or TableHeader()).encode()
+        match event:
+            case TableRow():
+                yield row_to_line(event).encode()
+            case TableHeader():
+                yield encode_header(event).encode()
+            case FusionState():
+                yield encode_state(event).encode()
+            case TableMark():
+                yield encode_mark(event).encode()
+            case TableFault():
+                tell(f"line {event.line}: {event.size} bytes: {event.reason}")
+    if not begun:
+        raise FlightError(f"{file}: holds no row that can be read")
+
+
+def _show(file: Path, found: FileInfo) -> None:
+    console = console_of()
+    console.print(f"{file}: {found.kind}, {found.size / 1e6:.3f} MB", markup=False)
+    console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
+    if found.header is not None:
+        head = found.header
+        console.print(
+            f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}",
+            markup=False,
+        )
+    for vehicle in found.vehicles:
+        console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n", markup=False)
+    for gap in found.gaps[:SHOWN]:
+        at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
+        console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
+    if len(found.gaps) > SHOWN:
+        console.print(f"and {len(found.gaps) - SHOWN} more gaps")
+    for mark in found.marks:
+        at_s = (mark.time_us - (found.first_us or 0)) / US_PER_S
+        console.print(f"mark at {_clock(at_s)}: {mark.text}", markup=False)
+    if found.damaged_bytes:
+        console.print(
+            f"[red]damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
+            "`mavgate recover` leaves them out[/red]"
+        )
+
+
+def _heading(vehicle: VehicleInfo, kind: str) -> str:
+    title = f"system {vehicle.system_id}" if kind == "tlog" else f"vehicle {vehicle.system_id}"
+    if vehicle.mav_type is not None:
+        title += f": {_enum_name('MAV_TYPE', vehicle.mav_type)}"
+        title += f", {_enum_name('MAV_AUTOPILOT', vehicle.autopilot or 0)}"
+    return f"{title}; {vehicle.distance_m / 1000:.3f} km"
+
+
+def _rates(vehicle: VehicleInfo) -> Table:
+    grid = table_of("what", "count", "per s")
+    for rate in vehicle.rates:
+        grid.add_row(rate.name, str(rate.count), f"{rate.rate_hz:.2f}")
+    return grid
+
+
+def _enum_name(enum: str, value: int) -> str:
+    entry = mavlink.enums[enum].get(value)
+    return entry.name.removeprefix(f"{enum}_").lower() if entry else f"{enum} {value}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    hours, minutes = divmod(int(minutes), 60)
+    return f"{hours}:{minutes:02d}:{rest:06.3f}" if hours else f"{minutes}:{rest:06.3f}"
+
+
+def _when(found: FileInfo) -> str:
+    begin_us = found.first_us
+    if found.header is not None:
+        zero_us = found.header.unix_us_at_zero
+        begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
+    if begin_us is None:
+        return ""
+    return f", from {datetime.fromtimestamp(begin_us / US_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -1,0 +1,98 @@
+"""`mavgate report`: figures and tables of a flight as one page."""
+
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from gateway.analysis.sources import with_latency
+from gateway.cli.live.run import ConfigOption, load_settings, or_refuse
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.loading import (
+    FlightArgument,
+    Loading,
+    ReferenceOption,
+    SystemOption,
+    fusion_of,
+    load_flight,
+)
+from gateway.cli.support.recording_options import ColumnsOption, SettingsOption, refusing
+from gateway.cli.support.terminal import console_of
+
+NEEDED: Final = ("jinja2", "matplotlib", "pandas")
+
+COLUMNS: Final = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+
+OutputOption = Annotated[
+    Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(report)
+
+
+def report(
+    flight: FlightArgument = None,
+    *,
+    output: OutputOption = Path("report"),
+    against: Annotated[
+        Path | None, typer.Option("--against", help="Another recording to compare with.")
+    ] = None,
+    against_config: Annotated[
+        Path | None, typer.Option("--against-config", help="Other settings to compare with.")
+    ] = None,
+    reference: ReferenceOption = None,
+    columns: ColumnsOption = None,
+    system: SystemOption = None,
+    settings: SettingsOption = "recorded",
+    config: ConfigOption = None,
+) -> None:
+    """Make a page of figures and tables of a flight: the paper's own, and more.
+
+    Without a flight the built-in simulated one is taken.
+    """
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        install = f"{sys.executable} -m pip install {' '.join(missing)}"
+        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")
+    # These need what may be missing, and take a second to load.
+    from gateway.analysis.case import make_case
+    from gateway.analysis.reporting.compose import make_report
+    from gateway.analysis.reporting.page import count_pictures, write_report
+
+    loading = Loading(
+        or_refuse(lambda: load_settings(config)), settings, columns, system, reference
+    )
+    loaded = load_flight(flight, loading)
+    other = loaded if against is None else load_flight(against, replace(loading, reference=None))
+    others = None
+    if against_config is not None:
+        others = fusion_of(or_refuse(lambda: load_settings(against_config)))
+        if flight is None:
+            others = with_latency(others, loaded.latency_s)
+    console = console_of(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(
+        *COLUMNS, console=console, transient=True, auto_refresh=False, disable=hidden
+    ) as progress:
+        task = progress.add_task("fusing", total=None)
+        progress.refresh()
+        case = make_case(loaded)
+        compared = make_case(other, others) if other is not loaded or others else None
+        made = make_report(case, compared)
+        progress.update(task, description="drawing", total=count_pictures(made.sections))
+
+        def advance() -> None:
+            # The bar has no thread of its own: the processes that draw are copies of this one.
+            progress.advance(task)
+            progress.refresh()
+
+        with refusing():
+            page = write_report(made, output, advance)
+    print(page)

@@ -1,0 +1,75 @@
+"""`mavgate sweep`: try settings on a flight, and write the best as a settings file."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from gateway.cli.live.run import ConfigOption, load_settings, or_refuse
+from gateway.cli.support.loading import FlightArgument, Loading, ReferenceOption, SystemOption
+from gateway.cli.support.recording_options import ColumnsOption, SettingsOption
+
+Metric = Literal["held", "interpolated", "reference", "attitude"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(sweep)
+
+
+def sweep(
+    flight: FlightArgument = None,
+    *,
+    alpha: Annotated[
+        str | None, typer.Option(help="Weight of the acceleration: 0.1:0.9:9 or 0.1,0.5.")
+    ] = None,
+    beta: Annotated[str | None, typer.Option(help="Weight of the velocity, likewise.")] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(help="Any other setting: gps_latency_s=0:0.4:9, accel_filter=chebyshev,…"),
+    ] = None,
+    optimise: Annotated[
+        int, typer.Option(help="Search the ranges for so many generations, in place of a grid.")
+    ] = 0,
+    metric: Annotated[
+        Metric,
+        typer.Option(
+            help="Judge by withheld fixes, by interpolated GPS as the paper does, or by the "
+            "reference's place or attitude."
+        ),
+    ] = "held",
+    hold_out: Annotated[
+        int, typer.Option(help="Withhold every so many-th fix; 0 for none.", min=0)
+    ] = 5,
+    gps_interval: Annotated[
+        float,
+        typer.Option(
+            help="Fuse one fix in so many seconds, and let all others judge; 0 for all.", min=0.0
+        ),
+    ] = 0.0,
+    jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Settings file for the best.")
+    ] = Path("best.toml"),
+    table: Annotated[Path | None, typer.Option("--table", help="CSV file for every trial.")] = None,
+    reference: ReferenceOption = None,
+    columns: ColumnsOption = None,
+    system: SystemOption = None,
+    settings: SettingsOption = "recorded",
+    config: ConfigOption = None,
+) -> None:
+    """Try settings on a flight, and write the best as a settings file.
+
+    Without a flight the built-in simulated one is taken. The filter is run causally; fixes that
+    it never sees judge it.
+    """
+    # It loads pandas and the optimisers, which no other command should wait for.
+    from gateway.cli.support.sweeping import Wish, run_sweep
+
+    current = or_refuse(lambda: load_settings(config))
+    named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
+    run_sweep(
+        flight,
+        Loading(current, settings, columns, system, reference),
+        Wish(named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table),
+    )

@@ -1,0 +1,92 @@
+"""How the commands of the analysis come by their flight."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from gateway.analysis.flight_arrays import Flight, FusionSettings
+from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
+from gateway.cli.live.run import pipeline_settings
+from gateway.cli.support.recording_options import progress_of, read_column_map, refusing
+from gateway.config import GatewaySettings
+from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.flights.reading import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
+
+FlightArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="A recording: our CSV, another program's CSV with --columns, or a tlog; "
+        "by default the built-in simulated flight.",
+        show_default=False,
+    ),
+]
+ReferenceOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--reference", help="A CSV of ours on the flight's clock, whose states judge the estimates."
+    ),
+]
+SystemOption = Annotated[
+    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to take.")
+]
+
+STORIES: Final = {
+    FileKind.TABLE: "Recorded by mavgate.",
+    FileKind.FOREIGN: "Recorded by another program; its samples count as calibrated.",
+    FileKind.TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Loading:
+    """How a command wants its flights to be read."""
+
+    settings: GatewaySettings
+    choice: SettingsChoice = "recorded"
+    columns: Path | None = None
+    system: int | None = None
+    reference: Path | None = None
+
+
+def fusion_of(settings: GatewaySettings) -> FusionSettings:
+    """Take what fuses a flight out of the whole settings."""
+    return FusionSettings(sensing=settings.sensing, estimation=settings.estimation)
+
+
+def load_flight(path: Path | None, loading: Loading) -> Flight:
+    """Read a recording, or fly the simulated flight; a file that holds none ends the command."""
+    settings = loading.settings
+    if path is None:
+        return simulated_flight(settings.simulator, fusion_of(settings))
+    files = [file for file in (path, loading.reference) if file is not None]
+    with progress_of(files) as advance, refusing():
+        wishes = _wishes(loading, advance)
+        table = open_rows(path, wishes)
+        aircraft = aircraft_of(table, wishes)
+        fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+        story = STORIES[kind_of(path)]
+        try:
+            flight = flight_of_rows(
+                table.plain_rows, aircraft.calibration, fusion, name=path.name, story=story
+            )
+        except ValueError as error:
+            raise FlightError(str(error)) from error
+        if loading.reference is None:
+            return flight
+        return judged_by(
+            flight, open_rows(loading.reference, wishes).plain_rows, loading.reference.name
+        )
+
+
+def _wishes(loading: Loading, advance: Callable[[int], None]) -> Wishes:
+    settings = loading.settings
+    return Wishes(
+        current=pipeline_settings(settings),
+        choice=loading.choice,
+        columns=read_column_map(loading.columns),
+        system_id=loading.system,
+        progress=advance,
+    )

@@ -1,0 +1,81 @@
+"""What the commands on recordings share: options, progress, and clear words for bad files."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import typer
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.terminal import console_of
+from gateway.flightlog.moment import Moment, parse_moment
+from gateway.flightlog.table.foreign import ColumnMap
+from gateway.flights.reading import FlightError, Position, SettingsChoice
+
+PANEL: Final = "Recordings"
+
+Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]
+FromOption = Annotated[
+    str | None, typer.Option("--from", help="Begin: 80, 1:20 or 2026-06-11T14:25:30Z.")
+]
+ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --from.")]
+ColumnsOption = Annotated[
+    Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
+]
+SettingsOption = Annotated[
+    SettingsChoice,
+    typer.Option("--settings", help="Fuse tables with the settings of then or of today."),
+]
+PositionOption = Annotated[
+    Position,
+    typer.Option("--position", help="Position as live, or on straight lines between fixes."),
+]
+
+
+def read_column_map(path: Path | None) -> ColumnMap | None:
+    """Read a column map; raises FlightError if it is none."""
+    if path is None:
+        return None
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=ColumnMap)
+    except (OSError, msgspec.DecodeError) as error:
+        raise FlightError(f"{path}: {error}") from error
+
+
+def read_moment(text: str | None) -> Moment | None:
+    """Read a moment of the command line; raises FlightError if it is none."""
+    try:
+        return None if text is None else parse_moment(text)
+    except ValueError as error:
+        raise FlightError(str(error)) from error
+
+
+@contextmanager
+def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
+    """Show how far the files are read, on a terminal."""
+    total = sum(file.stat().st_size for file in files if file.exists())
+    columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    console = console_of(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        task = progress.add_task("reading", total=total)
+        yield lambda count: progress.advance(task, count)
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """End the command with a clear word where a file is not as it should be."""
+    try:
+        yield
+    except FileExistsError as error:
+        refuse(f"{error.filename}: is there already; --force overwrites it")
+    except OSError as error:
+        file = str(error.filename or "disk").removesuffix(".partial")
+        refuse(f"{file}: {error.strerror}")
+    except FlightError as error:
+        refuse(str(error))

@@ -1,0 +1,153 @@
+"""A sweep as a command: axes from texts, a progress bar, the best as a table and a file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import pandas as pd
+from rich import box
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from gateway.analysis.flight_arrays import FusionSettings
+from gateway.analysis.tuning import contest as sweeping
+from gateway.analysis.tuning.contest import COLUMN_OF, Axis, Contest, Metric, SweepError, Values
+from gateway.analysis.tuning.workers import Run, pool
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.loading import Loading, load_flight
+from gateway.cli.support.recording_options import refusing
+from gateway.cli.support.terminal import console_of
+from gateway.config import GatewaySettings, render
+
+SHOWN: Final = 10
+HEADINGS: Final = {
+    "north_m": "latitude\nerror, m",
+    "east_m": "longitude\nerror, m",
+    "held_m": "withheld\nfixes, m",
+    "interpolated_m": "interpolated\nGPS, m",
+    "reference_m": "reference\nm",
+    "attitude_deg": "attitude\ndeg",
+}
+
+Trial = tuple[Values, dict[str, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the command line asks for."""
+
+    named: Sequence[tuple[str, str]]
+    """The paper's own weights, with their values as texts."""
+    vary: Sequence[str]
+    """Further settings as `NAME=VALUES`."""
+    generations: int
+    """How long to search; 0 for a grid."""
+    metric: Metric
+    hold_out: int
+    gps_interval_s: float
+    jobs: int | None
+    output: Path
+    table: Path | None
+
+
+def run_sweep(path: Path | None, loading: Loading, wish: Wish) -> None:
+    """Try the settings, show the best, and write it as a settings file."""
+    try:
+        axes = _axes(wish)
+        flight = load_flight(path, loading)
+        contest = sweeping.make_contest(
+            flight,
+            flight.fusion,
+            [axis.key for axis in axes],
+            hold_out=wish.hold_out,
+            interval_s=wish.gps_interval_s,
+        )
+        with pool(contest, wish.jobs) as run:
+            if wish.generations:
+                trials = _search(axes, run, wish.generations, wish.metric)
+            else:
+                trials = _try_all(sweeping.grid(axes), run)
+        results = sweeping.tabulate(contest.keys, trials, wish.metric)
+    except SweepError as error:
+        refuse(str(error))
+    _show(results, contest, wish.metric)
+    best = tuple(results.iloc[0][list(contest.keys)])
+    with refusing():
+        wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
+        print(wish.output)
+        if wish.table is not None:
+            with wish.table.open("w", encoding="utf-8", newline="") as table:
+                results.to_csv(table, index=False)
+
+
+def _axes(wish: Wish) -> list[Axis]:
+    wanted = list(wish.named)
+    for item in wish.vary:
+        name, equals, text = item.partition("=")
+        if not equals:
+            raise SweepError(f"--vary {item}: write NAME=VALUES")
+        wanted.append((name, text))
+    if not wanted:
+        raise SweepError("nothing to vary: give --alpha, --beta or --vary NAME=VALUES")
+    return [sweeping.parse_axis(name, text) for name, text in wanted]
+
+
+def _progress() -> Progress:
+    console = console_of(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
+    )  # fmt: skip
+
+
+def _try_all(points: Sequence[Values], run: Run) -> list[Trial]:
+    found: list[Trial] = []
+    with _progress() as progress:
+        task = progress.add_task("trials", total=len(points))
+        for index, scores in run(points):
+            found.append((points[index], scores))
+            progress.advance(task)
+    return found
+
+
+def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) -> list[Trial]:
+    found: list[Trial] = []
+    with _progress() as progress:
+        task = progress.add_task("generations", total=generations)
+
+        def evaluate(points: list[Values]) -> list[float]:
+            scores = dict(run(points))
+            found.extend((values, scores[k]) for k, values in enumerate(points))
+            return [scores[k][COLUMN_OF[metric]] for k in range(len(points))]
+
+        def told(best: float) -> None:
+            progress.update(task, advance=1, description=f"generations, best {best:.3f}")
+
+        sweeping.optimise(axes, evaluate, generations, told)
+    return found
+
+
+def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
+    judged = COLUMN_OF[metric]
+    others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
+    names = [*contest.keys, judged, *(name for name in others if name != judged)]
+    shown = Table(box=box.SIMPLE_HEAD, title=f"Best of {len(results)} trials, by {judged}")
+    for name in names:
+        shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
+    for row in results[names].head(SHOWN).itertuples(index=False):
+        shown.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row))
+    console_of().print(shown)
+
+
+def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:
+    """Put the best values into the whole settings."""
+    fusion: FusionSettings = sweeping.settings_at(contest, best)
+    return msgspec.structs.replace(settings, sensing=fusion.sensing, estimation=fusion.estimation)

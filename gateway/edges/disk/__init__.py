@@ -1,0 +1,1 @@
+"""Recordings, places and logs on the disk."""

@@ -1,0 +1,79 @@
+"""A tlog that comes into being while it is played: a table that is fused again."""
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from itertools import islice
+from typing import Final
+
+from gateway.flightlog.tlog.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
+
+log = logging.getLogger(__name__)
+
+PIECE: Final = 8
+"""Frames that are made at once: one or two milliseconds."""
+
+
+class FusedTlog:
+    """Makes frames as they are wanted, and keeps them on the disk so that one can seek back.
+
+    Parameters
+    ----------
+    frames : iterator of TlogRecord
+        What is played, in the order of its time.
+    last_us : int, optional
+        Time of its end, as far as that is known beforehand.
+
+    Raises
+    ------
+    OSError
+        If there is no room for temporary files.
+    """
+
+    def __init__(self, frames: Iterator[TlogRecord], last_us: int | None = None) -> None:
+        self._frames = frames
+        self._last_us = last_us
+        self._file = tempfile.TemporaryFile(prefix="mavgate-play-")  # noqa: SIM115
+        self._scanner = TlogScanner()
+        self._size = 0
+        self._ended = False
+        self.index = TlogIndex()
+        """Of what was made by now."""
+        while not self.index.count and self._make():
+            pass
+
+    @property
+    def last_us(self) -> int:
+        """Time of the end, or of the last frame that was made."""
+        return max(self._last_us or 0, self.index.last_us or 0)
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to so many bytes; makes the next frames where there are none yet."""
+        while offset >= self._size and self._make():
+            pass
+        return os.pread(self._file.fileno(), size, offset)
+
+    def prepare(self, until_us: int) -> bool:
+        """Make a few of the frames up to a time; tells whether they are all there."""
+        return (self.index.last_us or 0) >= until_us or not self._make()
+
+    def close(self) -> None:
+        """Forget what was made."""
+        self._file.close()
+
+    def _make(self) -> bool:
+        """Make some frames; tells whether there were any."""
+        if self._ended:
+            return False
+        made = b"".join(encode_record(r.time_us, r.frame) for r in islice(self._frames, PIECE))
+        self._ended = not made
+        try:
+            self._file.write(made)
+            self._file.flush()
+        except OSError as error:
+            log.warning("The rest cannot be played: %s: %s", tempfile.gettempdir(), error.strerror)
+            self._ended = True
+        self.index.add(self._scanner.feed(made, final=self._ended))
+        self._size += len(made)
+        return not self._ended

@@ -1,0 +1,152 @@
+"""The files of one part on the disk; everything here may block and runs in the recorder's worker.
+
+Files are only ever appended to, so a cut at any moment leaves what was written before. Only what a
+disk has refused in the middle is taken back.
+"""
+
+import contextlib
+import errno
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gateway.edges.disk.recordings import (
+    check_free,
+    free_name,
+    list_recordings,
+    rename_recording,
+    sync_folder,
+)
+from gateway.flightlog.session import part_stem
+
+RIGHTS: Final = 0o644
+
+
+@dataclass(frozen=True, slots=True)
+class DiskState:
+    """What came of a write."""
+
+    part_bytes: int
+    """Size of the largest file."""
+    free_bytes: int
+
+
+def free_bytes_near(folder: Path) -> int:
+    """Tell the free space where a folder is, or would be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize
+
+
+def reason_of(error: OSError) -> str:
+    """Say in a few words what the disk does not like: a STATUSTEXT has 50 bytes."""
+    known = {
+        errno.ENOSPC: "disk is full",
+        errno.EDQUOT: "disk quota is used up",
+        errno.EROFS: "disk is read-only",
+        errno.EACCES: "no right to write",
+        errno.ENOENT: "folder has vanished",
+        errno.EIO: "disk fails",
+    }
+    return known.get(error.errno or 0, os.strerror(error.errno or errno.EIO))
+
+
+class PartFiles:
+    """Appends to the files of one part, opening each with its first bytes.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    session : str
+        Name of the recording; gets a number behind it if the first part finds it taken.
+    part : int
+        From 1.
+    """
+
+    def __init__(self, folder: Path, session: str, part: int) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self.session = free_name(folder, session) if part == 1 else session
+        self._part = part
+        self._files: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}
+
+    def write(self, pieces: Mapping[str, bytes], sync: bool) -> DiskState:
+        """Append to files.
+
+        Parameters
+        ----------
+        pieces : mapping of str to bytes
+            What to append, by the end of the file's name: `.tlog`, `_v1.csv`.
+        sync : bool
+            Wait until all of it is on the disk itself.
+
+        Returns
+        -------
+        DiskState
+
+        Raises
+        ------
+        OSError
+            If the disk does not take it, or a file was removed under our hands.
+        """
+        for ending, data in pieces.items():
+            if ending not in self._files:
+                self._open(ending)
+            self._append(ending, data)
+        for file in self._files.values():
+            if sync:
+                os.fdatasync(file)
+            if os.fstat(file).st_nlink == 0:
+                raise FileNotFoundError(errno.ENOENT, "removed while it was written")
+        return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
+
+    def rename(self, to_name: str) -> None:
+        """Name the recording otherwise between two writes, also before the first.
+
+        Raises
+        ------
+        RecordingError
+            If the name is taken, or is none.
+        """
+        if self.session in {recording.name for recording in list_recordings(self._folder)}:
+            rename_recording(self._folder, self.session, to_name)
+        else:
+            check_free(self._folder, to_name)
+        self.session = to_name
+
+    def close(self) -> None:
+        """Close all files; what the disk holds stays whatever happens, but none stays empty."""
+        files, self._files = self._files, {}
+        for ending, file in files.items():
+            try:
+                os.fdatasync(file)
+            finally:
+                os.close(file)
+                if not self._sizes[ending]:
+                    self._path(ending).unlink(missing_ok=True)
+
+    def _open(self, ending: str) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
+        self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
+        self._sizes[ending] = 0
+        sync_folder(self._folder)
+
+    def _path(self, ending: str) -> Path:
+        return self._folder / (part_stem(self.session, self._part) + ending)
+
+    def _append(self, ending: str, data: bytes) -> None:
+        file, size, view = self._files[ending], self._sizes[ending], memoryview(data)
+        try:
+            while view:
+                view = view[os.write(file, view) :]
+        except OSError:
+            # A full disk takes the begin of what is written: no half record may stay.
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, size)
+            raise
+        self._sizes[ending] = size + len(data)

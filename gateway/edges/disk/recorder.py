@@ -1,0 +1,400 @@
+"""The recorder: keeps what passes through the gateway, and never holds it up.
+
+Linux has no way to write to a disk without waiting for it: a card that tidies up, or a network
+folder, blocks for seconds. So the disk is the one thing that a second thread does. It is handed
+immutable bytes and hands back a result; nothing is shared, so there is nothing to lock. While it
+is at work the event loop gathers the next bytes, up to a bound.
+
+Every `flush_s` the gathered bytes go to the kernel, which survives the death of the gateway; every
+`sync_s` the kernel is made to put them on the disk, which survives the loss of power. By default
+both are half a second, so that either costs less than a second; a card that is worn by this may be
+synced less often.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import msgspec
+
+from gateway.edges.disk.part_files import DiskState, PartFiles, free_bytes_near, reason_of
+from gateway.edges.disk.recordings import RecordingError, part_of, rename_recording
+from gateway.edges.disk.restamp import Restamper, clear_copies
+from gateway.flightlog.session import (
+    Announce,
+    ClosePart,
+    OpenPart,
+    RecordingSettings,
+    Rename,
+    Session,
+    SessionAction,
+    SessionState,
+)
+from gateway.flightlog.table.part import PENDING_LIMIT, Part
+from gateway.flightlog.table.table import TableHeader, TableMark
+from gateway.flightlog.tlog.stamps import CivilClock
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """What the recorder does."""
+
+    state: str
+    name: str
+    part: int
+    part_bytes: int
+    free_bytes: int
+    reason: str
+    folder: str
+
+
+class Recorder:
+    """Records MAVLink and flights.
+
+    Parameters
+    ----------
+    settings : RecordingSettings
+        What, where, when.
+    now_us : callable
+        The gateway clock.
+    unix_us : callable
+        The machine's civil time.
+    header_of : callable
+        Tells what heads a vehicle's table: version, settings, calibration. Session, part and
+        start are filled in here.
+    announce : callable
+        Told whether it is trouble, and a text for the user.
+    state_of : callable
+        Tells what the fusion of a vehicle remembers after all that was handed to `flight`.
+    """
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        now_us: Callable[[], int],
+        unix_us: Callable[[], int],
+        header_of: Callable[[int], TableHeader],
+        announce: Callable[[bool, str], None],
+        state_of: Callable[[int], FusionState | None] = lambda _: None,
+    ) -> None:
+        self._settings = settings
+        self._clock, self._machine_us = now_us, unix_us
+        self._header_of = header_of
+        self._announce = announce
+        self._state_of = state_of
+        self._session = Session(settings)
+        self._civil = CivilClock()
+        self._seen: set[int] = set()
+        self._part: Part | None = None
+        self._files: PartFiles | None = None
+        self._disk = DiskState(0, 0)
+        self._sync_due_us = 0
+        self._worker = ThreadPoolExecutor(1, "recorder")
+        self._wake = asyncio.Event()
+        self._turned = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._offsets: dict[int, int] = {}
+        """Civil time of gateway time zero with which each part of the session was written."""
+        self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
+        self._restamping: asyncio.Task[None] | None = None
+        self.folder = Path(settings.folder).expanduser()
+        """Where the recordings are."""
+
+    def start(self) -> None:
+        """Begin to work; needs a running event loop.
+
+        A recording that is wanted already is opened at once: nothing runs yet that could be held
+        up, and a table is worth most from the estimator's first sample on.
+        """
+        clear_copies(self.folder)
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        if self._session.wanted:
+            self._open_at_once()
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def close(self) -> None:
+        """Write what is left and end; waits for the disk."""
+        for task in (self._task, self._restamping):
+            if task is not None:
+                task.cancel()
+        self._worker.shutdown(wait=True)
+        files, self._files = self._files, None
+        try:
+            if files is not None and self._part is not None:
+                self._part.flush_rows()
+                files.write(self._part.take(), sync=True)
+                files.close()
+        except OSError as error:
+            log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+        self._restamper.finish()
+
+    async def settle(self) -> None:
+        """Wait until orders given so far have been carried out."""
+        # The turn that is at work may have begun before the order came.
+        for _ in range(2):
+            self._turned.clear()
+            self._wake.set()
+            await self._turned.wait()
+
+    def record(self) -> None:
+        """Record from now on."""
+        self._session.start()
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Record no more until the next order or flight."""
+        self._session.stop()
+        self._wake.set()
+
+    def set_in_flight(self, in_flight: bool) -> None:
+        """Note take-off or landing."""
+        self._session.set_in_flight(in_flight)
+
+    def mark(self, text: str) -> None:
+        """Put a remark at this moment into the recording."""
+        if self._part is not None:
+            self._part.add_mark(TableMark(self._clock(), text))
+        self._announce(False, f"Mark: {text}")
+
+    async def save(self, name: str) -> None:
+        """Name the session that runs, or ran last.
+
+        Raises
+        ------
+        RecordingError
+            If there is none, or the name is taken or is none.
+        """
+        if not self._session.name:
+            raise RecordingError("nothing was recorded since the gateway started")
+        await self._restamped()
+        old, files = self._session.name, self._files
+        if files is None:
+            await self._on_disk(rename_recording, self.folder, old, name)
+        else:
+            await self._on_disk(files.rename, name)
+        self._session.name = name
+        if self._part is not None:
+            self._part.session = name
+
+    def status(self) -> RecorderStatus:
+        """Describe this moment."""
+        session, disk = self._session, self._disk
+        return RecorderStatus(
+            state=session.state.value,
+            name=session.name,
+            part=session.part,
+            part_bytes=disk.part_bytes,
+            free_bytes=disk.free_bytes,
+            reason=session.reason,
+            folder=str(self.folder),
+        )
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can be recorded at the moment, or nothing."""
+        return self._session.reason if self._session.state is SessionState.BLOCKED else ""
+
+    @property
+    def recording(self) -> bool:
+        """Whether a recording runs, and the disk has taken its first bytes."""
+        return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
+
+    def frame(self, frame: bytes) -> None:
+        """Keep a MAVLink frame that was sent or received."""
+        if self._part is not None and self._settings.tlog:
+            self._part.add_frame(frame, self._clock())
+
+    def flight(self, record: BaroRaw | GpsFix | FusedSample) -> None:
+        """Keep what the estimator took, and the state that it made of it."""
+        if isinstance(record, GpsFix) and record.utc_us is not None:
+            self._civil.hear_gps(record.utc_us, record.time_us)
+        vehicle_id = (
+            record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
+        )
+        part = self._part
+        if part is not None and self._settings.table:
+            if not part.has_table(vehicle_id):
+                part.prepare_table(self._header(vehicle_id, part))
+            part.add_flight(vehicle_id, record)
+        self._seen.add(vehicle_id)
+
+    def settings_changed(self, vehicle_id: int) -> None:
+        """Note that what comes is fused with other settings, which a new head tells."""
+        if self._part is not None and self._part.has_table(vehicle_id):
+            self._part.change_settings(self._header(vehicle_id, self._part))
+
+    def _new_part(self, session: str, number: int) -> Part:
+        """Begin to gather for a part; later, the fusion would be ahead of its first row."""
+        part = Part(session, number, self._civil.offset_us or 0)
+        if number == 1:
+            self._offsets.clear()
+        self._offsets[number] = part.stamper.offset_us
+        if self._settings.table:
+            for vehicle_id in self._seen:
+                part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
+        return part
+
+    def _header(self, vehicle_id: int, part: Part) -> TableHeader:
+        return msgspec.structs.replace(
+            self._header_of(vehicle_id),
+            vehicle_id=vehicle_id,
+            session=part.session,
+            part=part.number,
+            cold_start=vehicle_id not in self._seen,
+            unix_us_at_zero=part.stamper.offset_us,
+        )
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            # A slow disk takes its time from the pause: what waits for it is not to grow by both.
+            due_s = loop.time() + self._settings.flush_s
+            self._wake.clear()
+            await self._turn()
+            self._turned.set()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), max(due_s - loop.time(), 0.0))
+
+    async def _turn(self) -> None:
+        """Write what was gathered, then let the session decide."""
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        actions = await self._flush()
+        if not actions:
+            now_us, disk = self._clock(), self._disk
+            part = self._part
+            actions = self._session.poll(
+                now_us,
+                now_us + (self._civil.offset_us or 0),
+                disk.part_bytes,
+                disk.free_bytes,
+                jumped=part is not None and part.stamper.has_jumped(self._civil),
+            )
+        while actions:
+            actions = await self._perform(actions)
+
+    async def _flush(self) -> list[SessionAction]:
+        now_us, part, files = self._clock(), self._part, self._files
+        try:
+            if part is None or files is None:
+                self._disk = DiskState(0, await self._on_disk(free_bytes_near, self.folder))
+                return []
+            if part.size > PENDING_LIMIT:
+                return self._session.failed("disk is too slow", now_us)
+            sync = now_us >= self._sync_due_us
+            if sync:
+                self._sync_due_us = now_us + round(self._settings.sync_s * US_PER_S)
+            self._disk = await self._on_disk(files.write, part.take(), sync)
+        except OSError as error:
+            return self._session.failed(reason_of(error), self._clock())
+        return []
+
+    async def _perform(self, actions: list[SessionAction]) -> list[SessionAction]:
+        """Do what the session decided; return what it decides upon the outcome."""
+        closing = self._part
+        opening = next((action for action in actions if isinstance(action, OpenPart)), None)
+        # The next part gathers from here on, so that nothing is lost while the last one closes.
+        if closing is not None and any(isinstance(a, ClosePart) for a in actions):
+            closing.flush_rows()
+            self._part = None
+        if opening is not None:
+            self._part = self._new_part(opening.session, opening.part)
+        following: list[SessionAction] = []
+        for action in actions:
+            match action:
+                case ClosePart():
+                    await self._close_part(closing)
+                case Rename():
+                    await self._rename(action)
+                case OpenPart():
+                    following += await self._open_part(action)
+                case Announce():
+                    self._say(action)
+        return following
+
+    def _say(self, action: Announce) -> None:
+        (log.warning if action.is_trouble else log.info)("%s", action.text)
+        self._announce(action.is_trouble, action.text)
+
+    def _open_at_once(self) -> None:
+        now_us, offset_us = self._clock(), self._civil.offset_us or 0
+        try:
+            self._disk = DiskState(0, free_bytes_near(self.folder))
+            actions = self._session.poll(now_us, now_us + offset_us, 0, self._disk.free_bytes)
+            for action in actions:
+                if isinstance(action, OpenPart):
+                    files = PartFiles(self.folder, action.session, action.part)
+                    self._part = self._new_part(action.session, action.part)
+                    actions = self._adopt(files)
+        except OSError as error:
+            actions = self._session.failed(reason_of(error), now_us)
+        for action in actions:
+            if isinstance(action, Announce):
+                self._say(action)
+
+    async def _open_part(self, action: OpenPart) -> list[SessionAction]:
+        try:
+            files = await self._on_disk(PartFiles, self.folder, action.session, action.part)
+        except OSError as error:
+            self._part = None
+            return self._session.failed(reason_of(error), self._clock())
+        return self._adopt(files)
+
+    def _adopt(self, files: PartFiles) -> list[SessionAction]:
+        self._files = files
+        self._session.name = files.session
+        if self._part is not None:
+            self._part.session = files.session
+        return self._session.opened(self._clock())
+
+    async def _close_part(self, part: Part | None) -> None:
+        files, self._files = self._files, None
+        if part is None or files is None:
+            return
+        try:
+            await self._on_disk(files.write, part.take(), True)
+        except OSError as error:
+            log.warning("Recording: the end of %s is lost: %s", files.session, reason_of(error))
+        with contextlib.suppress(OSError):
+            await self._on_disk(files.close)
+
+    async def _rename(self, action: Rename) -> None:
+        """Name a session by its true time, and let its finished parts be shifted to it."""
+        await self._restamped()
+        old, new = action.session, action.to_session
+        try:
+            found = await self._on_disk(rename_recording, self.folder, old, new)
+        except (OSError, RecordingError) as error:
+            log.warning("Recording %s keeps its name and times: %s", old, error)
+            return
+        true_us = self._civil.offset_us or 0
+        for path in found.files:
+            self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
+        self._offsets = dict.fromkeys(self._offsets, true_us)
+        run = self._restamper.run(lambda step: self._on_disk(step))
+        self._restamping = asyncio.get_running_loop().create_task(run)
+
+    async def _restamped(self) -> None:
+        """Wait until no file is being copied, so that its name may change."""
+        if self._restamping is not None:
+            await self._restamping
+
+    async def _on_disk(
+        self,
+        job: Callable[Parameters, Result],
+        *args: Parameters.args,
+        **kwargs: Parameters.kwargs,
+    ) -> Result:
+        assert not kwargs
+        return await asyncio.get_running_loop().run_in_executor(self._worker, job, *args)

@@ -1,0 +1,144 @@
+"""Recordings on the disk as streams: read in chunks, written without overwriting."""
+
+import gzip
+import os
+from collections.abc import Callable, Iterable, Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import BinaryIO, Final, cast
+
+from gateway.flightlog.table.table import TableEvent, TableReader
+from gateway.flightlog.tlog.tlog import Batch, TlogScanner
+
+CHUNK: Final = 1 << 20
+SNIFF: Final = 512
+TAIL: Final = 1 << 14
+"""Some twenty rows."""
+GZIP: Final = ".gz"
+
+Progress = Callable[[int], None]
+"""Told how many more bytes were read."""
+
+
+class FileKind(StrEnum):
+    """What a file holds."""
+
+    TLOG = "tlog"
+    TABLE = "table"
+    FOREIGN = "foreign"
+    """Text with columns that are not ours."""
+
+
+def kind_of(path: Path) -> FileKind:
+    """Look at a file's first bytes; raises OSError if it cannot be read."""
+    with _open(path) as file:
+        head = file.read(SNIFF)
+    if head.startswith((b"# mavgate table", b"time_us,")):
+        return FileKind.TABLE
+    is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
+    return FileKind.TLOG if is_binary or b"," not in head else FileKind.FOREIGN
+
+
+def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:
+    """Read a file, gzipped or not, piece by piece; progress counts bytes on the disk."""
+    done = 0
+    with path.open("rb") as raw, _unpacked(path, raw) as file:
+        while data := file.read(CHUNK):
+            yield data
+            if progress is not None:
+                progress(raw.tell() - done)
+                done = raw.tell()
+
+
+def read_ends(path: Path) -> tuple[bytes, bytes]:
+    """Read the lines of a text that stand before its first row, and some of the last.
+
+    Returns
+    -------
+    head : bytes
+        The lines up to the first that is no comment, and that one.
+    tail : bytes
+        The last lines, the first of them whole.
+    """
+    head = tail = b""
+    with _open(path) as file:
+        for line in file:
+            head += line
+            if not line.startswith(b"#"):
+                break
+        if path.suffix == GZIP:
+            while data := file.read(CHUNK):
+                tail = tail[-TAIL:] + data
+        else:
+            file.seek(max(len(head), path.stat().st_size - TAIL))
+            tail = file.read()
+    return head, tail[-TAIL:].partition(b"\n")[2]
+
+
+def _open(path: Path) -> BinaryIO:
+    return cast(BinaryIO, gzip.open(path)) if path.suffix == GZIP else path.open("rb")
+
+
+def _unpacked(path: Path, raw: BinaryIO) -> BinaryIO:
+    return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if path.suffix == GZIP else raw
+
+
+def read_batches(
+    path: Path, progress: Progress | None = None, *, strict: bool = False
+) -> Iterator[Batch]:
+    """Read a tlog batch by batch; see `TlogScanner`."""
+    scanner = TlogScanner(strict=strict)
+    for data in read_chunks(path, progress):
+        yield scanner.feed(data)
+    yield scanner.feed(b"", final=True)
+
+
+def read_events(
+    path: Path, reader: TableReader, progress: Progress | None = None
+) -> Iterator[TableEvent]:
+    """Read a table event by event; the reader then knows its head."""
+    for data in read_chunks(path, progress):
+        yield from reader.feed(data)
+    yield from reader.feed(b"", final=True)
+
+
+def write_new(path: Path, pieces: Iterable[bytes], *, overwrite: bool = False) -> int:
+    """Write a file in full or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Must not be there yet unless it may be overwritten.
+    pieces : iterable of bytes
+        What to write.
+    overwrite : bool
+        Put it in the place of what is there.
+
+    Returns
+    -------
+    int
+        Bytes written.
+
+    Raises
+    ------
+    OSError
+        FileExistsError if there is such a file, or what the disk does not like.
+    """
+    if not overwrite:
+        path.touch(exist_ok=False)
+    partial = path.with_name(path.name + ".partial")
+    size, done = 0, False
+    try:
+        with partial.open("wb") as file:
+            for piece in pieces:
+                size += file.write(piece)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+        done = True
+    finally:
+        if not done:
+            partial.unlink(missing_ok=True)
+            if not overwrite:
+                path.unlink(missing_ok=True)
+    return size

@@ -1,0 +1,1 @@
+"""The hub: MAVLink to and from every client, one file a transport."""

@@ -1,0 +1,102 @@
+"""The short way for frames that come often and need no judgement.
+
+Telemetry of a vehicle that is heard by one way only goes to the same clients again and again.
+For each kind of frame the hub keeps one express: the clients' own write functions in a row, with
+nothing counted on the way but once for all. Whenever anybody comes, goes or changes, all
+expresses are given up, and the next frame of each kind is judged anew.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(slots=True)
+class ClientCounters:
+    """What one client has done since it appeared."""
+
+    sent: int = 0
+    dropped: int = 0
+    bytes_sent: int = 0
+    received: int = 0
+    bytes_received: int = 0
+    bytes_garbage: int = 0
+
+
+class Outlet(Protocol):
+    """What an express needs of a client."""
+
+    @property
+    def counters(self) -> ClientCounters:
+        """What it has done."""
+
+    @property
+    def write(self) -> Callable[[bytes], object]:
+        """Sends one frame at once or raises OSError; only of a client that is direct."""
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether a frame may go to `write` without further ado."""
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Judge a failed `write` that will be counted as sent all the same."""
+
+    def transmit(self, frame: bytes, message_id: int) -> None:
+        """Send one frame now or queue it; never block, never raise."""
+
+
+class Express:
+    """Who gets one kind of frame from one client.
+
+    Parameters
+    ----------
+    source : Outlet
+        Where the frames come from.
+    message_id : int
+        Of the frames.
+    clients : sequence of Outlet
+        Those who take each of them.
+    tap : callable, optional
+        Sees each frame too.
+    """
+
+    __slots__ = ("_bytes", "_direct", "_frames", "_message_id", "_others", "_source", "_tap")
+
+    def __init__(
+        self,
+        source: Outlet,
+        message_id: int,
+        clients: Sequence[Outlet],
+        tap: Callable[[bytes], None] | None,
+    ) -> None:
+        self._source = source
+        self._message_id = message_id
+        self._tap = tap
+        self._direct = [client for client in clients if client.is_direct]
+        self._others = [client for client in clients if not client.is_direct]
+        self._frames = self._bytes = 0
+
+    def send(self, frame: bytes) -> None:
+        """Count a frame as received and hand it to every client."""
+        self._frames += 1
+        self._bytes += len(frame)
+        for client in self._direct:
+            try:
+                client.write(frame)
+            except OSError as error:
+                client.recover_uncounted(frame, error)
+        for client in self._others:
+            client.transmit(frame, self._message_id)
+        if self._tap is not None:
+            self._tap(frame)
+
+    def settle(self) -> int:
+        """Add what passed to the clients' own counters; return how many frames that were."""
+        frames, size = self._frames, self._bytes
+        self._frames = self._bytes = 0
+        self._source.counters.received += frames
+        self._source.counters.bytes_received += size
+        for client in self._direct:
+            client.counters.sent += frames
+            client.counters.bytes_sent += size
+        return frames

@@ -1,0 +1,400 @@
+"""The hub: every frame of ours goes to every client, and what clients say finds its way."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any, Final
+
+from gateway.edges.hub.client import Client
+from gateway.edges.hub.express import Express
+from gateway.edges.hub.group import GroupClient
+from gateway.edges.hub.listener import Listener
+from gateway.edges.hub.radio import RadioClient
+from gateway.edges.hub.tcp import TcpClient, TcpListener
+from gateway.edges.hub.udp import UdpClient
+from gateway.edges.hub.udp_listen import UdpListener
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.routing.digest import Digest
+from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.routing.fanout import Fanout
+from gateway.routing.hub_settings import HubSettings
+from gateway.routing.probe import RoundTrip
+from gateway.routing.routing_table import LoopGuard, Origin, RoutingTable
+from gateway.routing.trouble import TroubleWatch
+from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import (
+    is_station_heartbeat,
+    key_of,
+    message_id_of,
+    origin_of,
+    restamp,
+    target_of,
+)
+
+log = logging.getLogger(__name__)
+
+MAX_EXPRESS: Final = 1024
+"""Kinds of frame a client; beyond a few hundred they are forged."""
+TICK_S: Final = 0.25
+"""Often enough for expiry and reconnection, too seldom to cost anything."""
+VISITS_IN_FULL: Final = 30
+"""Comings and goings at listening ports that are logged one by one in a minute."""
+
+CLIENTS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Client]]] = {
+    EndpointKind.UDP: UdpClient,
+    EndpointKind.UDP_BROADCAST: GroupClient,
+    EndpointKind.UDP_MULTICAST: GroupClient,
+    EndpointKind.TCP: TcpClient,
+    EndpointKind.SERIAL: RadioClient,
+}
+LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener[Any]]]] = {
+    EndpointKind.UDP_LISTEN: UdpListener,
+    EndpointKind.TCP_LISTEN: TcpListener,
+}
+
+
+class Hub:
+    """Send MAVLink to many clients, take theirs, and pass between them what concerns them.
+
+    Parameters
+    ----------
+    settings : HubSettings
+        Endpoints and limits.
+    on_frame : callable
+        Called with every frame for our vehicles, every request to all, and every heartbeat.
+    now_us : callable
+        The gateway clock.
+    on_foreign : callable, optional
+        Called with every frame of another system, once, byte for byte, as for a recorder.
+    on_gone : callable, optional
+        Called with the id of a client that has gone for good.
+    on_trouble : callable, optional
+        Called with a short text when clients come into trouble or out of it.
+    seal : callable, optional
+        Numbers, and signs, each frame of ours that leaves; without it none is signed.
+    """
+
+    def __init__(
+        self,
+        settings: HubSettings,
+        on_frame: Callable[[Incoming], None],
+        now_us: Callable[[], int],
+        on_foreign: Callable[[bytes], None] | None = None,
+        on_gone: Callable[[int], None] | None = None,
+        on_trouble: Callable[[str], None] | None = None,
+        seal: Seal = restamp,
+    ) -> None:
+        self.settings = settings
+        self.seal = seal
+        self.now_us = now_us
+        self._on_frame = on_frame
+        self._on_foreign = on_foreign
+        self._on_gone = on_gone
+        self._on_trouble = on_trouble
+        self._trouble = TroubleWatch()
+        self._visits = Digest(VISITS_IN_FULL, "more comings and goings at listening ports")
+        self._fanout = Fanout(seal)
+        self._table = RoutingTable()
+        self._guard = LoopGuard()
+        self._probe = RoundTrip(seal)
+        self._clients: dict[int, Client] = {}
+        self._express_sources: set[Client] = set()
+        self._endpoints: dict[str, Client | Listener[Any]] = {}
+        self._next_id = 1
+        self._vehicles = OwnVehicles(seal)
+        self._ping_us = self._trouble_us = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._published = self._forwarded = self._duplicates = 0
+        self._looped = self._unroutable = 0
+
+    def start(self) -> None:
+        """Open the endpoints; needs a running event loop. What fails is tried again."""
+        for url in self.settings.endpoints:
+            self.add(url)
+        self._tick()
+
+    def close(self) -> None:
+        """Close every socket."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        for place in list(self._endpoints):
+            self.remove(place)
+
+    def send(self, outgoing: Outgoing) -> None:
+        """Send one of our own frames to every client that takes it, or to the one it answers."""
+        frame = outgoing.frame
+        self._published += 1
+        if self._vehicles.has_newcomers:
+            self._welcome(frame)
+        if outgoing.client_id is not None:
+            self._fanout.answer(frame, outgoing.client_id)
+            return
+        now_us = self.now_us()
+        if self._vehicles.note(frame, outgoing.message_id, now_us):
+            self._forget_express()
+        self._fanout.publish(frame, now_us)
+
+    def set_interval(self, wish: ClientInterval) -> None:
+        """Send a client one message of one system at the rate that it wishes."""
+        self._fanout.set_interval(wish)
+        self._forget_express()
+
+    def add(self, url: str) -> None:
+        """Open one more endpoint.
+
+        Raises
+        ------
+        ValueError
+            If the URL is not understood, or the same endpoint is there already.
+        """
+        endpoint = parse_endpoint(url)
+        if endpoint.place in self._endpoints:
+            raise ValueError(f"endpoint {endpoint.place!r} is there already")
+        if listen := LISTENERS.get(endpoint.kind):
+            self._endpoints[endpoint.place] = listen(self, endpoint)
+            return
+        client = CLIENTS[endpoint.kind](self, self.new_client_id(), endpoint)
+        self._endpoints[endpoint.place] = client
+        self.appear(client)
+
+    def remove(self, name: str) -> None:
+        """Close an endpoint.
+
+        Parameters
+        ----------
+        name : str
+            Its URL, with or without options, or its name.
+
+        Raises
+        ------
+        ValueError
+            If there is none such.
+        """
+        for place, opened in self._endpoints.items():
+            if name in (place, opened.endpoint.name, opened.endpoint.url):
+                break
+        else:
+            raise ValueError(f"no endpoint is called {name!r}")
+        gone = self._endpoints.pop(place)
+        if isinstance(gone, Client):
+            self.vanish(gone)
+        else:
+            gone.close()
+
+    def apply(self, settings: HubSettings) -> None:
+        """Take over changed settings; endpoints that stay keep their clients.
+
+        Those whose options changed are changed in place, those added at run time stay.
+        """
+        before = {parse_endpoint(url).place for url in self.settings.endpoints}
+        after = {parse_endpoint(url).place: url for url in settings.endpoints}
+        self.settings = settings
+        for place in before - after.keys():
+            if place in self._endpoints:
+                self.remove(place)
+        for place, url in after.items():
+            if place not in self._endpoints:
+                self.add(url)
+            elif (opened := self._endpoints[place]).endpoint.url != url:
+                opened.reconfigure(parse_endpoint(url))
+
+    def clients(self) -> tuple[ClientStats, ...]:
+        """Describe every client at this moment, in the order of their ids."""
+        self._settle_express()
+        return tuple(
+            self._clients[key].stats(self._table.origins(key)) for key in sorted(self._clients)
+        )
+
+    def listeners(self) -> tuple[ListenerStats, ...]:
+        """Describe every listening port at this moment, in the order of the settings."""
+        return tuple(
+            opened.stats() for opened in self._endpoints.values() if not isinstance(opened, Client)
+        )
+
+    def endpoints(self) -> tuple[str, ...]:
+        """Return the URLs of all endpoints."""
+        return tuple(opened.endpoint.url for opened in self._endpoints.values())
+
+    def counters(self) -> HubCounters:
+        """Return the totals since the start."""
+        self._settle_express()
+        return HubCounters(
+            published=self._published,
+            forwarded=self._forwarded,
+            duplicates=self._duplicates,
+            looped=self._looped,
+            unroutable=self._unroutable,
+        )
+
+    def listening_ports(self) -> tuple[int, ...]:
+        """Return the ports that listening endpoints have bound, in the order of the settings."""
+        return tuple(listener.port for listener in self.listeners())
+
+    def new_client_id(self) -> int:
+        """Return an id that no client had before."""
+        self._next_id += 1
+        return self._next_id - 1
+
+    def is_own(self, origin: Origin) -> bool:
+        """Tell whether a system and component is one of our vehicles."""
+        return self._vehicles.is_own(origin, self.now_us())
+
+    def deliver(self, client: Client, frame: bytes, now_us: int) -> None:
+        """Take one frame that a client received, and pass it on to whom it concerns."""
+        origin = origin_of(frame)
+        if self._vehicles.is_own(origin, now_us) or origin == self._probe.origin:
+            self._looped += 1
+            return
+        if self._table.hear(client.client_id, origin, now_us):
+            self._forget_express()
+        message_id = message_id_of(frame)
+        if message_id == HEARTBEAT_ID:
+            self._table.note_kind(origin, is_station=is_station_heartbeat(frame))
+        round_trip_us = self._probe.read(frame, now_us)
+        if round_trip_us is not None:
+            client.round_trip_us = round_trip_us
+            return
+        if self._table.is_shared(origin, now_us) and self._guard.is_copy(
+            frame, self._table.since_us(client.client_id, origin), now_us
+        ):
+            self._duplicates += 1
+        elif target_of(frame)[0]:
+            self._route_addressed(client, frame, now_us)
+        else:
+            self._route_broadcast(client, frame, now_us)
+
+    def appear(self, client: Client) -> None:
+        """Let a client take part."""
+        self._clients[client.client_id] = client
+        self._fanout.add(client.client_id, client.transmit, client.endpoint)
+        self._forget_express()
+        self._log_visit(client, f"client {client.client_id}: {client.remote}")
+
+    def greet(self, client: Client) -> None:
+        """Tell a peer that has just come which vehicles there are, and their homes."""
+        self._vehicles.await_greeting(client.client_id)
+
+    def reconfigure(self, client: Client) -> None:
+        """Let a client's changed lists and rates hold from the next frame on."""
+        self._fanout.reconfigure(client.client_id, client.endpoint)
+        self._forget_express()
+
+    def vanish(self, client: Client) -> None:
+        """Close a client and forget it."""
+        self._fanout.remove(client.client_id)
+        self._forget_express()
+        self._table.forget(client.client_id)
+        self._vehicles.forget(client.client_id)
+        if self._clients.pop(client.client_id, None):
+            self._log_visit(client, f"client {client.client_id} has gone: {client.remote}")
+            if self._on_gone is not None:
+                self._on_gone(client.client_id)
+        client.close()
+
+    def _route_addressed(self, client: Client, frame: bytes, now_us: int) -> None:
+        target = target_of(frame)
+        ours = target[0] in self._vehicles.systems(now_us)
+        if ours:
+            self._on_frame(Incoming(client.client_id, frame, client.trusted))
+        ways = self._table.ways_to(target, client.client_id, now_us) if client.trusted else []
+        if ways:
+            self._tap(frame)
+            self._fanout.deliver(frame, ways)
+        elif not ours:
+            self._unroutable += 1
+
+    def _route_broadcast(self, client: Client, frame: bytes, now_us: int) -> None:
+        message_id = message_id_of(frame)
+        from_station = self._table.is_station(origin_of(frame))
+        telemetry = message_id != HEARTBEAT_ID and message_id not in TARGET_OFFSETS
+        if from_station or not telemetry:
+            self._on_frame(Incoming(client.client_id, frame, client.trusted))
+        if not client.trusted:
+            return
+        self._tap(frame)
+        if from_station:
+            self._fanout.deliver(frame, self._table.ways_to_vehicles(client.client_id))
+            return
+        self._fanout.forward(frame, client.client_id, now_us)
+        if telemetry and client.is_direct and not self._table.is_shared(origin_of(frame), now_us):
+            self._open_express(client, frame)
+
+    def _open_express(self, client: Client, frame: bytes) -> None:
+        """Let the next frames of this kind take the short way, if all of them go the same one."""
+        key = key_of(frame)
+        takers = self._fanout.takers(frame, client.client_id)
+        if takers is None or key in client.express or len(client.express) >= MAX_EXPRESS:
+            return
+        clients = [self._clients[taker] for taker in takers]
+        self._express_sources.add(client)
+        client.express[key] = Express(client, message_id_of(frame), clients, self._on_foreign)
+
+    def _tap(self, frame: bytes) -> None:
+        self._forwarded += 1
+        if self._on_foreign is not None:
+            self._on_foreign(frame)
+
+    def _forget_express(self) -> None:
+        """Judge every frame anew: somebody came, went or changed."""
+        self._settle_express()
+        for client in self._express_sources:
+            client.express.clear()
+        self._express_sources.clear()
+
+    def _settle_express(self) -> None:
+        for client in self._express_sources:
+            for express in client.express.values():
+                self._forwarded += express.settle()
+
+    def _welcome(self, frame: bytes) -> None:
+        newcomers, greeting = self._vehicles.greet(frame)
+        for client_id in newcomers:
+            if client := self._clients.get(client_id):
+                for greeting_frame, message_id in greeting:
+                    client.transmit(greeting_frame, message_id)
+
+    def _tick(self) -> None:
+        now_us = self.now_us()
+        for endpoint in list(self._endpoints.values()):
+            if not isinstance(endpoint, Client):
+                endpoint.tick(now_us)
+        for client in list(self._clients.values()):
+            client.tick(now_us)
+        self._tell_trouble(now_us)
+        interval_us = round(self.settings.ping_interval_s * US_PER_S)
+        if interval_us and now_us - self._ping_us >= interval_us:
+            self._ping_us = now_us
+            self._ask_round_trips(now_us)
+        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _tell_trouble(self, now_us: int) -> None:
+        if now_us - self._trouble_us < US_PER_S:
+            return
+        self._trouble_us = now_us
+        for line in self._visits.poll(now_us):
+            log.info("%s", line)
+        for text in self._trouble.update(self.clients(), self.listeners(), now_us):
+            log.warning("%s", text)
+            if self._on_trouble is not None:
+                self._on_trouble(text)
+
+    def _log_visit(self, client: Client, text: str) -> None:
+        is_caller = client.endpoint.kind in LISTENERS
+        for line in self._visits.say(text, self.now_us()) if is_caller else [text]:
+            log.info("%s", line)
+
+    def _ask_round_trips(self, now_us: int) -> None:
+        """Ask every client that speaks; one that does not listens to nothing but telemetry."""
+        asked = [client for client in self._clients.values() if client.heard_us is not None]
+        systems = self._vehicles.systems(now_us)
+        if not asked or not systems:
+            return
+        questions = self._probe.ask(systems[0], now_us)
+        for client in asked:
+            for frame, message_id in questions:
+                client.transmit(frame, message_id)

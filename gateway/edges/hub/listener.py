@@ -1,0 +1,110 @@
+"""What listening ports share: they are bound as soon as that is possible, and say why it is not."""
+
+import asyncio
+import logging
+import socket
+from typing import Final, Generic, TypeVar
+
+from gateway.edges.hub.client import Client, HubContext
+from gateway.edges.reasons import reason_of
+from gateway.routing.client_table import ListenerStats
+from gateway.routing.endpoint import Endpoint
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+RETRY_US: Final = US_PER_S
+"""Between attempts to open a socket again: soon for a person, never spinning."""
+
+Peer = TypeVar("Peer", bound=Client)
+
+
+class Listener(Generic[Peer]):
+    """An endpoint that makes a client of everyone who calls.
+
+    Parameters
+    ----------
+    context : HubContext
+        The hub.
+    endpoint : Endpoint
+        Where to listen.
+    """
+
+    def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self.reason = ""
+        self.turned_away = 0
+        self._context = context
+        self._loop = asyncio.get_running_loop()
+        self._clients: dict[int, Peer] = {}
+        self._socket: socket.socket | None = None
+        self._retry_us = 0
+        self._told = ""
+        self.tick(context.now_us())
+
+    @property
+    def port(self) -> int:
+        """The port that is bound, or 0."""
+        return self._socket.getsockname()[1] if self._socket else 0
+
+    def tick(self, now_us: int) -> None:
+        """Bind or take callers in again if that failed; called a few times a second."""
+        if now_us < self._retry_us or (self._socket and not self.reason):
+            return
+        self._retry_us = now_us + RETRY_US
+        if self._socket is None:
+            try:
+                self._socket = self._bind()
+            except OSError as error:
+                self._complain(error)
+                return
+            if self._told:
+                log.info("%s is open", self.endpoint.name)
+                self._told = ""
+        self.reason = ""
+        self._loop.add_reader(self._socket, self._on_readable, self._socket)
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options of the same place, for the clients that are there too."""
+        self.endpoint = endpoint
+        for client in self._clients.values():
+            client.reconfigure(endpoint)
+
+    def close(self) -> None:
+        """Part from all clients and close the port."""
+        for client in list(self._clients.values()):
+            self.leave(client)
+        if self._socket is not None:
+            self._loop.remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def leave(self, client: Peer) -> None:
+        """Part from one client."""
+        self._clients.pop(client.client_id, None)
+        self._context.vanish(client)
+
+    def stats(self) -> ListenerStats:
+        """Describe the port at this moment."""
+        return ListenerStats(
+            name=self.endpoint.name,
+            endpoint=self.endpoint.url,
+            state="closed" if self.reason else "open",
+            reason=self.reason,
+            port=self.port,
+            clients=len(self._clients),
+            turned_away=self.turned_away,
+        )
+
+    def _bind(self) -> socket.socket:
+        """Open the port or raise OSError."""
+        raise NotImplementedError
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        raise NotImplementedError
+
+    def _complain(self, error: OSError) -> None:
+        self.reason = reason_of(error)
+        if self.reason != self._told:
+            log.warning("%s: %s; trying again until it works", self.endpoint.name, self.reason)
+            self._told = self.reason

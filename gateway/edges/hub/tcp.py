@@ -1,0 +1,247 @@
+"""TCP to clients and sources, with a bounded queue in front of each connection.
+
+A stalled client fills its own queue and loses its own oldest telemetry; the kernel ends the
+connection when nothing was acknowledged for long.
+"""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from gateway.edges.hub.client import Client
+from gateway.edges.hub.listener import RETRY_US, Listener
+from gateway.routing.endpoint import host_and_port
+from gateway.routing.outbox import Numbering, Outbox
+from gateway.wire.mavlink_splitter import MavlinkSplitter
+
+CHUNK_BYTES: Final = 4096
+"""Joined into one write while a queue drains; and read at once."""
+READ_BUDGET: Final = 16
+"""Chunks taken at one wake-up, so that one flooding peer cannot starve the others."""
+USER_TIMEOUT_MS: Final = 30_000
+"""A peer that acknowledges nothing for so long is gone; a stopped one may come back sooner."""
+SEND_BUFFER_BYTES: Final = 32_768
+"""Small, so that what waits does so in the queue, where the old can make room for the new."""
+ACCEPT_BACKLOG: Final = 16
+
+
+class StreamClient(Client):
+    """A peer behind a byte stream."""
+
+    _partial = b""
+    _socket: socket.socket | None = None
+
+    def __post_init__(self) -> None:
+        """Begin without a connection."""
+        super().__post_init__()
+        self._outbox = Outbox(self.context.settings.queue_bytes)
+        self._numbering = Numbering(self.context.is_own, self.context.seal)
+        self._splitter = MavlinkSplitter()
+
+    @property
+    def queued(self) -> int:
+        """Frames that wait for the connection."""
+        return len(self._outbox)
+
+    def transmit(self, frame: bytes, message_id: int) -> None:
+        """Send one frame at once if nothing waits, else queue it."""
+        if self._socket is None:
+            self.counters.dropped += 1
+            return
+        self.counters.sent += 1
+        step = self._numbering.enter(frame)
+        if self._partial or self._outbox:
+            self._drop(self._outbox.push(frame, message_id, step))
+        else:
+            self._write(self._socket, self._numbering.leave(frame, step))
+
+    def adopt(self, sock: socket.socket) -> None:
+        """Use a connected socket from now on."""
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, USER_TIMEOUT_MS // 2000)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        self._socket = sock
+        self._splitter.reset()
+        self.become("open")
+        self.loop.add_reader(sock, self._on_readable, sock)
+        self.context.greet(self)
+
+    def close(self) -> None:
+        """Close the connection; what waits is lost."""
+        if self._socket is not None:
+            self.loop.remove_reader(self._socket)
+            self.loop.remove_writer(self._socket)
+            self._socket.close()
+            self._socket = None
+        self._partial = b""
+        self._drop(self._outbox.clear())
+
+    def broke(self) -> None:
+        """Handle the end of the connection."""
+        raise NotImplementedError
+
+    def _drop(self, frames: int) -> None:
+        self.counters.dropped += frames
+        self.counters.sent -= frames
+
+    def _write(self, sock: socket.socket, data: bytes) -> bool:
+        """Write; keep what the socket does not take and wait for room."""
+        try:
+            taken = sock.send(data)
+        except BlockingIOError:
+            taken = 0
+        except OSError:
+            self.broke()
+            return False
+        self.counters.bytes_sent += taken
+        self._partial = data[taken:]
+        if self._partial:
+            self.loop.add_writer(sock, self._on_writable, sock)
+        return not self._partial
+
+    def _on_writable(self, sock: socket.socket) -> None:
+        if self._partial and not self._write(sock, self._partial):
+            return
+        while data := self._next_chunk():
+            if not self._write(sock, data):
+                return
+        self.loop.remove_writer(sock)
+
+    def _next_chunk(self) -> bytes:
+        frames, size = [], 0
+        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+            frames.append(self._numbering.leave(*waiting))
+            size += len(frames[-1])
+        return b"".join(frames)
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        for _ in range(READ_BUDGET):
+            try:
+                data = sock.recv(CHUNK_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self.broke()
+                return
+            self.receive(self._splitter.feed(data), len(data), self.context.now_us())
+            if self._socket is not sock:
+                return
+
+
+class TcpClient(StreamClient):
+    """A connection that the gateway makes, and makes again when it breaks."""
+
+    _retry_us = 0
+    _task: asyncio.Task[None] | None = None
+
+    def __post_init__(self) -> None:
+        """Connect at once if possible."""
+        super().__post_init__()
+        self.tick(self.context.now_us())
+
+    def tick(self, now_us: int) -> None:
+        """Connect if there is no connection and the last attempt is long enough ago."""
+        if self._socket is None and self._task is None and now_us >= self._retry_us:
+            self._retry_us = now_us + RETRY_US
+            self._task = self.loop.create_task(self._connect())
+
+    def close(self) -> None:
+        """Close the connection and stop connecting."""
+        if self._task is not None:
+            self._task.cancel()
+        super().close()
+
+    def broke(self) -> None:
+        """Let the next tick connect again."""
+        super().close()
+        self.become("connecting")
+
+    async def _connect(self) -> None:
+        host, port = self.endpoint.host, self.endpoint.port
+        try:
+            found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            for family, _, _, _, address in found:
+                if await self._connect_to(family, address):
+                    break
+        except OSError as error:
+            self.become("resolving", error)
+        finally:
+            self._task = None
+
+    async def _connect_to(self, family: int, address: tuple[Any, ...]) -> bool:
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            await self.loop.sock_connect(sock, address)
+            if sock.getsockname() == sock.getpeername():
+                # A closed local port may be drawn as our own and so connect to itself.
+                raise ConnectionRefusedError
+        except OSError as error:
+            sock.close()
+            if isinstance(error, ConnectionRefusedError):
+                self.become("refused")
+            else:
+                self.become("unreachable", error)
+            return False
+        except asyncio.CancelledError:
+            sock.close()
+            raise
+        self.remote = host_and_port(*address[:2])
+        self.adopt(sock)
+        return True
+
+
+@dataclass(eq=False)
+class TcpPeer(StreamClient):
+    """A connection that a client made."""
+
+    leave: Callable[["TcpPeer"], None] = field(kw_only=True)
+
+    def broke(self) -> None:
+        """Leave for good; the client may connect again."""
+        self.leave(self)
+
+
+class TcpListener(Listener[TcpPeer]):
+    """A TCP port and its clients."""
+
+    def _bind(self) -> socket.socket:
+        host, port = self.endpoint.host, self.endpoint.port
+        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((host, port))
+            sock.listen(ACCEPT_BACKLOG)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        for _ in range(READ_BUDGET):
+            try:
+                connection, address = sock.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                # Out of descriptors: the waiting client would wake us for ever.
+                self._complain(error)
+                self._loop.remove_reader(sock)
+                return
+            if len(self._clients) >= self._context.settings.max_clients:
+                self.turned_away += 1
+                connection.close()
+                continue
+            client_id, peer = self._context.new_client_id(), host_and_port(*address[:2])
+            client = TcpPeer(self._context, client_id, self.endpoint, peer, peer, leave=self.leave)
+            self._clients[client_id] = client
+            self._context.appear(client)
+            client.adopt(connection)

@@ -1,0 +1,1 @@
+"""The receiver's serial port, real and simulated."""

@@ -1,0 +1,327 @@
+"""The compiled entry points: one sample in, a log through, the state told."""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.complementary.bias import update_bias
+from gateway.estimation.complementary.complementary_output import tell
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
+from gateway.estimation.complementary.heading import UNKNOWN_VAR, is_heading_good, take_mag
+from gateway.estimation.complementary.manoeuvre import take_fix_velocity
+from gateway.estimation.complementary.navigation import (
+    blend_fix,
+    dead_reckon,
+    is_plausible,
+    restart_at,
+    stand_still,
+    take_baro,
+)
+from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
+from gateway.estimation.flagbits import FRESH_GPS_S
+from gateway.estimation.history import recall, remember
+from gateway.estimation.kernel import Kernels
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.local_position import (
+    NEVER_S,
+    fix_position,
+    fix_velocity,
+    is_relocked,
+    move_origin,
+    past_state,
+)
+from gateway.estimation.rest import watch_rest
+from gateway.estimation.sensor_faults import (
+    ACCEL_LIMIT_MPS2,
+    GYRO_LIMIT_RADPS,
+    HOLD_S,
+    is_sound,
+    judge_sensors,
+)
+from gateway.geometry.quaternion import rotate, rotate_inverse
+from gateway.records import NAN, Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+GAP_S: Final = 0.5
+"""A longer silence is not integrated over."""
+EPOCH_S: Final = 0.1
+"""Without GPS, the bias is updated this often."""
+MOVING_MPS: Final = 3.0
+
+ZERO: Final = (0.0, 0.0, 0.0)
+
+
+@compiled
+def start(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Set a fresh state."""
+    put_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
+    put_quat(s.q_ei, (1.0, 0.0, 0.0, 0.0))
+    refresh(s)
+    for k in range(3):
+        s.bias_cov[k, k] = p.bias_initial_radps**2
+        s.rate_b[k] = NAN
+    s.heading_var = UNKNOWN_VAR
+    s.declination_rad = NAN
+    forget_times(s)
+
+
+@compiled
+def forget_times(s: ComplementaryState) -> None:
+    """Drop all that is tied to the clock."""
+    s.mag_s = s.fix_s = s.fix_valid_s = s.baro_s = NEVER_S
+    s.reject_last[0] = NEVER_S
+    s.reject_s = s.rest_s = s.epoch_s = 0.0
+    s.ring_count = s.at_rest = 0
+
+
+@compiled
+def begin(s: ComplementaryState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
+    """Start at the first sound sample, level by its specific force."""
+    s.fault = 0 if is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2) else 1
+    if s.fault == 1:
+        return
+    s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
+    put(s.gyro_lp, gyro)
+    put(s.gyro_rest, gyro)
+    put(s.accel_lp, accel)
+    put(s.force_lp_i, accel)
+    take_gravity(s, accel, 1.0, 1e-3)
+    # Two turns: the first leaves a remainder where the start is upside down.
+    take_gravity(s, accel, 1.0, 1e-3)
+    s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+    put(s.rate_b, gyro)
+    refresh(s)
+
+
+@compiled
+def take_imu(
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    time_us: int,
+    ax: float,
+    ay: float,
+    az: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    mx: float,
+    my: float,
+    mz: float,
+    clipped: float,
+) -> None:
+    """Advance by one IMU sample; see `columns` for the numbers.
+
+    A sample that is late is left out; a clock that went far back is a new clock.
+    """
+    gyro, accel = (gx, gy, gz), (ax, ay, az)
+    if s.started == 0:
+        begin(s, time_us, gyro, accel)
+        return
+    dt = (time_us - s.time_us) * 1e-6
+    if dt <= 0.0:
+        s.fault = 1
+        if dt < -GAP_S:
+            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
+            forget_times(s)
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    if dt > GAP_S:
+        bridge_gap(s, dt)
+        return
+    sound_gyro, sound_accel = judge_sensors(s, gyro, accel, dt)
+    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
+    if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
+        take_mag(s, p, (mx, my, mz))
+    refresh(s)
+
+
+@compiled
+def bridge_gap(s: ComplementaryState, dt: float) -> None:
+    """Go on after a silence: straight ahead, and level anew from here."""
+    s.fault = 1
+    for k in range(3):
+        s.pos_n[k] += s.vel_n[k] * dt
+    s.ring_count = 0
+    s.fix_valid_s = NEVER_S
+    s.force_lp_s = s.rest_s = s.epoch_s = 0.0
+    s.at_rest = 0
+    s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+    s.heading_var = max(s.heading_var, 0.03)
+
+
+@compiled
+def advance(
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    gyro: Vec3,
+    accel: Vec3,
+    sound_gyro: bool,
+    sound_accel: bool,
+    dt: float,
+) -> None:
+    """Integrate one sample and correct by gravity where GPS does not do it better."""
+    if not sound_gyro:
+        held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
+        s.missing_gyro_s += dt
+        gyro = (held[0] + s.bias_b[0], held[1] + s.bias_b[1], held[2] + s.bias_b[2])
+    else:
+        s.missing_gyro_s = 0.0
+    strapdown(s, gyro, dt)
+    refresh(s)
+    if not sound_accel:
+        accel = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    since_fix = s.time_s - s.fix_s
+    moving = since_fix < FRESH_GPS_S and speed(s) > p.rest_speed_mps
+    if sound_gyro and sound_accel:
+        watch_rest(s, p, gyro, accel, moving, dt)
+    s.heading_var = min(s.heading_var + p.heading_process_rad2ps * dt, UNKNOWN_VAR)
+    coasting = since_fix < p.coast_s and speed(s) > MOVING_MPS
+    by_gps = since_fix < FRESH_GPS_S or coasting
+    if sound_accel and not (by_gps and is_heading_good(s)):
+        take_gravity(s, rotate(as_quat(s.q_ib), accel), p.tau_accel_s, dt)
+        s.epoch_s += dt
+        if s.epoch_s >= EPOCH_S:
+            update_bias(s, p, p.tau_accel_s, s.epoch_s)
+            s.epoch_s = 0.0
+    dead_reckon(s, accel, dt)
+    if s.at_rest == 1 and since_fix > FRESH_GPS_S:
+        stand_still(s, dt)
+    s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
+
+
+@compiled
+def speed(s: ComplementaryState) -> float:
+    """Horizontal speed in m/s."""
+    return math.hypot(s.vel_n[0], s.vel_n[1])
+
+
+@compiled
+def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: FloatArray) -> None:
+    """Take in one fix at its arrival.
+
+    Parameters
+    ----------
+    s : ComplementaryState
+        Changed in place.
+    p : ComplementaryGains
+        Constants.
+    time_us : int
+        Arrival on the gateway clock.
+    row : ndarray, shape (GPS_COLUMNS,)
+        See `columns`.
+    """
+    if s.started == 0 or row[GPS_USABLE] == 0.0:
+        return
+    learn_declination(s, row[GPS_DECLINATION])
+    arrival_s = (time_us - s.base_us) * 1e-6
+    then = s.then
+    valid_s = recall(s.ring, s.ring_count, arrival_s - p.gps_latency_s, s.time_s, s.integrals, then)
+    lag = s.time_s - valid_s
+    move_origin(s, row[GPS_LAT], row[GPS_LON])
+    pos, vel = fix_position(s, row), fix_velocity(row)
+    past = past_state(s, then, lag)
+    told_velocity = is_sound(vel, 1000.0)
+    if not told_velocity:
+        vel = velocity_from_position(s, pos, past)
+    if not accept_fix(s, p, row, pos, vel, past, lag):
+        return
+    s.fix_s = s.time_s
+    if told_velocity:
+        interval = take_fix_velocity(s, p, valid_s, vel, as_vec(then))
+        if interval > 0.0:
+            update_bias(s, p, p.tau_accel_gps_s, interval)
+    refresh(s)
+
+
+@compiled
+def velocity_from_position(s: ComplementaryState, pos: Vec3, past: tuple[Vec3, Vec3]) -> Vec3:
+    """Stand in for a velocity that the receiver does not tell."""
+    share = 0.0 if s.fix_s == NEVER_S else 0.5 / max(s.time_s - s.fix_s, 0.5)
+    (p0, p1, p2), (v0, v1, v2) = past
+    return (
+        v0 + share * (pos[0] - p0),
+        v1 + share * (pos[1] - p1),
+        v2 + share * (pos[2] - p2),
+    )
+
+
+@compiled
+def accept_fix(
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    row: FloatArray,
+    pos: Vec3,
+    vel: Vec3,
+    past: tuple[Vec3, Vec3],
+    lag: float,
+) -> bool:
+    """Blend a plausible fix, start anew at the first and after a lasting disagreement."""
+    if s.fix_s == NEVER_S:
+        restart_at(s, pos, vel, lag)
+        return True
+    off_m = math.hypot(pos[0] - past[0][0], pos[1] - past[0][1])
+    off_mps = math.hypot(vel[0] - past[1][0], vel[1] - past[1][1])
+    if is_plausible(s, p, row, off_m, off_mps):
+        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
+        blend_fix(s, p, pos, vel, past, lag)
+        return True
+    if is_relocked(s, p.gps_relock_s, pos, vel):
+        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
+        s.fix_valid_s = NEVER_S
+        restart_at(s, pos, vel, lag)
+        return True
+    return False
+
+
+@compiled
+def learn_declination(s: ComplementaryState, declination_rad: float) -> None:
+    """Turn a magnetic heading to true north when the declination becomes known."""
+    if not math.isfinite(declination_rad):
+        return
+    if s.heading_known == 1 and s.heading_true == 0:
+        s.heading_rad += declination_rad
+        s.heading_true = 1
+    s.declination_rad = declination_rad
+
+
+@compiled
+def run(
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    imu_time_us: IntArray,
+    imu: FloatArray,
+    baro_time_us: IntArray,
+    baro_alt_m: FloatArray,
+    gps_time_us: IntArray,
+    gps: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Advance over a log: at each IMU sample, what came before it first."""
+    i_baro, i_gps = 0, 0
+    for i in range(imu_time_us.shape[0]):
+        now = imu_time_us[i]
+        while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
+            take_baro(s, p, baro_alt_m[i_baro])
+            i_baro += 1
+        while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
+            take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
+            i_gps += 1
+        r = imu[i]
+        take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
+        tell(s, out[i])
+
+
+KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = Kernels(
+    declaration=ComplementaryState,
+    start=start,
+    imu=take_imu,
+    baro=take_baro,
+    gps=take_gps,
+    tell=tell,
+    run=run,
+)

@@ -1,0 +1,84 @@
+"""What the complementary estimator tells: its output row and flags."""
+
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_QUAT,
+    NAV_RATE,
+    NAV_VEL,
+)
+from gateway.estimation.complementary.complementary_state import ComplementaryState
+from gateway.estimation.complementary.heading import is_heading_good
+from gateway.estimation.flagbits import (
+    ALTITUDE_VALID,
+    AT_REST,
+    ATTITUDE_VALID,
+    DEGRADED,
+    HEADING_VALID,
+    MAG_DISTURBED,
+    SENSOR_FAULT,
+    USING_BARO,
+    USING_MAG,
+    gps_flags,
+)
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
+from gateway.estimation.magfield import STALE_MAG_S
+from gateway.geometry.geodesy import offset_deg
+from gateway.records import NAN
+
+DEAD_RECKONING_MAX_S: Final = 60.0
+"""Dead reckoning longer than this is no position any more."""
+
+
+@compiled
+def tell(s: ComplementaryState, row: FloatArray) -> None:
+    """Write the output row.
+
+    Parameters
+    ----------
+    s : ComplementaryState
+        Unchanged.
+    row : ndarray, shape (NAV_COLUMNS,)
+        Filled; standard deviations are not known to this estimator.
+    """
+    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
+    row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
+    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
+    row[NAV_FLAGS] = float(flags_of(s))
+    if s.has_origin == 0:
+        row[NAV_LAT] = row[NAV_LON] = NAN
+        row[NAV_VEL : NAV_VEL + 3] = NAN
+        return
+    lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
+    row[NAV_LAT], row[NAV_LON] = lat, lon
+    put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+
+
+@compiled
+def flags_of(s: ComplementaryState) -> int:
+    """Put the flags together."""
+    flags = ATTITUDE_VALID if s.started == 1 else 0
+    if s.heading_known == 1 and s.heading_true == 1 and is_heading_good(s):
+        flags |= HEADING_VALID
+    if s.at_rest == 1:
+        flags |= AT_REST
+    if s.time_s - s.mag_s < STALE_MAG_S:
+        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+    if s.time_s - s.baro_s < BARO_STALE_S:
+        flags |= USING_BARO
+    if s.has_height == 1:
+        flags |= ALTITUDE_VALID
+    if s.fault == 1:
+        flags |= SENSOR_FAULT | DEGRADED
+    if s.fix_s == NEVER_S:
+        return flags
+    since_reject = s.time_s - s.reject_last[0]
+    return flags | gps_flags(s.time_s - s.fix_s, since_reject, DEAD_RECKONING_MAX_S)

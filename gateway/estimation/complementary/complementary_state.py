@@ -1,0 +1,245 @@
+"""Settings, gains and state of the complementary estimator."""
+
+from typing import Annotated
+
+from gateway.estimation.alignment import MatchState
+from gateway.estimation.kernel_record import FloatArray, filled_record
+from gateway.estimation.local_position import PlaceState
+from gateway.estimation.magfield import CompassSettings, FieldGains, FieldState, field_gains
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
+from gateway.estimation.sensor_faults import HealthState
+from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
+
+
+class ComplementarySettings(Settings, frozen=True):
+    """Time constants and thresholds of the complementary estimator."""
+
+    tau_accel_s: Annotated[
+        float,
+        setting(
+            "Time constant of the accelerometer's low-pass in the inertial frame. Small follows "
+            "accelerations, large trusts the gyroscope; cutoff = sqrt(2) / (2 pi tau).",
+            "s",
+            ge=0.1,
+            le=60.0,
+        ),
+    ] = 3.0
+    tau_accel_gps_s: Annotated[
+        float,
+        setting(
+            "The same while the GPS velocity takes the acceleration out. Small passes the noise "
+            "of the GPS velocity, large the drift of the gyroscope.",
+            "s",
+            ge=0.1,
+            le=60.0,
+        ),
+    ] = 5.0
+    coast_s: Annotated[
+        float,
+        setting(
+            "After the loss of GPS in motion, how long the attitude runs on the gyroscope alone "
+            "before the accelerometer is believed again.",
+            "s",
+            ge=0.0,
+            le=120.0,
+        ),
+    ] = 30.0
+    tau_heading_s: Annotated[
+        float,
+        setting(
+            "Time constant of the compass correction. Small follows magnetic noise, large the "
+            "gyroscope's drift.",
+            "s",
+            ge=0.5,
+            le=120.0,
+        ),
+    ] = 20.0
+    heading_noise_deg: Annotated[
+        float,
+        setting("Slow error of the compass, weighed against the GPS.", "deg", ge=0.1, le=45.0),
+    ] = 3.0
+    gps_velocity_noise_mps: Annotated[
+        float, setting("Noise of the GPS velocity.", "m/s", ge=0.01, le=5.0)
+    ] = 0.3
+    bias_initial_degps: Annotated[
+        float, setting("Gyroscope bias to be expected at the start.", "deg/s", ge=0.01, le=20.0)
+    ] = 0.5
+    bias_motion_degps: Annotated[
+        float,
+        setting(
+            "Accuracy to which the gyroscope bias is learned in motion. Small learns slowly, "
+            "large follows manoeuvres.",
+            "deg/s",
+            ge=0.01,
+            le=5.0,
+        ),
+    ] = 0.1
+    bias_rest_degps: Annotated[
+        float,
+        setting(
+            "The same at rest, against its drift of 0.1 deg/s in 100 s.", "deg/s", ge=0.001, le=5.0
+        ),
+    ] = 0.03
+    tau_velocity_s: Annotated[
+        float,
+        setting(
+            "Time constant of the velocity against GPS. Small is noisy, large drifts.",
+            "s",
+            ge=0.01,
+            le=20.0,
+        ),
+    ] = 0.4
+    tau_position_s: Annotated[
+        float,
+        setting(
+            "Time constant of the position against GPS. Small is noisy, large drifts.",
+            "s",
+            ge=0.01,
+            le=20.0,
+        ),
+    ] = 0.4
+    tau_baro_s: Annotated[
+        float,
+        setting("Time constant of height and climb against the barometer.", "s", ge=0.1, le=30.0),
+    ] = 2.0
+    tau_baro_offset_s: Annotated[
+        float,
+        setting(
+            "Time constant of the barometer's offset against GPS height.", "s", ge=1.0, le=600.0
+        ),
+    ] = 60.0
+    gps_gate_m: Annotated[
+        float,
+        setting(
+            "Fixes further off than this, the receiver's own accuracy and what dead reckoning "
+            "may have drifted are rejected.",
+            "m",
+            ge=1.0,
+            le=1000.0,
+        ),
+    ] = 15.0
+    gps_gate_mps: Annotated[
+        float, setting("The same for the velocity.", "m/s", ge=0.5, le=100.0)
+    ] = 6.0
+    gps_relock_s: Annotated[
+        float,
+        setting(
+            "After this time of agreeing fixes that were all rejected, they are believed.",
+            "s",
+            ge=0.5,
+            le=120.0,
+        ),
+    ] = 8.0
+
+
+class ComplementaryGains(RestGains, FieldGains):
+    """The settings in SI units, and the latency."""
+
+    tau_accel_s: float
+    tau_accel_gps_s: float
+    coast_s: float
+    heading_process_rad2ps: float
+    heading_noise_rad2s: float
+    gps_velocity_noise_mps: float
+    bias_initial_radps: float
+    bias_motion_radps: float
+    bias_rest_radps: float
+    tau_velocity_s: float
+    tau_position_s: float
+    tau_baro_s: float
+    tau_baro_offset_s: float
+    gps_gate_m: float
+    gps_gate_mps: float
+    gps_relock_s: float
+    gps_latency_s: float
+
+
+class ComplementaryState(HealthState, RestState, FieldState, PlaceState, MatchState):
+    """All that the complementary estimator remembers."""
+
+    started: int
+    base_us: int
+    time_us: int
+    bias_b: Annotated[FloatArray, (3,)]
+    bias_cov: Annotated[FloatArray, (3, 3)]
+    q_ib: Annotated[FloatArray, (4,)]
+    """Body to the inertial frame of the gyroscope alone."""
+    q_ei: Annotated[FloatArray, (4,)]
+    """That frame to a level frame of free heading."""
+    q_eb: Annotated[FloatArray, (4,)]
+    q_nb: Annotated[FloatArray, (4,)]
+    force_lp_i: Annotated[FloatArray, (3,)]
+    force_lp_rate_i: Annotated[FloatArray, (3,)]
+    force_in_i: Annotated[FloatArray, (3,)]
+    force_lp_s: float
+    """Time behind the low-pass; its start is a plain mean."""
+    turn_lp: Annotated[FloatArray, (8,)]
+    """Low-pass of the two level rows of `R_eb` and of their products with the bias."""
+    turn_lp_rate: Annotated[FloatArray, (8,)]
+    turn_in: Annotated[FloatArray, (8,)]
+    tilt_sum: Annotated[FloatArray, (2,)]
+    """Level corrections since the bias was last updated."""
+    epoch_s: float
+
+    heading_rad: float
+    """Turn about down from the level frame to NED."""
+    heading_var: float
+    heading_known: int
+    """0 unknown, 1 magnetic or true north."""
+    heading_true: int
+    """1 if the declination was known or the GPS gave the heading."""
+    declination_rad: float
+    mag_s: float
+    accel_bias_b: Annotated[FloatArray, (3,)]
+    """Error of the specific force as the fixes' velocities tell it, m/s2."""
+    accel_bias_d: float
+    """Error of the vertical acceleration, positive down."""
+    baro_offset_m: float
+    baro_known: int
+    baro_s: float
+    has_height: int
+    fix_s: float
+    """Arrival of the last accepted fix."""
+    fix_valid_s: float
+    """When the last accepted fix was valid."""
+    fix_vel: Annotated[FloatArray, (3,)]
+    fix_force_i: Annotated[FloatArray, (3,)]
+
+
+def make_gains(
+    settings: ComplementarySettings,
+    reference: ReferenceSettings,
+    rest: RestSettings,
+    compass: CompassSettings,
+) -> ComplementaryGains:
+    """Turn the settings into a record of SI constants.
+
+    Parameters
+    ----------
+    settings : ComplementarySettings
+        Time constants and thresholds.
+    reference : ReferenceSettings
+        GPS latency.
+    rest : RestSettings
+        What is taken for rest.
+    compass : CompassSettings
+        When the compass is taken for disturbed.
+
+    Returns
+    -------
+    ComplementaryGains
+        For the kernels.
+    """
+    values = {name: getattr(settings, name) for name in settings.__struct_fields__}
+    values |= {
+        name.removesuffix("_degps") + "_radps": value * RAD_PER_DEG
+        for name, value in values.items()
+        if name.endswith("_degps")
+    }
+    noise_rad = settings.heading_noise_deg * RAD_PER_DEG
+    values["heading_process_rad2ps"] = noise_rad**2 / settings.tau_heading_s
+    values["heading_noise_rad2s"] = noise_rad**2 * settings.tau_heading_s
+    values["gps_latency_s"] = reference.gps_latency_s
+    return filled_record(ComplementaryGains, values | rest_gains(rest) | field_gains(compass))

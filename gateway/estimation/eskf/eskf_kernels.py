@@ -1,0 +1,314 @@
+"""The compiled entry points: one sample in, a log through."""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.covariance import propagate
+from gateway.estimation.eskf.eskf_output import tell
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import EskfState
+from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.measure import (
+    UNAIDED_CORRELATION_S,
+    absorb_baro,
+    absorb_compass,
+    absorb_rest,
+    absorb_velocity,
+)
+from gateway.estimation.eskf.start import (
+    begin,
+    bridge_gap,
+    end_dead_reckoning,
+    forget_times,
+    restart_baro,
+    start,
+    start_heading_by_compass,
+)
+from gateway.estimation.flagbits import FRESH_GPS_S
+from gateway.estimation.history import remember
+from gateway.estimation.kernel import Kernels
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.local_position import (
+    BARO_STALE_S,
+)
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field, likeness
+from gateway.estimation.rest import watch_rest
+from gateway.estimation.sensor_faults import HOLD_S, judge_sensors
+from gateway.geometry.quaternion import (
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    rotate_inverse,
+)
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+GAP_S: Final = 0.5
+"""A longer silence is not integrated over."""
+COVARIANCE_S: Final = 0.02
+"""The covariance is propagated this often, and before each measurement."""
+PSEUDO_S: Final = 0.1
+"""Between measurements that stand in for a sensor."""
+COMPASS_S: Final = 0.045
+"""Between compass measurements; its slow error makes more of them useless."""
+ROUGH_LIMIT: Final = 1e4
+"""A larger change is a fault, and NaN compares false."""
+ZERO: Final = (0.0, 0.0, 0.0)
+
+
+@compiled
+def take_imu(
+    s: EskfState,
+    p: EskfGains,
+    time_us: int,
+    ax: float,
+    ay: float,
+    az: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    mx: float,
+    my: float,
+    mz: float,
+    clipped: float,
+) -> None:
+    """Advance by one IMU sample; see `columns` for the numbers.
+
+    A sample that is late is left out; a clock that went far back is a new clock.
+    """
+    gyro, accel = (gx, gy, gz), (ax, ay, az)
+    if s.started == 0:
+        s.hold_s = p.dead_reckoning_s
+        begin(s, p, time_us, gyro, accel)
+        return
+    dt = (time_us - s.time_us) * 1e-6
+    if dt <= 0.0:
+        s.fault = 1
+        if dt < -GAP_S:
+            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
+            forget_times(s)
+            bridge_gap(s, p, 1.0)
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    if dt > GAP_S:
+        bridge_gap(s, p, dt)
+        return
+    collect_roughness(s, gyro, accel, dt)
+    sound_gyro, sound_accel = judge_sensors(s, gyro, accel, dt)
+    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    if not sound_gyro:
+        gyro = stand_in_rate(s, dt)
+    else:
+        s.missing_gyro_s = 0.0
+    if not sound_accel:
+        accel = stand_in_force(s)
+    integrate(s, gyro, accel, dt)
+    if sound_gyro and sound_accel:
+        watch_rest(s, p, gyro, accel, is_moving(s, p), dt)
+    if s.pending_s >= COVARIANCE_S:
+        propagate(s, p)
+    take_substitutes(s, p)
+    if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
+        take_mag(s, p, (mx, my, mz))
+
+
+@compiled
+def collect_roughness(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Measure the noise by the changes from sample to sample, before the last sample goes."""
+    turn, pull = 0.0, 0.0
+    for k in range(3):
+        turn += (gyro[k] - s.gyro_last[k]) ** 2
+        pull += (accel[k] - s.accel_last[k]) ** 2
+    # Two samples' noise, three axes.
+    share = dt * dt / 6.0
+    if turn < ROUGH_LIMIT and pull < ROUGH_LIMIT:
+        s.rough_gyro += share * turn
+        s.rough_accel += share * pull
+
+
+@compiled
+def stand_in_rate(s: EskfState, dt: float) -> Vec3:
+    """Hold the last rate for a moment, then none, where the gyroscope fails."""
+    held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
+    s.missing_gyro_s += dt
+    b = s.gyro_bias_b
+    return (held[0] + b[0], held[1] + b[1], held[2] + b[2])
+
+
+@compiled
+def stand_in_force(s: EskfState) -> Vec3:
+    """Assume no acceleration where the accelerometer fails."""
+    f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    b = s.accel_bias_b
+    return (f[0] + b[0], f[1] + b[1], f[2] + b[2])
+
+
+@compiled
+def is_moving(s: EskfState, p: EskfGains) -> bool:
+    """Tell whether the GPS says that the aircraft moves."""
+    fresh = s.aided == 1 and s.time_s - s.fix_s < FRESH_GPS_S
+    return bool(fresh and math.hypot(s.vel_n[0], s.vel_n[1]) > p.rest_speed_mps)
+
+
+@compiled
+def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Advance the nominal state and collect what the covariance will need.
+
+    Parameters
+    ----------
+    s : EskfState
+        Changed in place.
+    gyro, accel : tuple of 3 floats
+        Newest sample in body FRD, biases still in.
+    dt : float
+        Time step, s.
+    """
+    b, c = s.gyro_bias_b, s.accel_bias_b
+    e = s.gyro_scale_b
+    rate = (
+        gyro[0] - b[0] - e[0] * gyro[0],
+        gyro[1] - b[1] - e[1] * gyro[1],
+        gyro[2] - b[2] - e[2] * gyro[2],
+    )
+    put(s.rate_b, rate)
+    # The force of the interval acts, on average, at the attitude half way through it.
+    half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
+    q = multiply(as_quat(s.q_nb), half)
+    put_quat(s.q_nb, normalise(multiply(q, half)))
+    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
+    s.pending_s += dt
+    for k in range(3):
+        force = x[k] * f0 + y[k] * f1 + z[k] * f2
+        s.pending_force_n[k] += force * dt
+        s.pending_turn[k, 0] += x[k] * dt
+        s.pending_turn[k, 1] += y[k] * dt
+        s.pending_turn[k, 2] += z[k] * dt
+        if s.aided == 1:
+            s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
+            s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
+            s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
+        a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
+        s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
+        s.integrals[3 + k] += a * dt
+        s.pending_accel_sq += a * a * dt
+        if s.aided == 1:
+            s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
+        s.vel_n[k] += a * dt
+    s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
+
+
+@compiled
+def take_substitutes(s: EskfState, p: EskfGains) -> None:
+    """Use rest, or the little motion to be expected, where GPS does not tell the velocity."""
+    if s.time_s - s.pseudo_s < PSEUDO_S:
+        return
+    dt = min(s.time_s - s.pseudo_s, 1.0)
+    s.pseudo_s = s.time_s
+    if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
+        end_dead_reckoning(s, p)
+    if s.at_rest == 1:
+        absorb_rest(s, p)
+    elif s.aided == 0:
+        absorb_velocity(s, p, p.unaided_var * UNAIDED_CORRELATION_S / dt)
+
+
+@compiled
+def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
+    """Use one magnetometer sample.
+
+    Parameters
+    ----------
+    s : EskfState
+        Changed in place.
+    p : EskfGains
+        Constants.
+    mag_b : tuple of 3 floats
+        Calibrated field in body FRD, uT.
+    """
+    dt = s.time_s - s.mag_s
+    b = s.mag_bias_b
+    mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
+    field = rotate(as_quat(s.q_nb), mag_b)
+    level = math.hypot(field[0], field[1])
+    norm = math.hypot(level, field[2])
+    if norm < MIN_FIELD_UT or level < 0.05 * norm or dt <= 0.0:
+        return
+    s.mag_s = s.time_s
+    dip = math.asin(field[2] / norm)
+    weight = judge_field(s, p, norm, dip, min(dt, STALE_MAG_S)) * likeness(s, norm, dip)
+    known = math.isfinite(s.declination_rad)
+    declination = s.declination_rad if known else 0.0
+    if s.heading_known == 0:
+        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]))
+        s.heading_true = 1 if known else 0
+    elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
+        since = min(s.time_s - s.mag_used_s, STALE_MAG_S)
+        s.mag_used_s = s.time_s
+        put(s.field_n, field)
+        absorb_compass(s, p, field, declination, weight, since)
+
+
+@compiled
+def take_baro(s: EskfState, p: EskfGains, alt_m: float) -> None:
+    """Use one barometer height.
+
+    Parameters
+    ----------
+    s : EskfState
+        Changed in place.
+    p : EskfGains
+        Constants.
+    alt_m : float
+        Pressure altitude, positive up.
+    """
+    if s.started == 0 or not math.isfinite(alt_m):
+        return
+    s.baro_down_m = -alt_m
+    if s.has_height == 0:
+        s.pos_n[2] = -alt_m
+    elif s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:
+        restart_baro(s, p)
+    else:
+        absorb_baro(s, p, -alt_m)
+    s.baro_known, s.baro_s = 1, s.time_s
+
+
+@compiled
+def run(
+    s: EskfState,
+    p: EskfGains,
+    imu_time_us: IntArray,
+    imu: FloatArray,
+    baro_time_us: IntArray,
+    baro_alt_m: FloatArray,
+    gps_time_us: IntArray,
+    gps: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Advance over a log: at each IMU sample, what came before it first."""
+    i_baro, i_gps = 0, 0
+    for i in range(imu_time_us.shape[0]):
+        now = imu_time_us[i]
+        while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
+            take_baro(s, p, baro_alt_m[i_baro])
+            i_baro += 1
+        while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
+            take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
+            i_gps += 1
+        r = imu[i]
+        take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
+        tell(s, out[i])
+
+
+KERNELS: Final[Kernels[EskfState, EskfGains]] = Kernels(
+    declaration=EskfState,
+    start=start,
+    imu=take_imu,
+    baro=take_baro,
+    gps=take_gps,
+    tell=tell,
+    run=run,
+)

@@ -1,0 +1,112 @@
+"""What the filter tells: its output row, standard deviations and flags."""
+
+import math
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_POS_STD,
+    NAV_QUAT,
+    NAV_RATE,
+    NAV_VEL,
+    NAV_VEL_STD,
+)
+from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
+from gateway.estimation.flagbits import (
+    ALTITUDE_VALID,
+    AT_REST,
+    ATTITUDE_VALID,
+    DEGRADED,
+    FRESH_GPS_S,
+    HEADING_VALID,
+    MAG_DISTURBED,
+    SENSOR_FAULT,
+    USING_BARO,
+    USING_MAG,
+    gps_flags,
+)
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
+from gateway.estimation.magfield import STALE_MAG_S
+from gateway.geometry.geodesy import offset_deg
+from gateway.records import NAN
+
+LEVEL_VAR = 0.1**2
+HEADING_VAR = 0.26**2
+NO_HOLD_S = 1.0
+
+
+@compiled
+def put_std(row: FloatArray, column: int, s: EskfState, first: int) -> None:
+    """Write three standard deviations."""
+    for k in range(3):
+        row[column + k] = math.sqrt(max(s.P[first + k, first + k], 0.0))
+
+
+@compiled
+def tell(s: EskfState, row: FloatArray) -> None:
+    """Write the output row.
+
+    Parameters
+    ----------
+    s : EskfState
+        Unchanged.
+    row : ndarray, shape (NAV_COLUMNS,)
+        Filled.
+    """
+    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
+    row[NAV_VEL : NAV_VEL + 3] = NAN
+    row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
+    row[NAV_FLAGS] = float(flags_of(s))
+    row[NAV_LAT] = row[NAV_LON] = NAN
+    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_known == 1 else NAN
+    if s.started == 0:
+        return
+    put_std(row, NAV_ATTITUDE_STD, s, TILT)
+    if s.has_origin == 0:
+        return
+    lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
+    row[NAV_LAT], row[NAV_LON] = lat, lon
+    if s.aided == 1:
+        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+        put_std(row, NAV_VEL_STD, s, VEL)
+        put_std(row, NAV_POS_STD, s, POS)
+        for k in range(2):
+            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
+    elif s.time_s - s.fix_s < FRESH_GPS_S:
+        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
+
+
+@compiled
+def flags_of(s: EskfState) -> int:
+    """Put the flags together."""
+    flags = sensor_flags(s)
+    if s.started == 1 and max(s.P[TILT, TILT], s.P[TILT + 1, TILT + 1]) < LEVEL_VAR:
+        flags |= ATTITUDE_VALID
+    if s.heading_true == 1 and s.P[TILT + 2, TILT + 2] < HEADING_VAR:
+        flags |= HEADING_VALID
+    if s.has_height == 1 or s.baro_known == 1:
+        flags |= ALTITUDE_VALID
+    if s.fix_s == NEVER_S:
+        return flags
+    # Unaided, the place is that of the last fix and does not move on.
+    hold_s = s.hold_s if s.aided == 1 else NO_HOLD_S
+    return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.reject_last[0], hold_s)
+
+
+@compiled
+def sensor_flags(s: EskfState) -> int:
+    """Tell which sensors are used, and whether one is at fault."""
+    flags = AT_REST if s.at_rest == 1 else 0
+    if s.time_s - s.mag_s < STALE_MAG_S:
+        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+    if s.time_s - s.baro_s < BARO_STALE_S:
+        flags |= USING_BARO
+    if s.fault == 1:
+        flags |= SENSOR_FAULT | DEGRADED
+    return flags

@@ -1,0 +1,96 @@
+"""EskfState of the error-state Kalman filter: nominal values and the covariance of their errors."""
+
+from typing import Annotated, Final
+
+from gateway.estimation.alignment import MatchState
+from gateway.estimation.kernel_record import FloatArray
+from gateway.estimation.local_position import PlaceState
+from gateway.estimation.magfield import FieldState
+from gateway.estimation.rest import RestState
+from gateway.estimation.sensor_faults import HealthState
+
+TILT: Final = 0
+"""Attitude error: the rotation in NED that takes the estimate to the truth, rad."""
+VEL: Final = 3
+POS: Final = 6
+GYRO_BIAS: Final = 9
+ACCEL_BIAS: Final = 12
+WANDER: Final = 15
+"""Slow error of the GPS position in NED, m."""
+MAG_BIAS: Final = 18
+"""Iron that the calibration left, in body FRD, uT."""
+GYRO_SCALE: Final = 21
+"""Share by which each axis of the gyroscope tells too much."""
+BARO_BIAS: Final = 24
+"""What is added to the barometer's depth, m."""
+STATES: Final = 25
+
+
+class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
+    """All that the filter remembers."""
+
+    started: int
+    base_us: int
+    time_us: int
+    q_nb: Annotated[FloatArray, (4,)]
+    gyro_bias_b: Annotated[FloatArray, (3,)]
+    accel_bias_b: Annotated[FloatArray, (3,)]
+    gyro_scale_b: Annotated[FloatArray, (3,)]
+    wander_n: Annotated[FloatArray, (3,)]
+    mag_bias_b: Annotated[FloatArray, (3,)]
+    baro_bias_m: float
+    P: Annotated[FloatArray, (STATES, STATES)]
+
+    h: Annotated[FloatArray, (STATES,)]
+    """Scratch: one row of the measurement matrix."""
+    Ph: Annotated[FloatArray, (STATES,)]
+    held: Annotated[FloatArray, (STATES,)]
+    """Scratch: 1 for the states that a measurement must not change."""
+    dx: Annotated[FloatArray, (STATES,)]
+    """Scratch: error found so far in one group of measurements."""
+
+    pending_s: float
+    """Time over which the covariance has still to be propagated."""
+    pending_force_n: Annotated[FloatArray, (3,)]
+    rough_gyro: float
+    """Variance of the angle over that time if the changes of the rate were white noise."""
+    rough_accel: float
+    """The same of the velocity."""
+    pending_accel_sq: float
+    """Integral of the squared acceleration over that time."""
+    pending_turn: Annotated[FloatArray, (3, 3)]
+    """Integral of `R_nb` over that time."""
+    pending_scaled: Annotated[FloatArray, (3, 3)]
+    """Integral of `R_nb diag(gyro)` over that time, while GPS is there to tell the scale."""
+
+    aided: int
+    """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""
+    heading_known: int
+    heading_true: int
+    declination_rad: float
+    mag_s: float
+    mag_used_s: float
+    field_n: Annotated[FloatArray, (3,)]
+    """The field that the compass was last used with, NED, uT; all zero before."""
+    iron_doubted: int
+    """1 once the iron that the calibration left is looked for."""
+    pseudo_s: float
+    """Last time of a measurement that stands in for a sensor: no motion, or little."""
+    hold_s: float
+    """How long position is dead-reckoned."""
+    baro_s: float
+    baro_known: int
+    baro_down_m: float
+    """Newest barometer height, positive down."""
+    has_height: int
+    """1 once a fix has told the height above the sea."""
+    fix_s: float
+    fix_valid_s: float
+    fix_vel: Annotated[FloatArray, (3,)]
+    fix_force: Annotated[FloatArray, (3,)]
+    wander_var: Annotated[FloatArray, (3,)]
+    """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
+    off_last_m: float
+    """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
+    contradiction_m: float
+    """By how much the last two fixes did; the true place may be either."""

@@ -1,0 +1,1 @@
+"""Flights as tables: our CSV, and what is read into the same rows."""

@@ -1,0 +1,188 @@
+"""Other people's CSV files as rows, by a map of their columns."""
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Final
+
+from gateway.flightlog.table.row import COLUMNS, TableRow
+from gateway.records import (
+    NAN,
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NodeId,
+    Vec3,
+)
+from gateway.settings import Settings, setting
+
+EXTRA_FIELDS: Final = ("baro_alt_m",)
+"""May be mapped though the table has no such column: heights become pressures."""
+NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
+"""Without these there is nothing to fuse."""
+SEA_LEVEL_PA: Final = 101_325.0
+_EXPONENT: Final = 1.0 / 0.190263
+_SCALE_M: Final = 44_330.769
+
+
+class Column(Settings, frozen=True):
+    """One column of a foreign file: value = column * scale + offset."""
+
+    column: Annotated[str, setting("Name of the column.")]
+    scale: Annotated[float, setting("Factor to our unit.")] = 1.0
+    offset: Annotated[float, setting("Added after that.")] = 0.0
+
+
+class ColumnMap(Settings, frozen=True):
+    """Which columns of a foreign file stand for which of ours."""
+
+    columns: Annotated[
+        dict[str, Column | str],
+        setting("The file's column, with scale and offset where they are needed, by our name."),
+    ]
+
+    def __post_init__(self) -> None:
+        """Refuse a map to a column that there is not."""
+        unknown = sorted(set(self.columns) - set(COLUMNS) - set(EXTRA_FIELDS))
+        if unknown:
+            raise ValueError(f"no such column here: {', '.join(unknown)}")
+        if "time_us" not in self.columns:
+            raise ValueError("time_us must be mapped")
+
+
+class ForeignReader:
+    """Turn the lines of a foreign file into rows.
+
+    Parameters
+    ----------
+    column_map : ColumnMap
+        What its columns mean.
+    vehicle_id : int
+        The aircraft it is taken for.
+    lenient : bool
+        Whether the file may lack mapped columns, but those needed to fuse it.
+    """
+
+    def __init__(
+        self, column_map: ColumnMap, vehicle_id: int = 1, *, lenient: bool = False
+    ) -> None:
+        self._columns = {
+            name: Column(column=column) if isinstance(column, str) else column
+            for name, column in column_map.columns.items()
+        }
+        self._vehicle_id = vehicle_id
+        self._lenient = lenient
+        self.faults = 0
+        """Lines that could not be read."""
+
+    def rows(self, lines: Iterable[str]) -> Iterator[TableRow]:
+        """Read a whole file.
+
+        Parameters
+        ----------
+        lines : iterable of str
+            Its lines; those that begin with `#` are left out.
+
+        Yields
+        ------
+        TableRow
+
+        Raises
+        ------
+        ValueError
+            If the file lacks a column that it must have.
+        """
+        table = csv.DictReader(line for line in lines if not line.startswith("#"))
+        self._check(set(table.fieldnames or ()))
+        for cells in table:
+            try:
+                yield self._row(cells)
+            except (ValueError, TypeError):
+                self.faults += 1
+
+    def _check(self, names: set[str]) -> None:
+        """Compare the map with the file's columns; raises ValueError if one is missed."""
+        found = {ours: theirs for ours, theirs in self._columns.items() if theirs.column in names}
+        absent = self._columns.keys() - found.keys()
+        if absent & set(NEEDED) or (absent and not self._lenient):
+            missing = sorted(self._columns[ours].column for ours in absent)
+            raise ValueError(f"the file has no column {', '.join(missing)}")
+        self._columns = found
+
+    def _row(self, cells: Mapping[str, str]) -> TableRow:
+        value = {
+            name: float(cells[c.column]) * c.scale + c.offset
+            for name, c in self._columns.items()
+            if (cells[c.column] or "").strip()
+        }
+        time_us = round(value["time_us"]) if "time_us" in value else None
+        if time_us is None:
+            raise ValueError("no time")
+        return TableRow(
+            time_us=time_us,
+            baro=self._baro(value, time_us),
+            gps=self._gps(value, time_us),
+            imu=self._imu(value, time_us),
+        )
+
+    def _imu(self, value: Mapping[str, float], time_us: int) -> ImuCalibrated | None:
+        if "accel_x_b_mps2" not in value or "gyro_x_b_radps" not in value:
+            return None
+        has_mag = "mag_x_b_ut" in value
+        return ImuCalibrated(
+            time_us=time_us,
+            node=NodeId(self._vehicle_id, 0),
+            accel_b_mps2=_vector(value, "accel_{}_b_mps2", "xyz"),
+            gyro_b_radps=_vector(value, "gyro_{}_b_radps", "xyz"),
+            mag_b_ut=_vector(value, "mag_{}_b_ut", "xyz") if has_mag else None,
+            temperature_degc=value.get("temperature_degc", NAN),
+            flags=ImuFlags(int(value.get("imu_flags", ImuFlags.MAG_NEW if has_mag else 0))),
+        )
+
+    def _baro(self, value: Mapping[str, float], time_us: int) -> BaroRaw | None:
+        if "baro_pressure_pa" in value:
+            pressure_pa = value["baro_pressure_pa"]
+        elif "baro_alt_m" in value:
+            # The standard atmosphere backwards, so that the height comes out again.
+            pressure_pa = SEA_LEVEL_PA * (1.0 - value["baro_alt_m"] / _SCALE_M) ** _EXPONENT
+        else:
+            return None
+        return BaroRaw(
+            time_us=round(value.get("baro_time_us", time_us)),
+            node=NodeId(self._vehicle_id, 0),
+            node_time_us=time_us,
+            pressure_pa=pressure_pa,
+            temperature_degc=value.get("baro_temperature_degc", NAN),
+        )
+
+    def _gps(self, value: Mapping[str, float], time_us: int) -> GpsFix | None:
+        if "gps_lat_dege7" not in value or "gps_lon_dege7" not in value:
+            return None
+        utc_us = value.get("gps_utc_us", NAN)
+        return GpsFix(
+            time_us=round(value.get("gps_time_us", time_us)),
+            node=NodeId(self._vehicle_id, 1),
+            node_time_us=time_us,
+            itow_ms=round(value.get("gps_itow_ms", 0)),
+            fix_type=GpsFixType(int(value.get("gps_fix_type", GpsFixType.FIX_3D))),
+            fix_ok=bool(value.get("gps_fix_ok", 1)),
+            satellites=int(value.get("gps_satellites", 0)),
+            lat_dege7=round(value["gps_lat_dege7"]),
+            lon_dege7=round(value["gps_lon_dege7"]),
+            alt_amsl_m=value.get("gps_alt_amsl_m", NAN),
+            vel_n_mps=_vector(value, "gps_vel_{}_mps", ("north", "east", "down")),
+            alt_ellipsoid_m=value.get("gps_alt_ellipsoid_m", NAN),
+            h_acc_m=value.get("gps_h_acc_m", NAN),
+            v_acc_m=value.get("gps_v_acc_m", NAN),
+            speed_acc_mps=value.get("gps_speed_acc_mps", NAN),
+            course_acc_deg=value.get("gps_course_acc_deg", NAN),
+            pdop=value.get("gps_pdop", NAN),
+            utc_us=None if math.isnan(utc_us) else round(utc_us),
+        )
+
+
+def _vector(value: Mapping[str, float], name: str, axes: Iterable[str]) -> Vec3:
+    x, y, z = (value.get(name.format(axis), NAN) for axis in axes)
+    return (x, y, z)

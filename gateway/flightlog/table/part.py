@@ -1,0 +1,128 @@
+"""What is gathered for the part of a recording that is being written."""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import msgspec
+
+from gateway.flightlog.table.row import RowBuilder, TableRow, row_to_line
+from gateway.flightlog.table.table import (
+    TableHeader,
+    TableMark,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_state,
+)
+from gateway.flightlog.tlog.stamps import Stamper
+from gateway.flightlog.tlog.tlog import encode_record
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
+
+PENDING_LIMIT: Final = 16 << 20
+"""Bytes that wait for a slow disk: minutes of telemetry. More is given up, not piled up."""
+TLOG: Final = ".tlog"
+
+
+@dataclass(slots=True)
+class _Table:
+    """One aircraft's table, which begins with its first row."""
+
+    header: TableHeader
+    state: FusionState | None
+    rows: RowBuilder = field(default_factory=RowBuilder)
+    begun: bool = False
+
+
+class Part:
+    """Bytes by the end of their file's name, gathered until they are taken to the disk.
+
+    Parameters
+    ----------
+    session : str
+        Name of the recording.
+    number : int
+        Which part of it, from 1.
+    offset_us : int
+        Civil time of gateway time zero, for as long as the part is written.
+    """
+
+    def __init__(self, session: str, number: int, offset_us: int) -> None:
+        self.session = session
+        """May be set until the table of an aircraft begins."""
+        self.number = number
+        self.stamper = Stamper(offset_us)
+        self.pending: dict[str, bytearray] = {}
+        self.size = 0
+        """Bytes that were given, those beyond the limit included."""
+        self._tables: dict[int, _Table] = {}
+
+    def add(self, ending: str, data: bytes) -> None:
+        """Gather bytes for one file, unless too many wait already."""
+        if self.size < PENDING_LIMIT:
+            self.pending.setdefault(ending, bytearray()).extend(data)
+        self.size += len(data)
+
+    def take(self) -> dict[str, bytes]:
+        """Hand over what was gathered."""
+        pending, self.pending, self.size = self.pending, {}, 0
+        return {ending: bytes(data) for ending, data in pending.items()}
+
+    def add_frame(self, frame: bytes, now_us: int) -> None:
+        """Gather a MAVLink frame for the tlog."""
+        self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
+
+    def has_table(self, vehicle_id: int) -> bool:
+        """Tell whether the table of an aircraft was prepared."""
+        return vehicle_id in self._tables
+
+    def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:
+        """Note what will head an aircraft's table.
+
+        Parameters
+        ----------
+        header : TableHeader
+            Of this part; the recording's name is put in when the table begins.
+        state : FusionState, optional
+            What the fusion remembers before the first row, if it has seen anything.
+        """
+        self._tables[header.vehicle_id] = _Table(header, state)
+
+    def add_flight(self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample) -> None:
+        """Gather what the estimator took, for a table that was prepared."""
+        self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
+
+    def change_settings(self, header: TableHeader) -> None:
+        """Note in a table that was prepared that what comes is fused with other settings."""
+        table = self._tables[header.vehicle_id]
+        self._begin(table)
+        self._write(table, table.rows.flush())
+        self.add(table_ending(header.vehicle_id), encode_header(header).encode())
+
+    def add_mark(self, mark: TableMark) -> None:
+        """Put a remark into every table that has begun."""
+        for vehicle_id, table in self._tables.items():
+            if table.begun:
+                self.add(table_ending(vehicle_id), encode_mark(mark).encode())
+
+    def flush_rows(self) -> None:
+        """Gather also what still waits for an IMU sample to share its row."""
+        for table in self._tables.values():
+            self._write(table, table.rows.flush())
+
+    def _begin(self, table: _Table) -> None:
+        if not table.begun:
+            table.begun = True
+            # The name may have changed since the table was prepared.
+            header = msgspec.structs.replace(table.header, session=self.session)
+            begun = "" if table.state is None else encode_state(table.state)
+            self.add(table_ending(header.vehicle_id), (encode_head(header) + begun).encode())
+
+    def _write(self, table: _Table, rows: list[TableRow]) -> None:
+        for row in rows:
+            self._begin(table)
+            self.add(table_ending(table.header.vehicle_id), row_to_line(row).encode())
+
+
+def table_ending(vehicle_id: int) -> str:
+    """Name the end of an aircraft's table."""
+    return f"_v{vehicle_id}.csv"

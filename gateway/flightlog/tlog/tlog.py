@@ -1,0 +1,263 @@
+"""The tlog format: records out of bytes, bytes out of records, and an index to seek by."""
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from gateway.flightlog.tlog.tlog_scan import (
+    COLUMNS,
+    LARGEST_RECORD,
+    SMALLEST_RECORD,
+    TIME_SIZE,
+    IntArray,
+    crc_extra_table,
+    scan,
+)
+from gateway.units import US_PER_S
+
+DAY_US: Final = 86_400 * US_PER_S
+STRIDE: Final = 256
+"""Records between two entries of the index: a seek scans at most this many, some 15 kB."""
+SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
+MAX_DAMAGE_RUNS: Final = 1000
+"""Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+
+_EXTRA: Final = crc_extra_table()
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A run of bytes of a file that belongs to no record."""
+
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class TlogRecord:
+    """One frame and the civil time at which it passed, in µs since 1970."""
+
+    time_us: int
+    frame: bytes
+
+
+def encode_record(time_us: int, frame: bytes) -> bytes:
+    """Build the bytes of one record.
+
+    Parameters
+    ----------
+    time_us : int
+        µs since 1970.
+    frame : bytes
+        A complete MAVLink frame.
+
+    Returns
+    -------
+    bytes
+        Big-endian time, then the frame.
+    """
+    return time_us.to_bytes(TIME_SIZE, "big") + frame
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The records of one stretch of a file, as columns."""
+
+    data: bytes
+    offset: int
+    """Where `data` begins in the file."""
+    starts: IntArray
+    """Offset of each record in `data`."""
+    sizes: IntArray
+    """Size of each frame in bytes."""
+    time_us: IntArray
+    origins: IntArray
+    """Sender of each frame: system id << 8 | component id."""
+    message_ids: IntArray
+    damage: tuple[Damage, ...]
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def frame(self, index: int) -> bytes:
+        """Return one frame's own bytes."""
+        begin = int(self.starts[index]) + TIME_SIZE
+        return self.data[begin : begin + int(self.sizes[index])]
+
+    def shifted(self, shift_us: int) -> bytes:
+        """Return the bytes from the first record to the last, with all times moved."""
+        if not len(self):
+            return b""
+        begin = int(self.starts[0])
+        end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
+        shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
+        times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
+        places = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
+        shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
+        return shifted.tobytes()
+
+    def records(self, begin: int = 0) -> Iterator[TlogRecord]:
+        """Go through the records from one of them on."""
+        data = self.data
+        times, starts, sizes = self.time_us, self.starts, self.sizes
+        for time_us, start, size in zip(
+            times[begin:].tolist(), starts[begin:].tolist(), sizes[begin:].tolist(), strict=True
+        ):
+            yield TlogRecord(time_us, data[start + TIME_SIZE : start + TIME_SIZE + size])
+
+
+class TlogScanner:
+    """Turn any chunks of a tlog into batches of records; never raises on data.
+
+    Parameters
+    ----------
+    offset : int
+        Where in the file the first chunk begins; a record must begin there.
+    strict : bool
+        Check every checksum, so that a frame with a wrong one counts as damage.
+    """
+
+    def __init__(self, offset: int = 0, *, strict: bool = False) -> None:
+        self._offset = offset
+        self._strict = strict
+        self._rest = b""
+        self._in_step = True
+
+    def feed(self, data: bytes, *, final: bool = False) -> Batch:
+        """Take the next bytes of the file.
+
+        Parameters
+        ----------
+        data : bytes
+            Any chunk.
+        final : bool
+            Whether the file ends with it. Before that the last record is held back, since only
+            its successor confirms it.
+
+        Returns
+        -------
+        Batch
+            Every record that is certain now.
+        """
+        data = self._rest + data if self._rest else data
+        room = len(data) // SMALLEST_RECORD + 1
+        columns = np.empty((COLUMNS, room), np.int64)
+        runs = np.empty((2, room + 1), np.int64)
+        end, count, damaged, self._in_step = scan(
+            np.frombuffer(data, np.uint8),
+            final,
+            self._strict,
+            self._in_step,
+            _EXTRA,
+            columns,
+            runs,
+        )
+        offset = self._offset
+        self._rest = data[end:]
+        self._offset += end
+        found = columns[:, :count]
+        if damaged:
+            found = _without_torn_times(found, runs[1, :damaged])
+        begins, ends = runs[:, :damaged].tolist()
+        damage = tuple(Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True))
+        starts, sizes, times, origins, message_ids = found
+        return Batch(data, offset, starts, sizes, times, origins, message_ids, damage)
+
+
+def _without_torn_times(columns: IntArray, damage_ends: IntArray) -> IntArray:
+    """Leave out records of which the damage before them has taken a part of the time.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (COLUMNS, n)
+        Records from `scan`.
+    damage_ends : ndarray, shape (m,)
+        Where each damage ends; moved behind what is left out.
+    """
+    starts, sizes, times = columns[:3]
+    far = np.abs(np.diff(times)) > DAY_US
+    torn = []
+    for run, end in enumerate(damage_ends.tolist()):
+        i = int(np.searchsorted(starts, end))
+        # The last of a batch has nothing behind it to compare with.
+        if i < len(far) and starts[i] == end and far[i] and (i == 0 or far[i - 1]):
+            torn.append(i)
+            damage_ends[run] = end + TIME_SIZE + sizes[i]
+    return np.delete(columns, torn, axis=1)
+
+
+class TlogIndex:
+    """Where to begin reading for a time, and what the whole file holds.
+
+    One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
+    it. The time stamps of other people's files may jump back; the index searches by the greatest
+    time so far, which never does.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Records."""
+        self.size = 0
+        """Bytes that were seen, damage included."""
+        self.first_us: int | None = None
+        self.last_us: int | None = None
+        """Greatest time."""
+        self.systems: set[int] = set()
+        """Ids of all that sent."""
+        self.damage: list[Damage] = []
+        """The first `MAX_DAMAGE_RUNS` runs."""
+        self.damaged_bytes = 0
+        self._offsets = array("q")
+        self._times = array("q")
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        for run in batch.damage:
+            self._add_damage(run)
+        if not len(batch):
+            return
+        self.systems |= set(np.flatnonzero(np.bincount(batch.origins >> 8)).tolist())
+        if self.first_us is None or self.last_us is None:
+            self.first_us = self.last_us = int(batch.time_us[0])
+        greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))
+        first = -self.count % STRIDE
+        self._offsets.frombytes((batch.starts[first::STRIDE] + batch.offset).tobytes())
+        self._times.frombytes(greatest[first::STRIDE].tobytes())
+        self.count += len(batch)
+        self.last_us = int(greatest[-1])
+        end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
+        self.size = max(self.size, batch.offset + end)
+
+    def offset_before(self, time_us: int, records: int = 0) -> int:
+        """Tell where to begin reading to find the first record that is not before a time.
+
+        Parameters
+        ----------
+        time_us : int
+            µs since 1970.
+        records : int
+            Begin at least so many records earlier, or at the begin of the file.
+
+        Returns
+        -------
+        int
+            Offset of a record at most `records` and two strides before it; 0 for an empty file.
+        """
+        if not self._offsets:
+            return 0
+        entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
+        return self._offsets[max(entry, 0)]
+
+    def _add_damage(self, run: Damage) -> None:
+        self.damaged_bytes += run.size
+        self.size = max(self.size, run.offset + run.size)
+        last = self.damage[-1] if self.damage else None
+        if last is not None and last.offset + last.size == run.offset:
+            # A run across two chunks arrives in two pieces.
+            self.damage[-1] = Damage(last.offset, last.size + run.size)
+        elif len(self.damage) < MAX_DAMAGE_RUNS:
+            self.damage.append(run)

@@ -1,0 +1,1 @@
+"""Recordings as streams: opened from any format, and fused again."""

@@ -1,0 +1,308 @@
+"""Recordings as streams for the commands: rows to fuse, frames to send, points to draw."""
+
+import heapq
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from itertools import chain
+from pathlib import Path
+from typing import Final, Literal, TypeVar
+
+import msgspec
+
+from gateway.aircraft import AircraftSettings
+from gateway.edges.disk.recording_streams import (
+    FileKind,
+    Progress,
+    kind_of,
+    read_batches,
+    read_chunks,
+    read_events,
+)
+from gateway.flightlog.mapshape import TrackPoint
+from gateway.flightlog.summary import payload_of
+from gateway.flightlog.table.autopilot import AutopilotReader
+from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
+from gateway.flightlog.table.row import RowBuilder, TableRow
+from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
+from gateway.flightlog.tlog.stamps import JUMP_US
+from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.pipeline import PipelineSettings
+from gateway.records import (
+    BaroRaw,
+    FusionState,
+    GpsFix,
+    ImuCalibrated,
+    ImuRaw,
+    NavFlags,
+    NavState,
+)
+from gateway.replay import header_for, settings_of
+from gateway.sensing.calibration import NodeCalibration
+from gateway.units import DEG_PER_DEGE7, M_PER_MM
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+
+GLOBAL_POSITION_INT_ID: Final = 33
+TRACKER_LOG: Final = files("gateway.flights") / "tracker-log.toml"
+"""The map for logs whose columns are time_s, ax, gx and so on."""
+_POSITION: Final = struct.Struct("<Iiii")
+
+Position = Literal["causal", "interpolated"]
+SettingsChoice = Literal["recorded", "current"]
+
+
+Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
+
+
+Line = TableRow | TableHeader | TableMark | FusionState
+
+
+NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
+
+
+class FlightError(Exception):
+    """A file that does not hold what a command needs; the text says what and where."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """How a command wants its flights."""
+
+    current: PipelineSettings
+    """The settings of today."""
+    choice: SettingsChoice = "recorded"
+    """Whose settings a table is fused with; those of today where it has none of its own."""
+    position: Position = "causal"
+    columns: ColumnMap | None = None
+    """For a CSV that is not ours; by default those of a tracker log."""
+    system_id: int | None = None
+    """The vehicle of a tlog to take."""
+    progress: Progress | None = None
+
+
+@dataclass(slots=True)
+class RecordedTable:
+    """Rows with the head that belongs to them."""
+
+    header: TableHeader
+    rows: Iterator[Line]
+    """A header among them tells of settings that were changed in flight, a state of what the
+    fusion remembered there, a mark of what somebody remarked."""
+
+    @property
+    def plain_rows(self) -> Iterator[TableRow]:
+        """The rows alone."""
+        return (row for row in self.rows if isinstance(row, TableRow))
+
+
+def open_rows(path: Path, wishes: Wishes) -> RecordedTable:
+    """Open any file that holds a flight as a table.
+
+    Parameters
+    ----------
+    path : Path
+        A table, a foreign CSV, or an autopilot's tlog.
+    wishes : Wishes
+        Column map, vehicle, settings.
+
+    Returns
+    -------
+    RecordedTable
+        The head is complete, the rows come as they are read.
+
+    Raises
+    ------
+    FlightError
+        If it holds no flight that can be read.
+    OSError
+        If it cannot be read at all.
+    """
+    match kind_of(path):
+        case FileKind.TABLE:
+            return _open_table(path, wishes)
+        case FileKind.FOREIGN:
+            return _open_foreign(path, wishes)
+        case FileKind.TLOG:
+            return _open_autopilot(path, wishes)
+
+
+def aircraft_of(table: RecordedTable, wishes: Wishes) -> AircraftSettings:
+    """Choose the settings for one table: its own, or those of today."""
+    if wishes.choice == "current" or not table.header.settings:
+        return wishes.current.aircraft.get(table.header.vehicle_id, wishes.current.default)
+    try:
+        return settings_of(table.header)
+    except msgspec.ValidationError as error:
+        raise FlightError(
+            f"the recorded settings are of another version ({error}); "
+            "use the current ones: --settings current"
+        ) from error
+
+
+def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterator[TlogRecord]:
+    """Yield the records of tlogs, merged by time."""
+    streams = [
+        (record for batch in read_batches(path, progress) for record in batch.records())
+        for path in paths
+    ]
+    return heapq.merge(*streams, key=lambda record: record.time_us)
+
+
+def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
+    """Put tables of one aircraft behind one another on the clock of the first.
+
+    Parts of one recording share a clock; other recordings are put in their place by civil time.
+
+    Raises
+    ------
+    FlightError
+        If they are of several aircraft.
+    """
+    vehicles = sorted({table.header.vehicle_id for table in tables})
+    if len(vehicles) > 1:
+        listed = " and ".join(map(str, vehicles))
+        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
+    first = tables[0].header
+
+    def rows() -> Iterator[Line]:
+        known = first
+        for table in tables:
+            header = table.header
+            if (header.settings, header.calibration) != (known.settings, known.calibration):
+                yield header
+            for row in table.rows:
+                known = row if isinstance(row, TableHeader) else known
+                yield from shifted(row, _shift_us(header, first))
+
+    return RecordedTable(first, rows())
+
+
+def _shift_us(header: TableHeader, first: TableHeader) -> int:
+    """Tell how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
+        return 0
+    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
+    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
+
+
+def shifted(row: Line, shift_us: int) -> Iterator[Line]:
+    """Move a row and all its records in time; a state holds times of its own and is left out."""
+    if not shift_us or isinstance(row, TableHeader):
+        yield row
+    elif isinstance(row, TableMark):
+        yield TableMark(row.time_us + shift_us, row.text)
+    elif isinstance(row, TableRow):
+        yield TableRow(
+            row.time_us + shift_us,
+            _moved(row.baro, shift_us),
+            _moved(row.gps, shift_us),
+            _moved(row.raw, shift_us),
+            _moved(row.imu, shift_us),
+            _moved(row.state, shift_us),
+        )
+
+
+def points_of_rows(table: RecordedTable) -> Iterator[TrackPoint]:
+    """Yield the fused positions of a table; its fixes where it has no states."""
+    zero_us = table.header.unix_us_at_zero or 0
+    for row in table.plain_rows:
+        state, fix = row.state, row.gps
+        if state is not None and NavFlags.POSITION_VALID in state.flags:
+            time_us = zero_us + row.time_us
+            yield TrackPoint(time_us, state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        elif state is None and fix is not None and fix.fix_ok:
+            lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
+            yield TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
+
+
+def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:
+    """Yield the positions that one vehicle told; the first that tells one by default."""
+    for record in records:
+        if message_id_of(record.frame) != GLOBAL_POSITION_INT_ID:
+            continue
+        sender = origin_of(record.frame)[0]
+        system_id = sender if system_id is None else system_id
+        _, lat, lon, alt = _POSITION.unpack(payload_of(record.frame, _POSITION.size))
+        if sender == system_id and (lat or lon):
+            yield TrackPoint(
+                record.time_us, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM
+            )
+
+
+def _moved(record: Moved | None, shift_us: int) -> Moved | None:
+    return None if record is None else replace(record, time_us=record.time_us + shift_us)
+
+
+def foreign_rows(lines: Iterable[str], wishes: Wishes) -> Iterator[TableRow]:
+    """Read the lines of another program's CSV; raises ValueError as `ForeignReader.rows`."""
+    known = wishes.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+    reader = ForeignReader(known, wishes.system_id or 1, lenient=wishes.columns is None)
+    return reader.rows(lines)
+
+
+def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
+    rest = b""
+    for data in read_chunks(path, progress):
+        *lines, rest = (rest + data).split(b"\n")
+        yield from (line.decode(errors="replace") for line in lines)
+    if rest:
+        yield rest.decode(errors="replace")
+
+
+def _open_table(path: Path, wishes: Wishes) -> RecordedTable:
+    reader = TableReader()
+    events = read_events(path, reader, wishes.progress)
+    lines = (event for event in events if isinstance(event, Line))
+    head: list[Line] = []
+    for line in lines:
+        head.append(line)
+        if isinstance(line, TableRow):
+            return RecordedTable(reader.header or TableHeader(), chain(head, lines))
+    raise FlightError(f"{path}: holds no row")
+
+
+def _open_foreign(path: Path, wishes: Wishes) -> RecordedTable:
+    rows = foreign_rows(_lines(path, wishes.progress), wishes)
+    try:
+        first = next(rows, None)
+    except ValueError as error:
+        raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
+    if first is None:
+        raise FlightError(f"{path}: holds no row that can be read")
+    return _headed(first, rows, wishes, wishes.system_id or 1, None)
+
+
+def _open_autopilot(path: Path, wishes: Wishes) -> RecordedTable:
+    reader, builder = AutopilotReader(wishes.system_id), RowBuilder()
+    records = recorded_frames([path], wishes.progress)
+
+    def rows() -> Iterator[TableRow]:
+        for record in records:
+            for imported in reader.feed(record.frame, record.time_us):
+                yield from builder.add(imported)
+        yield from builder.flush()
+
+    stream = rows()
+    first = next(stream, None)
+    if first is None:
+        raise FlightError(
+            f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
+        )
+    return _headed(first, stream, wishes, reader.system_id or 1, reader.unix_us_at_zero)
+
+
+def _headed(
+    first: TableRow,
+    rest: Iterator[TableRow],
+    wishes: Wishes,
+    vehicle_id: int,
+    unix_us_at_zero: int | None,
+) -> RecordedTable:
+    """Give rows of another program the head of a table, with the settings of today."""
+    current = wishes.current.aircraft.get(vehicle_id, wishes.current.default)
+    # Its values are calibrated already, whatever the calibration of the aircraft of that number.
+    calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
+    known = header_for(calibrated, vehicle_id)
+    header = msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
+    return RecordedTable(header, chain([first], rest))

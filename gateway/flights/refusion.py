@@ -1,0 +1,123 @@
+"""Recorded flights through the pipeline again, as rows or as the frames it would have sent."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from gateway import __version__
+from gateway.edges.disk.recording_streams import FileKind, kind_of, read_ends
+from gateway.flightlog.table.row import RowBuilder, TableRow
+from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
+from gateway.flightlog.tlog.stamps import Stamper
+from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.reading import (
+    Line,
+    RecordedTable,
+    Wishes,
+    aircraft_of,
+    foreign_rows,
+    joined_rows,
+    open_rows,
+)
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, Outgoing
+from gateway.replay import InterpolatedPosition, Replay, header_for
+
+SETTLES: Final = "what was remembered at the begin is left aside: {}; the estimator settles anew"
+
+
+class Refusion:
+    """Flights behind one another, to be fused once more.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Anything that `open_rows` reads, of one aircraft.
+    wishes : Wishes
+        Settings, and how positions are told.
+
+    Raises
+    ------
+    FlightError
+        If there is no flight in a file, or they do not belong together.
+    """
+
+    def __init__(self, files: Sequence[Path], wishes: Wishes) -> None:
+        self._table = table = joined_rows([open_rows(file, wishes) for file in files])
+        self._aircraft, self._zero_us = aircraft_of(table, wishes), table.header.unix_us_at_zero
+        self._recorded = wishes.choice == "recorded"
+        correct = None
+        if wishes.position == "interpolated":
+            latency_s = self._aircraft.estimation.reference.gps_latency_s
+            correct = InterpolatedPosition(_fixes_of(files, wishes), latency_s)
+        common = PipelineSettings(self._aircraft, {}, self._zero_us or 0, correct)
+        self._replay = Replay(Pipeline(common), follow=self._recorded)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the user should know of the states, as far as it was seen by now."""
+        return [SETTLES.format(reason) for reason in self._replay.refused]
+
+    def frames(self) -> Iterator[TlogRecord]:
+        """Yield the MAVLink that the gateway would have sent, at civil times."""
+        stamper = Stamper(self._zero_us or 0)
+        for row in self._table.rows:
+            if isinstance(row, TableMark):
+                continue
+            for now_us, action in self._replay.take(row):
+                if isinstance(action, Outgoing) and action.client_id is None:
+                    yield TlogRecord(stamper.stamp(now_us), action.frame)
+
+    def table(self) -> RecordedTable:
+        """Return the rows with the new states, under a head that tells how they were made."""
+        rows = self._rows()
+        first = next(rows, None)
+        old, new = self._table.header, header_for(self._aircraft, self._table.header.vehicle_id)
+        if not self._recorded or not old.settings:
+            old = msgspec.structs.replace(old, settings=new.settings, calibration=new.calibration)
+        begins_cold = not isinstance(first, FusionState)
+        header = msgspec.structs.replace(old, mavgate_version=__version__, cold_start=begins_cold)
+        return RecordedTable(header, chain([] if first is None else [first], rows))
+
+    def _rows(self) -> Iterator[Line]:
+        builder = RowBuilder()
+        for row in self._table.rows:
+            if isinstance(row, FusionState):
+                if self._replay.restore(row):
+                    yield row
+                continue
+            if isinstance(row, TableMark):
+                yield row
+                continue
+            if isinstance(row, TableHeader) and self._recorded:
+                yield row
+            for _, action in self._replay.take(row):
+                if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                    yield from builder.add(action)
+            # A row that stood without an IMU sample does so again.
+            yield from builder.flush()
+
+
+def end_of(file: Path, wishes: Wishes) -> int | None:
+    """Tell the civil time of a table's last row without reading all of it; None if unknown."""
+    head, tail = read_ends(file)
+    if kind_of(file) is FileKind.FOREIGN:
+        rows = list(foreign_rows((head + tail).decode(errors="replace").splitlines(), wishes))
+        zero_us = 0
+    else:
+        reader = TableReader()
+        events = reader.feed(head + tail, final=True)
+        rows = [event for event in events if isinstance(event, TableRow)]
+        zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
+    return zero_us + rows[-1].time_us if rows else None
+
+
+def _fixes_of(files: Iterable[Path], wishes: Wishes) -> Iterator[GpsFix]:
+    """Read the fixes beside the rows, a little ahead of them."""
+    quiet = replace(wishes, progress=None)
+    table = joined_rows([open_rows(file, quiet) for file in files])
+    return (row.gps for row in table.plain_rows if row.gps is not None)

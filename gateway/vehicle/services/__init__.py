@@ -1,0 +1,1 @@
+"""What the vehicle answers: one service a file."""

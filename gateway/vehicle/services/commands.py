@@ -1,0 +1,214 @@
+"""MAV_CMDs: each acknowledged once, to the one who asked, and most of them carried out."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.client_place import GLOBAL_FRAMES
+from gateway.vehicle.services.intervals import IntervalService
+
+DEGE7: Final = 1e7
+
+ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
+DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
+UNSUPPORTED: Final[int] = mavlink.MAV_RESULT_UNSUPPORTED
+NOT_NOW: Final[int] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+IN_PROGRESS: Final[int] = mavlink.MAV_RESULT_IN_PROGRESS
+FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
+
+NO_PROGRESS: Final = 255
+RESPOND_TO_ALL: Final = 2
+"""Last parameter of MAV_CMD_REQUEST_MESSAGE."""
+
+REFUSALS: Final = {
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: "A tracker cannot be armed: it flies nothing",
+    mavlink.MAV_CMD_DO_SET_MODE: "A tracker has no modes to switch",
+    mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
+}
+"""Commands that are understood and not done, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """COMMAND_LONG or COMMAND_INT, told alike."""
+
+    request: Request
+    number: int
+    params: tuple[float, float, float, float]
+    lat_deg: float
+    """Parameter 5 of a COMMAND_LONG, x of a COMMAND_INT in degrees."""
+    lon_deg: float
+    height_m: float
+    """Parameter 7."""
+    frame: int
+
+    def ack(self, result: int, progress: int = NO_PROGRESS) -> Reply:
+        """Acknowledge it."""
+        done = progress if result == IN_PROGRESS else 0
+        return self.request.reply(
+            mavlink.MAVLink_command_ack_message(
+                self.number,
+                result,
+                done,
+                0,
+                self.request.system_id,
+                self.request.component_id,
+            )
+        )
+
+    @property
+    def extra(self) -> tuple[float, float]:
+        """Parameters 5 and 6, where they are no place."""
+        message = self.request.message
+        if message.get_type() == "COMMAND_INT":
+            return (float(message.x), float(message.y))
+        return (message.param5, message.param6)
+
+
+Outcome = tuple[int, list[Answer]]
+"""Result of a command, and what goes out behind its acknowledgement."""
+
+Handler = Callable[[Command, int], Outcome]
+Explain = Callable[[str, int], list[Answer]]
+"""Tells all a text at a time: why something was refused."""
+
+
+def read_command(request: Request) -> Command:
+    """Take a command out of either message."""
+    message = request.message
+    params = (message.param1, message.param2, message.param3, message.param4)
+    if message.get_type() == "COMMAND_LONG":
+        place = (message.param5, message.param6, message.param7)
+        frame = int(mavlink.MAV_FRAME_GLOBAL)
+    else:
+        scale = DEGE7 if message.frame in GLOBAL_FRAMES else 1.0
+        place = (message.x / scale, message.y / scale, message.z)
+        frame = int(message.frame)
+    return Command(request, message.command, params, *place, frame)
+
+
+def whole(value: float) -> int:
+    """Read an integer parameter; what is no number is 0."""
+    return round(value) if math.isfinite(value) else 0
+
+
+class CommandService:
+    """Dispatch commands by number; what nobody handles is UNSUPPORTED."""
+
+    types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
+
+    def __init__(
+        self,
+        intervals: IntervalService,
+        build: Callable[[int, int], list[Any]],
+        knows: Callable[[int], bool],
+        explain: Explain,
+    ) -> None:
+        """Start with what needs no other service.
+
+        Parameters
+        ----------
+        intervals : IntervalService
+            For the rates of single clients.
+        build : callable
+            Builds the messages of an id at a time; an empty list if there is nothing yet.
+        knows : callable
+            Tells whether a message of that id is ever sent.
+        explain : callable
+            Tells all why something was refused.
+        """
+        self._intervals = intervals
+        self._build = build
+        self._knows = knows
+        self._explain = explain
+        self._handlers: dict[int, Handler] = {
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
+            mavlink.MAV_CMD_GET_HOME_POSITION: self._fixed(mavlink.MAVLINK_MSG_ID_HOME_POSITION),
+            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._fixed(
+                mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+            ),
+            mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: self._fixed(300),
+        }
+        self._changing: set[int] = set(REFUSALS)
+        for number in REFUSALS:
+            self._handlers[number] = self._decline
+
+    def register(self, number: int, handler: Handler) -> None:
+        """Let another service carry out a command that changes state."""
+        self._handlers[number] = handler
+        self._changing.add(number)
+
+    def changes_state(self, request: Request) -> bool:
+        """Tell whether the command would change anything."""
+        message = request.message
+        return message.get_type() == "SET_MODE" or message.command in self._changing
+
+    def refuse(self, request: Request) -> list[Answer]:
+        """Acknowledge as denied."""
+        return [self._read(request).ack(DENIED)]
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Carry out a command and acknowledge it."""
+        command = self._read(request)
+        handler = self._handlers.get(command.number)
+        if handler is None:
+            return [command.ack(UNSUPPORTED)]
+        result, answers = handler(command, now_us)
+        return [command.ack(result), *answers]
+
+    def _read(self, request: Request) -> Command:
+        if request.message.get_type() != "SET_MODE":
+            return read_command(request)
+        number = mavlink.MAV_CMD_DO_SET_MODE
+        return Command(request, number, (0.0,) * 4, 0.0, 0.0, 0.0, mavlink.MAV_FRAME_GLOBAL)
+
+    def _decline(self, command: Command, now_us: int) -> Outcome:
+        return DENIED, self._explain(REFUSALS[command.number], now_us)
+
+    def _request_message(self, command: Command, now_us: int) -> Outcome:
+        message_id = whole(command.params[0])
+        if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
+            return self._tell_interval(command, whole(command.params[1]))
+        if not self._knows(message_id):
+            return UNSUPPORTED, []
+        messages = self._build(message_id, now_us)
+        everybody = whole(command.height_m) == RESPOND_TO_ALL
+        answers: list[Answer] = [
+            Reply(m, None if everybody else command.request.client_id) for m in messages
+        ]
+        return (ACCEPTED, answers) if answers else (NOT_NOW, [])
+
+    def _fixed(self, message_id: int) -> Handler:
+        def handler(command: Command, now_us: int) -> Outcome:
+            messages = self._build(message_id, now_us)
+            answers: list[Answer] = [command.request.reply(m) for m in messages]
+            return (ACCEPTED, answers) if answers else (NOT_NOW, [])
+
+        return handler
+
+    def _set_interval(self, command: Command, _now_us: int) -> Outcome:
+        message_id = whole(command.params[0])
+        wish = command.params[1]
+        if not math.isfinite(wish):
+            return DENIED, []
+        if not self._knows(message_id):
+            return UNSUPPORTED, []
+        try:
+            return ACCEPTED, self._intervals.set_interval(command.request, message_id, wish)
+        except ValueError:
+            return DENIED, []
+
+    def _get_interval(self, command: Command, _now_us: int) -> Outcome:
+        return self._tell_interval(command, whole(command.params[0]))
+
+    def _tell_interval(self, command: Command, message_id: int) -> Outcome:
+        client_id = command.request.client_id
+        interval_us = self._intervals.interval_us(client_id, message_id)
+        answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
+        return ACCEPTED, [command.request.reply(answer)]

@@ -1,0 +1,192 @@
+"""Rates that single clients wish for: each client's own, and nobody else's.
+
+A wish for fewer messages thins what goes to all, at the hub. A wish for more gets the client a
+stream of its own, beside the common one, which the hub then keeps from it. That costs the gateway
+work, so only clients that may change things get it.
+"""
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import ClientInterval
+from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.telemetry.streams import OFF, Stream
+from gateway.vehicle.telemetry.telemetry import STATE_MESSAGES, Telemetry
+
+MAX_FAST_STREAMS: Final = 64
+"""Each costs an encoding of its own."""
+MIN_INTERVAL_US: Final = 1000
+MIN_TIMED_INTERVAL_US: Final = 20_000
+"""Of messages that no sample carries: faster they would only repeat themselves."""
+MAX_WISHES: Final = 1024
+"""Clients come and go; the oldest wishes are forgotten first."""
+KEEPS_CLIENTS_US: Final = 1_000_000
+"""A client that gets fewer heartbeats loses the vehicle."""
+
+DEFAULT: Final = 0
+NONE: Final = -1
+
+HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+
+DATA_STREAMS: Final[dict[int, tuple[int, ...]]] = {
+    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
+        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+    ),
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+    ),
+    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
+    mavlink.MAV_DATA_STREAM_EXTRA1: (
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    ),
+    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
+}
+"""REQUEST_DATA_STREAM's groups, as autopilots fill them."""
+
+ALL_GROUPS: Final = tuple(message for group in DATA_STREAMS.values() for message in group)
+
+
+class IntervalService:
+    """Who gets which message how often."""
+
+    types = ("REQUEST_DATA_STREAM",)
+
+    def __init__(self, system_id: int, telemetry: Telemetry) -> None:
+        self._system_id = system_id
+        self._telemetry = telemetry
+        self._wishes: dict[tuple[int, int], int] = {}
+        self._fast: dict[tuple[int, int], Stream] = {}
+
+    def changes_state(self, _request: Request) -> bool:
+        """Tell that a client's own rates are nobody else's business."""
+        return False
+
+    def refuse(self, _request: Request) -> list[Answer]:
+        """Say nothing."""
+        return []
+
+    def handle(self, request: Request, _now_us: int) -> list[Answer]:
+        """Thin a group of messages by REQUEST_DATA_STREAM, which has no answer.
+
+        It only ever thins: its rate is meant for whole groups, and raising everything in them
+        would be no kindness.
+        """
+        message = request.message
+        group = ALL_GROUPS if message.req_stream_id == 0 else ()
+        ids = DATA_STREAMS.get(message.req_stream_id, group)
+        wanted_us = NONE
+        if message.start_stop and message.req_message_rate:
+            wanted_us = 1_000_000 // message.req_message_rate
+        answers: list[Answer] = []
+        for message_id in ids:
+            common_us = self._telemetry.streams[message_id].interval_us
+            faster = 0 <= wanted_us <= common_us
+            answers += self._take(request.client_id, message_id, DEFAULT if faster else wanted_us)
+        return answers
+
+    def set_interval(self, request: Request, message_id: int, interval_us: float) -> list[Answer]:
+        """Take one client's wish.
+
+        Parameters
+        ----------
+        request : Request
+            Who wishes it.
+        message_id : int
+        interval_us : float
+            As in MAV_CMD_SET_MESSAGE_INTERVAL: 0 for the settings' rate, -1 for none.
+
+        Returns
+        -------
+        list of Answer
+            What the hub is to do.
+
+        Raises
+        ------
+        ValueError
+            If the message is never streamed, or the wish cannot be granted.
+        """
+        stream = self._telemetry.streams.get(message_id)
+        if stream is None:
+            raise ValueError("this message is not streamed")
+        wish = round(interval_us)
+        if message_id == HEARTBEAT and wish != DEFAULT:
+            if not 0 < wish <= KEEPS_CLIENTS_US:
+                raise ValueError("a vehicle without heartbeats is lost")
+            wish = DEFAULT
+        if wish < 0:
+            wish = NONE
+        elif wish != DEFAULT:
+            carried = message_id in STATE_MESSAGES
+            wish = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, wish)
+        if _is_faster(wish, stream.interval_us) and not request.may_change:
+            raise ValueError("more than the settings' rate is not for every client")
+        return self._take(request.client_id, message_id, wish)
+
+    def interval_us(self, client_id: int, message_id: int) -> int:
+        """Tell how often a client gets a message, as MESSAGE_INTERVAL says it.
+
+        Returns
+        -------
+        int
+            Interval, -1 if it gets none, 0 if the vehicle never sends it.
+        """
+        stream = self._telemetry.streams.get(message_id)
+        if stream is None:
+            return DEFAULT
+        return self._wishes.get((client_id, message_id), stream.interval_us)
+
+    def forget_client(self, client_id: int) -> None:
+        """Forget the wishes of a client that has gone."""
+        for table in (self._wishes, self._fast):
+            for key in [key for key in table if key[0] == client_id]:
+                del table[key]
+
+    def on_state(self, time_us: int) -> list[Answer]:
+        """Send what an IMU sample carries to those who wished for more."""
+        return self._due(STATE_MESSAGES, time_us, Stream.offer) if self._fast else []
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Send what no sample carries to those who wished for more."""
+        if not self._fast:
+            return []
+        timed = [m for _, m in self._fast if m not in STATE_MESSAGES]
+        return self._due(timed, now_us, Stream.tick)
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` has something to send."""
+        due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in STATE_MESSAGES]
+        return min(due, default=None)
+
+    def _take(self, client_id: int, message_id: int, wish: int) -> list[Answer]:
+        key = (client_id, message_id)
+        self._fast.pop(key, None)
+        self._wishes.pop(key, None)
+        common_us = self._telemetry.streams[message_id].interval_us
+        if wish != DEFAULT:
+            if len(self._wishes) >= MAX_WISHES:
+                self._wishes.pop(next(iter(self._wishes)))
+            self._wishes[key] = wish
+        if _is_faster(wish, common_us) and len(self._fast) < MAX_FAST_STREAMS:
+            self._fast[key] = Stream(wish)
+            wish = NONE
+        return [ClientInterval(client_id, self._system_id, message_id, wish)]
+
+    def _due(self, ids: Iterable[int], time_us: int, ask: Any) -> list[Answer]:
+        found: list[Answer] = []
+        wanted = set(ids)
+        for (client_id, message_id), stream in self._fast.items():
+            if message_id in wanted and ask(stream, time_us):
+                message = self._telemetry.build(message_id, time_us)
+                if message is not None:
+                    found.append(Reply(message, client_id))
+        return found
+
+
+def _is_faster(wish_us: int, common_us: int) -> bool:
+    return wish_us > 0 and (common_us == OFF or wish_us < common_us)

@@ -1,0 +1,1 @@
+"""Missions, fences, rally points, home and the marked location."""

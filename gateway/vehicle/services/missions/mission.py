@@ -1,0 +1,258 @@
+"""The mission protocol, both directions, for missions, fences and rally points.
+
+An upload, seen from here:
+
+| state  | event                           | answer                            | next   |
+| ------ | ------------------------------- | --------------------------------- | ------ |
+| idle   | MISSION_COUNT, 0                | clear, ACK accepted               | idle   |
+| idle   | MISSION_COUNT, too many         | ACK no space                      | idle   |
+| idle   | MISSION_COUNT                   | REQUEST_INT 0                     | upload |
+| upload | the item asked for, well        | REQUEST_INT of the next           | upload |
+| upload | the last item, well             | store all, ACK accepted           | idle   |
+| upload | the item asked for, bad         | ACK with what is bad              | idle   |
+| upload | another item                    | REQUEST_INT of the one asked for  | upload |
+| upload | MISSION_COUNT, same client      | begin anew                        | upload |
+| upload | MISSION_COUNT, another client   | ACK denied                        | upload |
+| upload | MISSION_ACK (cancelled)         |                                   | idle   |
+| upload | 250 ms without the item         | REQUEST_INT again, five times     | upload |
+| upload | 250 ms more                     | ACK cancelled                     | idle   |
+| idle   | the last item once more         | ACK accepted again                | idle   |
+
+What is stored changes only when an upload is complete. A download has no state: each request is
+answered from the store.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.services.missions.mission_items import (
+    ACCEPTED,
+    FENCE,
+    MAX_ITEMS,
+    MISSION,
+    RALLY,
+    Item,
+    check_item,
+    read_item,
+    write_item,
+)
+
+ITEM_TIMEOUT_US: Final = 250_000
+MAX_RETRIES: Final = 5
+KINDS: Final = (MISSION, FENCE, RALLY)
+ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
+CHANGING: Final = frozenset(
+    {
+        "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_CLEAR_ALL",
+        "MISSION_SET_CURRENT", "MISSION_WRITE_PARTIAL_LIST",
+    }
+)  # fmt: skip
+
+Changed = Callable[[int, int], list[Answer]]
+"""Called with the kind that was stored, cleared or moved on, and the time."""
+
+
+@dataclass(slots=True)
+class _Upload:
+    request: Request
+    """The MISSION_COUNT that began it."""
+    kind: int
+    count: int
+    due_us: int
+    items: list[Item] = field(default_factory=list)
+    retries: int = 0
+
+
+class MissionService:
+    """The stored items of one vehicle."""
+
+    types = (
+        "MISSION_REQUEST_LIST", "MISSION_REQUEST_INT", "MISSION_REQUEST", "MISSION_ACK",
+        "MISSION_REQUEST_PARTIAL_LIST", *sorted(CHANGING),
+    )  # fmt: skip
+
+    def __init__(self, changed: Changed, explain: Callable[[str, int], list[Answer]]) -> None:
+        self.items: dict[int, tuple[Item, ...]] = dict.fromkeys(KINDS, ())
+        self.current = 0
+        self._changed = changed
+        self._explain = explain
+        self._upload: _Upload | None = None
+        self._finished: _Upload | None = None
+        self._handlers: dict[str, Callable[[Request, int], list[Answer]]] = {
+            "MISSION_REQUEST_LIST": self._list,
+            "MISSION_REQUEST_INT": self._send_item,
+            "MISSION_REQUEST": self._send_item,
+            "MISSION_COUNT": self._begin,
+            "MISSION_ITEM_INT": self._take_item,
+            "MISSION_ITEM": self._take_item,
+            "MISSION_CLEAR_ALL": self._clear,
+            "MISSION_SET_CURRENT": self._set_current,
+            "MISSION_ACK": self._end,
+        }
+
+    def changes_state(self, request: Request) -> bool:
+        """Tell whether the request would store, clear or move on."""
+        return request.message.get_type() in CHANGING
+
+    def refuse(self, request: Request) -> list[Answer]:
+        """Deny by MISSION_ACK; MISSION_SET_CURRENT has no negative answer of its own."""
+        if request.message.get_type() == "MISSION_SET_CURRENT":
+            return []
+        return [_ack(request, mavlink.MAV_MISSION_DENIED)]
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Answer one message."""
+        handler = self._handlers.get(request.message.get_type())
+        if handler is None:
+            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+        return handler(request, now_us)
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Ask again for an item that did not come; at last give up."""
+        upload = self._upload
+        if upload is None or now_us < upload.due_us:
+            return []
+        if upload.retries >= MAX_RETRIES:
+            self._upload = None
+            return [_ack(upload.request, mavlink.MAV_MISSION_OPERATION_CANCELLED)]
+        upload.retries += 1
+        return self._ask(upload, now_us)
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` has something to do."""
+        return self._upload.due_us if self._upload else None
+
+    def forget_client(self, client_id: int) -> None:
+        """Give up an upload whose client has gone."""
+        for upload in (self._upload, self._finished):
+            if upload is not None and upload.request.client_id == client_id:
+                self._upload = self._finished = None
+
+    def set_current(self, sequence: int, now_us: int) -> list[Answer] | None:
+        """Move on to an item; None if there is no such item."""
+        if not 0 <= sequence < len(self.items[MISSION]):
+            return None
+        self.current = sequence
+        return [Reply(self.mission_current()), *self._changed(MISSION, now_us)]
+
+    def mission_current(self) -> Any:
+        """Encode MISSION_CURRENT; nothing is executed here, so the mission is not started."""
+        count = len(self.items[MISSION])
+        state = mavlink.MISSION_STATE_NOT_STARTED if count else mavlink.MISSION_STATE_NO_MISSION
+        total = count if count else 0xFFFF
+        return mavlink.MAVLink_mission_current_message(self.current, total, state, 0)
+
+    def _list(self, request: Request, _now_us: int) -> list[Answer]:
+        kind = request.message.mission_type
+        if kind not in KINDS:
+            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+        count = mavlink.MAVLink_mission_count_message(
+            request.system_id, request.component_id, len(self.items[kind]), kind
+        )
+        return [request.reply(count)]
+
+    def _send_item(self, request: Request, _now_us: int) -> list[Answer]:
+        kind, sequence = request.message.mission_type, request.message.seq
+        if kind not in KINDS:
+            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+        if sequence >= len(self.items[kind]):
+            return [_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
+        target = (request.system_id, request.component_id)
+        current = kind == MISSION and sequence == self.current
+        item = write_item(self.items[kind][sequence], sequence, kind, target, current)
+        return [request.reply(item)]
+
+    def _begin(self, request: Request, now_us: int) -> list[Answer]:
+        kind, count = request.message.mission_type, request.message.count
+        busy = self._upload is not None and self._upload.request.client_id != request.client_id
+        if busy:
+            return [_ack(request, mavlink.MAV_MISSION_DENIED)]
+        if kind not in KINDS:
+            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+        if count > MAX_ITEMS[kind]:
+            return [_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
+        self._upload = self._finished = None
+        if count == 0:
+            return [_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
+        self._upload = _Upload(request, kind, count, now_us)
+        return self._ask(self._upload, now_us)
+
+    def _ask(self, upload: _Upload, now_us: int) -> list[Answer]:
+        upload.due_us = now_us + ITEM_TIMEOUT_US
+        request = upload.request
+        wanted = mavlink.MAVLink_mission_request_int_message(
+            request.system_id, request.component_id, len(upload.items), upload.kind
+        )
+        return [request.reply(wanted)]
+
+    def _take_item(self, request: Request, now_us: int) -> list[Answer]:
+        message = request.message
+        upload = self._upload
+        if upload is None or upload.request.client_id != request.client_id:
+            return self._stray_item(request)
+        if message.seq != len(upload.items) or message.mission_type != upload.kind:
+            return self._ask(upload, now_us)
+        item = read_item(message)
+        result = check_item(item, upload.kind)
+        if result != ACCEPTED:
+            self._upload = None
+            return [_ack(request, result)]
+        upload.items.append(item)
+        upload.retries = 0
+        if len(upload.items) < upload.count:
+            return self._ask(upload, now_us)
+        self._upload, self._finished = None, upload
+        stored = self._store(upload.kind, tuple(upload.items), now_us)
+        return [_ack(request, ACCEPTED), *stored]
+
+    def _stray_item(self, request: Request) -> list[Answer]:
+        """Acknowledge a last item that comes again because the ACK was lost; deny any other."""
+        done = self._finished
+        message = request.message
+        if (
+            done is not None
+            and done.request.client_id == request.client_id
+            and (message.seq, message.mission_type) == (done.count - 1, done.kind)
+        ):
+            return [_ack(request, ACCEPTED)]
+        return [_ack(request, mavlink.MAV_MISSION_ERROR)]
+
+    def _store(self, kind: int, items: tuple[Item, ...], now_us: int) -> list[Answer]:
+        self.items[kind] = items
+        if kind == MISSION:
+            self.current = 0
+        return self._changed(kind, now_us)
+
+    def _clear(self, request: Request, now_us: int) -> list[Answer]:
+        kind = request.message.mission_type
+        if kind not in (*KINDS, ALL):
+            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+        self._upload = self._finished = None
+        answers: list[Answer] = [_ack(request, ACCEPTED)]
+        for each in KINDS if kind == ALL else (kind,):
+            answers += self._store(each, (), now_us)
+        return answers
+
+    def _set_current(self, request: Request, now_us: int) -> list[Answer]:
+        answers = self.set_current(request.message.seq, now_us)
+        if answers is None:
+            return self._explain(f"No mission item {request.message.seq}", now_us)
+        return answers
+
+    def _end(self, request: Request, _now_us: int) -> list[Answer]:
+        """Take a client's MISSION_ACK: the end of its download, or of its own upload."""
+        upload = self._upload
+        if upload is not None and upload.request.client_id == request.client_id:
+            self._upload = None
+        return []
+
+
+def _ack(request: Request, result: int) -> Reply:
+    kind = getattr(request.message, "mission_type", MISSION)
+    return request.reply(
+        mavlink.MAVLink_mission_ack_message(request.system_id, request.component_id, result, kind)
+    )

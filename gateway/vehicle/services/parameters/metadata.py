@@ -1,0 +1,90 @@
+"""Component metadata: what each parameter means, its unit and range, as JSON for ground stations.
+
+References
+----------
+.. [1] https://mavlink.io/en/services/component_metadata.html
+"""
+
+import json
+from typing import Any, Final
+
+from gateway import __version__
+from gateway.vehicle.dialect import ComponentMetadata
+from gateway.vehicle.services.ftp import crc32
+from gateway.vehicle.services.parameters.parameters import Parameter, ParameterTable
+from gateway.vehicle.telemetry.messages import boot_ms
+
+GENERAL_PATH: Final = "/general.json"
+PARAMETER_PATH: Final = "/parameter.json"
+TYPE_PARAMETER: Final = 1
+"""COMP_METADATA_TYPE_PARAMETER."""
+
+
+class Metadata:
+    """The metadata files of one vehicle."""
+
+    def __init__(self, table: ParameterTable) -> None:
+        described = [_describe(parameter) for parameter in table.parameters]
+        self._parameters = _json({"version": 1, "parameters": described})
+        self._general = _json(
+            {
+                "version": 1,
+                "vendorName": "mavgate",
+                "modelName": "mavgate tracker",
+                "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
+                "metadataTypes": [
+                    {
+                        "type": TYPE_PARAMETER,
+                        "uri": f"mftp://{PARAMETER_PATH}",
+                        "fileCrc": crc32(self._parameters),
+                    }
+                ],
+            }
+        )
+
+    def general(self) -> bytes:
+        """Give the file that names the others."""
+        return self._general
+
+    def parameters(self) -> bytes:
+        """Give the parameters' file."""
+        return self._parameters
+
+    def announcement(self, now_us: int) -> Any:
+        """Encode COMPONENT_METADATA."""
+        uri = f"mftp://{GENERAL_PATH}".encode()
+        return ComponentMetadata(boot_ms(now_us), crc32(self._general), uri)
+
+
+def _describe(parameter: Parameter) -> dict[str, Any]:
+    field = parameter.field
+    group = parameter.path[-2] if len(parameter.path) > 1 else parameter.section
+    described: dict[str, Any] = {
+        "name": parameter.name,
+        "type": "Float",
+        "shortDesc": field.meaning.split(". ")[0].rstrip("."),
+        "longDesc": f"{field.meaning} ({'.'.join((parameter.section, *parameter.path))})",
+        "units": field.unit,
+        "default": parameter.to_number(field.default),
+        "group": group,
+        "category": parameter.section,
+    }
+    low, high = field.bounds
+    if field.choices:
+        described["values"] = [
+            {"value": number, "description": choice} for number, choice in enumerate(field.choices)
+        ]
+    elif isinstance(field.default, bool):
+        described["values"] = [
+            {"value": 0, "description": "off"},
+            {"value": 1, "description": "on"},
+        ]
+    else:
+        described |= {"min": low} if low is not None else {}
+        described |= {"max": high} if high is not None else {}
+        described["decimalPlaces"] = 0 if isinstance(field.default, int) else 4
+    return described
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=False).encode()

@@ -1,0 +1,210 @@
+"""The parameter protocol: list, read, set, and every answer that goes missing asked for again.
+
+The list goes to the one who asked, a few at a time, so that a client's receive buffer and a slow
+link survive it; a change goes to all, so that every ground station's table stays true.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final, Protocol
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.settings import Settings
+from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange
+from gateway.vehicle.services.commands import ACCEPTED, UNSUPPORTED, Command, Outcome, whole
+from gateway.vehicle.services.parameters.parameters import Parameter, ParameterTable, decode_value
+
+BATCH: Final = 10
+BATCH_INTERVAL_US: Final = 10_000
+MAX_LISTENERS: Final = 16
+BY_NAME: Final = -1
+
+WRITE: Final = 1
+RESET: Final = 2
+RESET_CALIBRATION: Final = 3
+"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
+CALIBRATION: Final = "calibration"
+"""The section that holds the sensors' errors."""
+
+REAL32: Final = mavlink.MAV_PARAM_TYPE_REAL32
+UNKNOWN: Final = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+BAD_VALUE: Final = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
+FORBIDDEN: Final = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
+
+
+class OwnSection(Protocol):
+    """Parameters that are no settings: the vehicle itself carries out what is set."""
+
+    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
+        """Carry out the change of one of them; ValueError refuses it."""
+        ...
+
+    def store(self) -> list[Answer]:
+        """Let the present values outlive the gateway."""
+        ...
+
+
+class ParameterService:
+    """Parameters of one vehicle.
+
+    Parameters
+    ----------
+    vehicle_id : int
+        Id in the radio payloads.
+    table : ParameterTable
+        All of them.
+    own : mapping of str to OwnSection, optional
+        Sections of the table that are no settings. They have no defaults to go back to.
+    """
+
+    types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
+
+    def __init__(
+        self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection] | None = None
+    ) -> None:
+        self.table = table
+        self._own = own or {}
+        self._vehicle_id = vehicle_id
+        self._lists: dict[int, int] = {}
+        self._due_us: int | None = None
+
+    def changes_state(self, request: Request) -> bool:
+        """Tell whether the request is to set one."""
+        return bool(request.message.get_type() == "PARAM_SET")
+
+    def refuse(self, request: Request) -> list[Answer]:
+        """Tell the value that stays."""
+        parameter = self._named(request.message.param_id)
+        if parameter is None:
+            return [self._error(request, UNKNOWN)]
+        return [self._error(request, FORBIDDEN), request.reply(self._value(parameter))]
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Answer one request."""
+        kind = request.message.get_type()
+        if kind == "PARAM_SET":
+            return self._set(request, now_us)
+        if kind == "PARAM_REQUEST_READ":
+            return self._read(request)
+        if request.client_id in self._lists or len(self._lists) < MAX_LISTENERS:
+            self._lists[request.client_id] = 0
+            self._due_us = now_us
+        return self.poll(now_us)
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Send the next few of every list that is under way."""
+        if self._due_us is None or now_us < self._due_us:
+            return []
+        answers: list[Answer] = []
+        for client_id, start in list(self._lists.items()):
+            batch = self.table.parameters[start : start + BATCH]
+            answers += [Reply(self._value(parameter), client_id) for parameter in batch]
+            self._lists[client_id] = start + BATCH
+            if start + BATCH >= len(self.table.parameters):
+                del self._lists[client_id]
+        self._due_us = now_us + BATCH_INTERVAL_US if self._lists else None
+        return answers
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` has something to send."""
+        return self._due_us
+
+    def forget_client(self, client_id: int) -> None:
+        """Stop a list whose client has gone."""
+        self._lists.pop(client_id, None)
+
+    def store(self, command: Command, _now_us: int) -> Outcome:
+        """Carry out MAV_CMD_PREFLIGHT_STORAGE: write, or go back to the defaults.
+
+        The calibration of the sensors is no tuning: only its own reset touches it.
+        """
+        asked = whole(command.params[0])
+        sections = {k: v for k, v in self.table.sections.items() if k not in self._own}
+        if asked == WRITE:
+            own = [answer for section in self._own.values() for answer in section.store()]
+            return ACCEPTED, [SaveSettings(self._vehicle_id, tuple(sections.items())), *own]
+        if asked not in (RESET, RESET_CALIBRATION):
+            return UNSUPPORTED, []
+        before = self._numbers()
+        answers: list[Answer] = []
+        for key in sections:
+            if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
+                fresh = self.table.reset(key)
+                answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
+        return ACCEPTED, answers + self._told_since(before)
+
+    def told(self, parameter: Parameter) -> Reply:
+        """Tell all the present value of a parameter."""
+        return Reply(self._value(parameter))
+
+    def take(self, section: str, settings: Any) -> list[Answer]:
+        """Take over a section that was changed elsewhere, and tell what differs."""
+        before = self._numbers()
+        self.table.sections[section] = settings
+        return self._told_since(before)
+
+    def _numbers(self) -> list[float]:
+        return [self.table.number(parameter) for parameter in self.table.parameters]
+
+    def _told_since(self, before: list[float]) -> list[Answer]:
+        changed = zip(self.table.parameters, before, self._numbers(), strict=True)
+        return [self.told(parameter) for parameter, old, new in changed if old != new]
+
+    def _set(self, request: Request, now_us: int) -> list[Answer]:
+        message = request.message
+        parameter = self._named(message.param_id)
+        if parameter is None:
+            return [self._error(request, UNKNOWN)]
+        number = decode_value(message.param_value, message.param_type)
+        before = self.table.sections[parameter.section]
+        try:
+            settings = self.table.change(parameter, number)
+            answers = self._carry_out(parameter, settings, now_us)
+        except ValueError:
+            self.table.sections[parameter.section] = before
+            # The error first: a client that sees only the old value would try again.
+            return [self._error(request, BAD_VALUE), self.told(parameter)]
+        return [*answers, self.told(parameter)]
+
+    def _carry_out(self, parameter: Parameter, settings: Settings, now_us: int) -> list[Answer]:
+        path = ".".join(parameter.path)
+        own = self._own.get(parameter.section)
+        if own is not None:
+            return own.change(settings, path, now_us)
+        return [SettingsChange(self._vehicle_id, parameter.section, settings, path)]
+
+    def _read(self, request: Request) -> list[Answer]:
+        index = request.message.param_index
+        if index == BY_NAME:
+            parameter = self._named(request.message.param_id)
+        else:
+            known = 0 <= index < len(self.table.parameters)
+            parameter = self.table.parameters[index] if known else None
+        if parameter is None:
+            return [self._error(request, UNKNOWN)]
+        return [request.reply(self._value(parameter))]
+
+    def _named(self, name: str) -> Parameter | None:
+        index = self.table.index.get(name)
+        return None if index is None else self.table.parameters[index]
+
+    def _value(self, parameter: Parameter) -> Any:
+        return mavlink.MAVLink_param_value_message(
+            parameter.name.encode(),
+            self.table.number(parameter),
+            REAL32,
+            len(self.table.parameters),
+            self.table.index[parameter.name],
+        )
+
+    def _error(self, request: Request, error: int) -> Reply:
+        message = request.message
+        return request.reply(
+            mavlink.MAVLink_param_error_message(
+                request.system_id,
+                request.component_id,
+                message.param_id.encode("ascii", "replace")[:16],
+                getattr(message, "param_index", BY_NAME),
+                error,
+            )
+        )

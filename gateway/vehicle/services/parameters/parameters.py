@@ -1,0 +1,246 @@
+"""The settings as a table of MAVLink parameters: names, numbers, ranges, and one change at a time.
+
+Every parameter travels as MAV_PARAM_TYPE_REAL32, switches and choices too (0, 1, 2 ...): a float
+is the only encoding on which the clients agree, since MAVProxy undoes the byte-wise encoding of
+integers for PX4 alone. An integer that a client encodes byte-wise is understood all the same.
+"""
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Final
+
+import msgspec
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.geometry.rotation import Matrix3, euler_deg_from_matrix, matrix_from_euler_deg
+from gateway.records import Vec3
+from gateway.settings import Field, Settings, fields_of
+from gateway.vehicle.services.parameters.parameter_names import parameter_name, without_unit
+
+AXES: Final = ("X", "Y", "Z")
+ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
+"""The angles of a rotation: in names, in texts, and how far each goes to either side."""
+
+RotationAngles = tuple[
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+    Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+]
+
+INTEGER_CODES: Final = {
+    mavlink.MAV_PARAM_TYPE_UINT8: "<Bxxx",
+    mavlink.MAV_PARAM_TYPE_INT8: "<bxxx",
+    mavlink.MAV_PARAM_TYPE_UINT16: "<Hxx",
+    mavlink.MAV_PARAM_TYPE_INT16: "<hxx",
+    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
+    mavlink.MAV_PARAM_TYPE_INT32: "<i",
+}
+
+
+def decode_value(value: float, kind: int) -> float:
+    """Undo the byte-wise encoding of a parameter's value.
+
+    Parameters
+    ----------
+    value : float
+        The float of the message.
+    kind : int
+        MAV_PARAM_TYPE.
+
+    Returns
+    -------
+    float
+        The shortest decimal that is the same 32-bit float: 0.1, not 0.10000000149.
+    """
+    code = INTEGER_CODES.get(kind)
+    if code is not None:
+        return float(struct.unpack(code, struct.pack("<f", value))[0])
+    return float(str(np.float32(value)))
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of the settings."""
+
+    name: str
+    section: str
+    """Key of the tree of settings that holds it."""
+    path: tuple[str, ...]
+    """Keys within that tree."""
+    axis: int | None
+    """Component of a vector; of a rotation: roll, pitch or yaw."""
+    field: Field
+    """The setting; of a rotation with its angles in place of its matrix."""
+
+    def to_number(self, value: Any) -> float:
+        """Turn the setting's value into the parameter's."""
+        if self.field.choices:
+            return float(self.field.choices.index(value))
+        return float(value if self.axis is None else value[self.axis])
+
+    def from_number(self, number: float, old: Any) -> Any:
+        """Turn a parameter's value into the setting's.
+
+        Raises
+        ------
+        ValueError
+            If the number is none, or out of what is allowed; the text says what is.
+        """
+        if not math.isfinite(number):
+            raise ValueError("not a number")
+        value: Any = number
+        if self.field.choices:
+            value = self._choice(number)
+        elif self.axis is not None:
+            value = tuple(number if n == self.axis else v for n, v in enumerate(old))
+        elif isinstance(self.field.default, bool):
+            value = bool(number)
+        elif isinstance(self.field.default, int):
+            value = round(number)
+        try:
+            return msgspec.convert(value, self.field.type)
+        except msgspec.ValidationError as error:
+            raise ValueError(str(error)) from error
+
+    def _choice(self, number: float) -> str:
+        choices = self.field.choices
+        if round(number) not in range(len(choices)):
+            allowed = ", ".join(f"{n} {choice}" for n, choice in enumerate(choices))
+            raise ValueError(f"allowed: {allowed}")
+        return choices[round(number)]
+
+
+class ParameterTable:
+    """All parameters of one vehicle, in an order that never changes.
+
+    Parameters
+    ----------
+    sections : mapping of str to Settings
+        The trees of settings that may be changed live, by key.
+
+    Raises
+    ------
+    ValueError
+        If two settings would share a name.
+    """
+
+    def __init__(self, sections: Mapping[str, Settings]) -> None:
+        self.sections = dict(sections)
+        self.parameters = tuple(
+            sorted(
+                (p for key, tree in sections.items() for p in _walk(key, tree)),
+                key=lambda parameter: parameter.name,
+            )
+        )
+        self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
+        # As they were set: a matrix alone would tell others, where the pitch is a right angle or
+        # only some of the three have been set yet.
+        self.index = {p.name: n for n, p in enumerate(self.parameters)}
+        if len(self.index) < len(self.parameters):
+            names = [p.name for p in self.parameters]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise ValueError(f"parameter names used twice: {', '.join(twice)}")
+
+    def number(self, parameter: Parameter) -> float:
+        """Read a parameter."""
+        return parameter.to_number(self._value(parameter))
+
+    def change(self, parameter: Parameter, number: float) -> Settings:
+        """Write a parameter.
+
+        Returns
+        -------
+        Settings
+            The whole tree with the change in it.
+
+        Raises
+        ------
+        ValueError
+            If the value is not allowed; nothing changes then.
+        """
+        value = parameter.from_number(number, self._value(parameter))
+        if parameter.field.is_rotation:
+            angles, value = value, matrix_from_euler_deg(value)
+            self._angles[(parameter.section, *parameter.path)] = value, angles
+        tree = _replaced(self.sections[parameter.section], parameter.path, value)
+        self.sections[parameter.section] = tree
+        return tree
+
+    def reset(self, section: str) -> Settings:
+        """Give every parameter of a tree its default; what is no parameter stays as it is.
+
+        Returns
+        -------
+        Settings
+            The whole tree.
+        """
+        for parameter in self.parameters:
+            if parameter.section == section:
+                self.change(parameter, parameter.to_number(parameter.field.default))
+        return self.sections[section]
+
+    def _value(self, parameter: Parameter) -> Any:
+        value: Any = self.sections[parameter.section]
+        for key in parameter.path:
+            value = getattr(value, key)
+        if not parameter.field.is_rotation:
+            return value
+        matrix, angles = self._angles.get((parameter.section, *parameter.path), (None, None))
+        return angles if matrix == value else euler_deg_from_matrix(value)
+
+
+def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
+    fields = fields_of(type(tree))
+    bare_keys = Counter(without_unit(field.name) for field in fields)
+    for field in fields:
+        inner = (*path, field.name)
+        if field.section is not None:
+            yield from _walk(section, getattr(tree, field.name), inner)
+            continue
+        group = path[-1] if path else section
+        default = field.default
+        bare = without_unit(field.name)
+        key = bare if bare_keys[bare] == 1 else field.name
+        if field.choices or isinstance(default, bool | int | float):
+            yield Parameter(parameter_name(group, key), section, inner, None, field)
+        elif field.is_rotation:
+            for axis, (letters, _, _) in enumerate(ANGLES):
+                name = parameter_name(group, key, letters)
+                yield Parameter(name, section, inner, axis, _angle_field(field, axis))
+        elif _is_vector(default):
+            for axis, letter in enumerate(AXES):
+                name = parameter_name(group, key, letter)
+                yield Parameter(name, section, inner, axis, field)
+
+
+def _angle_field(field: Field, axis: int) -> Field:
+    """Describe one angle of a rotation."""
+    what = field.meaning.partition(". ")[0]
+    _, name, limit = ANGLES[axis]
+    return replace(
+        field,
+        type=RotationAngles,
+        default=euler_deg_from_matrix(field.default),
+        meaning=f"{name} of the {what[0].lower()}{what[1:]}. Yaw is turned first, then pitch, then "
+        "roll; a board that lies face up with its x arrow to the nose has a roll of 180",
+        unit="deg",
+        bounds=(-limit, limit),
+    )
+
+
+def _is_vector(value: Any) -> bool:
+    return (
+        isinstance(value, tuple)
+        and len(value) == len(AXES)
+        and all(isinstance(item, float) for item in value)
+    )
+
+
+def _replaced(tree: Settings, path: tuple[str, ...], value: Any) -> Settings:
+    key, *rest = path
+    inner = _replaced(getattr(tree, key), tuple(rest), value) if rest else value
+    return msgspec.structs.replace(tree, **{key: inner})

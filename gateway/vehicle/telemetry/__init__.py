@@ -1,0 +1,1 @@
+"""What the vehicle sends without being asked."""

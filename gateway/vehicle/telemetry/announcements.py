@@ -1,0 +1,98 @@
+"""The events of one aircraft, as texts: link, nodes, GPS and what the estimator says of itself."""
+
+from typing import Any, Final
+
+from gateway.records import LinkReport, NavFlags
+from gateway.vehicle.telemetry.events import CRITICAL, INFO, NOTICE, WARNING, Announcer, Told
+from gateway.vehicle.telemetry.health import Health
+
+FLAG_TEXTS: Final = (
+    (NavFlags.ATTITUDE_VALID, Told(INFO, "Attitude valid"), Told(WARNING, "Attitude not valid")),
+    (NavFlags.HEADING_VALID, Told(INFO, "Heading valid"), Told(WARNING, "Heading not valid")),
+    (
+        NavFlags.DEAD_RECKONING,
+        Told(WARNING, "Position is dead-reckoned"),
+        Told(INFO, "Position follows GPS again"),
+    ),
+    (NavFlags.GPS_REJECTED, Told(WARNING, "GPS fixes rejected"), Told(INFO, "GPS accepted again")),
+    (
+        NavFlags.MAG_DISTURBED,
+        Told(WARNING, "Magnetic field disturbed"),
+        Told(INFO, "Magnetic field normal again"),
+    ),
+    (NavFlags.SENSOR_FAULT, Told(CRITICAL, "Sensor fault"), Told(NOTICE, "Sensors well again")),
+    (NavFlags.DEGRADED, Told(WARNING, "Estimator degraded"), Told(INFO, "Estimator well again")),
+)
+"""A flag of the estimator, what is told when it rises, and what when it falls."""
+
+
+class Announcements:
+    """What is told of one aircraft."""
+
+    def __init__(self, health: Health) -> None:
+        self._health = health
+        self._announcer = Announcer()
+        self._flags = NavFlags(0)
+        self._restarts: dict[int, int] = {}
+
+    def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
+        """Tell the estimator's changes."""
+        if flags == self._flags:
+            return []
+        changed, self._flags = flags ^ self._flags, flags
+        found = []
+        for flag, raised, fallen in FLAG_TEXTS:
+            if changed & flag:
+                text = raised if flags & flag else fallen
+                found += self._announcer.track(
+                    str(flag.name), bool(flags & flag), text, now_us, initially=False
+                )
+        return found
+
+    def on_fix(self, now_us: int) -> list[Any]:
+        """Tell whether GPS fixes come."""
+        fixed = self._health.has_fix(now_us)
+        text = Told(NOTICE, "GPS fix") if fixed else Told(WARNING, "GPS fix lost")
+        return self._announcer.track("GPS", fixed, text, now_us, initially=False)
+
+    def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
+        """Tell the receiver's and the nodes' coming and going."""
+        text = Told(CRITICAL, f"Receiver lost: {report.port}")
+        if report.connected:
+            text = Told(NOTICE, f"Receiver connected: {report.port}")
+        found = self._announcer.track("link", report.connected, text, now_us)
+        if not report.connected:
+            # Without the receiver every node is silent; that need not be said.
+            return found
+        silent = self._health.silent_nodes(now_us)
+        for node in sorted(self._health.known_nodes()):
+            name = self._health.node_name(node)
+            text = Told(NOTICE, f"{name} is back")
+            if node in silent:
+                text = Told(CRITICAL, f"{name} silent")
+            found += self._announcer.track(
+                f"node {node}", node not in silent, text, now_us, initially=True
+            )
+        return found + self._on_restarts(now_us)
+
+    def say(self, text: Told, now_us: int) -> list[Any]:
+        """Tell a single event."""
+        return self._announcer.say(text, now_us)
+
+    def poll(self, now_us: int) -> list[Any]:
+        """Tell what changed while its topic was held."""
+        return self.on_fix(now_us) + self._announcer.poll(now_us)
+
+    def next_due_us(self) -> int | None:
+        """Tell when `poll` has something to tell."""
+        return self._announcer.next_due_us()
+
+    def _on_restarts(self, now_us: int) -> list[Any]:
+        found = []
+        for node, restarts in sorted(self._health.restarts().items()):
+            if restarts > self._restarts.get(node, restarts):
+                found += self.say(
+                    Told(WARNING, f"{self._health.node_name(node)} restarted"), now_us
+                )
+            self._restarts[node] = restarts
+        return found

@@ -1,0 +1,219 @@
+"""Which sensors live and hold, as SYS_STATUS, RADIO_STATUS and texts tell it."""
+
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import (
+    BaroSample,
+    GpsFix,
+    ImuFlags,
+    ImuSample,
+    LinkReport,
+    NavFlags,
+    NavState,
+    NodeLink,
+    NodeStatus,
+)
+from gateway.units import US_PER_S
+from gateway.vehicle.home import is_3d
+from gateway.vehicle.telemetry import fields
+
+GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+ACCEL: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+MAG: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+PRESSURE: Final = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+GPS: Final = mavlink.MAV_SYS_STATUS_SENSOR_GPS
+AHRS: Final = mavlink.MAV_SYS_STATUS_AHRS
+LOGGING: Final = mavlink.MAV_SYS_STATUS_LOGGING
+GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
+PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
+
+SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
+NODE_IMU: Final = 1 << 0
+NODE_GPS: Final = 1 << 3
+NODE_SENSORS: Final = (
+    (NODE_IMU, GYRO | ACCEL),
+    (1 << 1, MAG),
+    (1 << 2, PRESSURE),
+    (NODE_GPS, GPS),
+)
+"""Bits of NodeStatus' masks, and the sensors they stand for."""
+
+BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
+
+
+class Health:
+    """What was heard last of every sensor of one aircraft, and whether it is well."""
+
+    def __init__(self, vehicle_id: int, silent_s: float) -> None:
+        self.vehicle_id = vehicle_id
+        self.silent_us = round(silent_s * US_PER_S)
+        self.recording = False
+        self._seen_us: dict[int, int] = {}
+        self._faulty: dict[int, int] = {}
+        self._roles: dict[int, str] = {}
+        self._absent = 0
+        self._imu_faults = 0
+        self._fix: GpsFix | None = None
+        self._nav_flags = NavFlags(0)
+        self._load_permille = 0
+        self._nodes: tuple[NodeLink, ...] = ()
+        self._noise_percent: int | None = None
+        self._received = 0
+        self._lost = 0
+        self._drop_rate = 0.0
+
+    def on_state(self, state: NavState, sample: ImuSample) -> None:
+        """Note an IMU sample and what the estimator made of it."""
+        self._seen_us[GYRO] = self._seen_us[ACCEL] = sample.time_us
+        if sample.mag_b_ut is not None:
+            self._seen_us[MAG] = sample.time_us
+        self._nav_flags = state.flags
+        flags = sample.flags
+        self._imu_faults = GYRO | ACCEL if flags & ImuFlags.SELF_TEST_FAILED else 0
+        self._absent = 0
+        if flags & ImuFlags.MAG_ABSENT:
+            self._absent |= MAG
+        if flags & ImuFlags.BARO_ABSENT:
+            self._absent |= PRESSURE
+
+    def on_baro(self, sample: BaroSample) -> None:
+        """Note a barometer sample."""
+        self._seen_us[PRESSURE] = sample.time_us
+
+    def on_gps(self, fix: GpsFix) -> None:
+        """Note a GPS fix, good or not."""
+        self._seen_us[GPS] = fix.time_us
+        self._fix = fix
+
+    def on_node_status(self, status: NodeStatus) -> None:
+        """Note what a node tells of its own sensors."""
+        failed = 0
+        for bit, sensors in NODE_SENSORS:
+            if status.sensors_failed & status.sensors_present & bit:
+                failed |= sensors
+        self._faulty[status.node.node_id] = failed
+        self._roles[status.node.node_id] = _role(status.sensors_present)
+        if status.sensors_present & NODE_IMU:
+            # The share of a sample's time that the node's longest loop took.
+            self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
+
+    def on_link(self, report: LinkReport) -> None:
+        """Note the state of the radio links to this aircraft's nodes."""
+        self._nodes = tuple(
+            link for link in report.nodes if link.node.vehicle_id == self.vehicle_id
+        )
+        received = sum(link.received for link in self._nodes)
+        lost = sum(link.lost for link in self._nodes)
+        fresh = max(0, received - self._received) + max(0, lost - self._lost)
+        self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
+        self._received, self._lost = received, lost
+        self._noise_percent = report.receiver.noise_percent if report.receiver else None
+
+    def is_alive(self, sensor: int, now_us: int) -> bool:
+        """Tell whether a sensor was heard of lately."""
+        seen = self._seen_us.get(sensor)
+        return seen is not None and now_us - seen <= self.silent_us
+
+    def has_fix(self, now_us: int) -> bool:
+        """Tell whether the newest fix is three-dimensional and not old."""
+        return self._fix is not None and is_3d(self._fix) and self.is_alive(GPS, now_us)
+
+    def sensors(self, now_us: int) -> tuple[int, int, int]:
+        """Compute the bit masks of SYS_STATUS.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        tuple of 3 ints
+            Present (ever heard of, and not said to be absent), enabled, healthy.
+        """
+        present = 0
+        healthy = 0
+        faulty = self._imu_faults
+        for failed in self._faulty.values():
+            faulty |= failed
+        for sensor in SENSORS:
+            if sensor not in self._seen_us or self._absent & sensor:
+                continue
+            present |= sensor
+            if self.is_alive(sensor, now_us) and not faulty & sensor:
+                healthy |= sensor
+        if not self.has_fix(now_us):
+            healthy &= ~GPS
+        if present & GYRO:
+            present |= AHRS
+            if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID:
+                healthy |= 0 if self._nav_flags & BAD_FOR_AHRS else AHRS
+        present |= LOGGING | PREARM
+        # There is no fence, so none is breached; MAVProxy cries breach without this bit.
+        healthy |= GEOFENCE
+        enabled = present if self.recording else present & ~LOGGING
+        healthy |= LOGGING if self.recording else 0
+        needed = GYRO | ACCEL | GPS | AHRS | present & MAG
+        if healthy & needed == needed:
+            healthy |= PREARM
+        return present, enabled, healthy
+
+    def sys_status(self, now_us: int) -> Any:
+        """Encode SYS_STATUS; the battery, which nothing measures, is absent."""
+        present, enabled, healthy = self.sensors(now_us)
+        return mavlink.MAVLink_sys_status_message(
+            present,
+            enabled,
+            healthy,
+            load=min(1000, self._load_permille),
+            voltage_battery=fields.UINT16_MAX,
+            current_battery=-1,
+            battery_remaining=-1,
+            drop_rate_comm=round(self._drop_rate * 10_000.0),
+            errors_comm=fields.uint16(self._lost),
+            errors_count1=0,
+            errors_count2=0,
+            errors_count3=0,
+            errors_count4=0,
+        )
+
+    def radio_status(self) -> Any:
+        """Encode RADIO_STATUS: the nRF24 measures no signal strength, only a busy channel."""
+        noise = fields.UINT8_MAX if self._noise_percent is None else self._noise_percent
+        return mavlink.MAVLink_radio_status_message(
+            rssi=fields.UINT8_MAX,
+            remrssi=fields.UINT8_MAX,
+            txbuf=100,
+            noise=noise,
+            remnoise=fields.UINT8_MAX,
+            rxerrors=fields.uint16(self._lost, unknown=0),
+            fixed=0,
+        )
+
+    def silent_nodes(self, now_us: int) -> frozenset[int]:
+        """Name the nodes that were heard once and are silent now."""
+        return frozenset(
+            link.node.node_id
+            for link in self._nodes
+            if link.received and now_us - link.last_time_us > self.silent_us
+        )
+
+    def node_name(self, node_id: int) -> str:
+        """Name a node by what it carries, as far as it has told."""
+        return f"{self._roles.get(node_id, 'Node')} {node_id}"
+
+    def restarts(self) -> dict[int, int]:
+        """Tell how often each node has started anew."""
+        return {link.node.node_id: link.restarts for link in self._nodes}
+
+    def known_nodes(self) -> frozenset[int]:
+        """Name the nodes that were ever heard."""
+        return frozenset(link.node.node_id for link in self._nodes if link.received)
+
+
+def _role(sensors_present: int) -> str:
+    if sensors_present & NODE_IMU:
+        return "IMU node"
+    return "GPS node" if sensors_present & NODE_GPS else "Node"

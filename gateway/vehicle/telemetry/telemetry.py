@@ -1,0 +1,257 @@
+"""What the vehicle tells without being asked, each message at its own rate.
+
+Every message has one builder, which works from the newest records; the streams and the answer to
+a request for a single message share it.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import msgspec
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState
+from gateway.vehicle.home import Home, is_good_enough, place_of
+from gateway.vehicle.telemetry import messages
+from gateway.vehicle.telemetry.health import GPS, GYRO, Health
+from gateway.vehicle.telemetry.motion import IN_AIR, Motion
+from gateway.vehicle.telemetry.streams import Stream, interval_us
+from gateway.vehicle.vehicle_settings import VehicleSettings
+
+STATE_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+)
+"""Carried by IMU samples; the quaternion first, for its latency is the one that is seen."""
+
+TIMED_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
+    mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
+)
+
+HEARTBEAT_HZ: Final = 1.0
+"""Clients take a vehicle for lost by the absence of heartbeats at this very rate."""
+
+Builder = Callable[[int], Any]
+
+
+class Telemetry:
+    """The newest records of one aircraft, and the messages they become."""
+
+    def __init__(self, settings: VehicleSettings, health: Health) -> None:
+        self.settings = settings
+        self.health = health
+        self.motion = Motion(settings.takeoff_speed_mps, settings.takeoff_height_m)
+        self.home: Home | None = None
+        self.calibrating = False
+        self.state: NavState | None = None
+        self._reference_alt_m = NAN
+        self._ground_alt_m = NAN
+        """Height of the first good fix, whoever sets home."""
+        self._sample: ImuSample | None = None
+        self._baro: BaroSample | None = None
+        self._fix: GpsFix | None = None
+        self._mag_b_ut = UNKNOWN_VEC3
+        self._updated = 0
+        self._unix_offset_us: int | None = None
+        self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
+        self._builders: dict[int, Builder] = {
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_state(
+                messages.attitude_quaternion
+            ),
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._of_state(messages.attitude),
+            mavlink.MAVLINK_MSG_ID_VFR_HUD: self._of_state(messages.vfr_hud),
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._of_state(messages.estimator_status),
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
+            mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw,
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._scaled_pressure,
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: health.sys_status,
+            mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
+            mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
+            mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
+        }
+
+    def add(self, message_id: int, builder: Builder) -> None:
+        """Let another service build a message that is sent by time."""
+        self._builders[message_id] = builder
+
+    def knows(self, message_id: int) -> bool:
+        """Tell whether the vehicle ever sends a message."""
+        return message_id in self._builders
+
+    def reconfigure(self, settings: VehicleSettings) -> None:
+        """Take on changed settings; only the rates that differ begin anew."""
+        self.settings = settings
+        self.motion.takeoff_speed_mps = settings.takeoff_speed_mps
+        self.motion.takeoff_height_m = settings.takeoff_height_m
+        for message_id, us in _intervals(settings).items():
+            if self.streams[message_id].interval_us != us:
+                self.streams[message_id].change(us)
+
+    @property
+    def armed(self) -> bool:
+        """Whether the armed bit is set, by the operator's rule."""
+        rule = self.settings.armed_when
+        flying = self.motion.landed_state == IN_AIR and rule.startswith("flying")
+        recording = self.health.recording and rule.endswith("recording")
+        return flying or recording or rule == "always"
+
+    def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
+        """Take in a navigation state and its IMU sample, and tell what is due."""
+        self.state, self._sample = state, sample
+        self._updated |= messages.ACCEL_UPDATED | messages.GYRO_UPDATED
+        self._updated |= messages.TEMPERATURE_UPDATED
+        if sample.mag_b_ut is not None:
+            self._mag_b_ut = sample.mag_b_ut
+            self._updated |= messages.MAG_UPDATED
+        if self._reference_alt_m != self._reference_alt_m and messages.has_position(state):
+            self._reference_alt_m = state.alt_amsl_m
+        self.motion.update(state, self._ground_alt_m)
+        due = (m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us))
+        return self._build_all(due, state.time_us)
+
+    def on_baro(self, sample: BaroSample) -> list[Any]:
+        """Take in a barometer sample, and tell it if due."""
+        self._baro = sample
+        self._updated |= messages.PRESSURE_UPDATED
+        stream = self.streams[mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE]
+        return [messages.scaled_pressure(sample)] if stream.offer(sample.time_us) else []
+
+    def on_gps(self, fix: GpsFix) -> list[Any]:
+        """Take in a GPS fix, tell it if due, and set home by the first good one."""
+        self._fix = fix
+        if fix.utc_us is not None:
+            self._unix_offset_us = fix.utc_us - fix.time_us
+        stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
+        found = [messages.gps_raw_int(fix)] if stream.offer(fix.time_us) else []
+        wanted = self.home is None or math.isnan(self._ground_alt_m)
+        limits = self.settings
+        if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
+            self._ground_alt_m = fix.alt_amsl_m
+            if self.home is None:
+                found += self.set_home(Home(place_of(fix), fix.time_us))
+        return found
+
+    def set_home(self, home: Home) -> list[Any]:
+        """Take on a home, and tell it at once."""
+        self.home = home
+        self._reference_alt_m = home.place.alt_amsl_m
+        return [messages.home_position(home)]
+
+    def forget_home(self) -> None:
+        """Let the next good fix set home; heights stay relative to the old one until then."""
+        self.home = None
+
+    def poll(self, now_us: int) -> list[Any]:
+        """Tell what is due by time."""
+        due = [m for m in TIMED_MESSAGES if self.streams[m].tick(now_us)]
+        found = self._build_all(due, now_us)
+        silent = not self.health.is_alive(GPS, now_us)
+        wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
+        if silent and wanted and mavlink.MAVLINK_MSG_ID_HEARTBEAT in due:
+            # Nothing else carries GPS_RAW_INT while the node is silent.
+            found.append(messages.gps_absent(now_us))
+        return found
+
+    def next_due_us(self) -> int:
+        """Tell when `poll` has something to tell; the heartbeat never stops."""
+        due = (self.streams[m].due_us for m in TIMED_MESSAGES if self.streams[m].interval_us > 0)
+        return min(0 if time_us is None else time_us for time_us in due)
+
+    def build(self, message_id: int, now_us: int) -> Any:
+        """Build one message from the newest records.
+
+        Returns
+        -------
+        MAVLink_message or None
+            None if the vehicle never sends it, or has nothing to send in it yet.
+        """
+        builder = self._builders.get(message_id)
+        return builder(now_us) if builder else None
+
+    def _build_all(self, ids: Iterable[int], now_us: int) -> list[Any]:
+        built = (self.build(message_id, now_us) for message_id in ids)
+        return [message for message in built if message is not None]
+
+    def _of_state(self, build: Callable[[NavState], Any]) -> Builder:
+        return lambda _: None if self.state is None else build(self.state)
+
+    def _global_position(self, _now_us: int) -> Any:
+        if self.state is None or not messages.has_position(self.state):
+            return None
+        return messages.global_position_int(self.state, self._reference_alt_m)
+
+    def _highres_imu(self, _now_us: int) -> Any:
+        if self._sample is None:
+            return None
+        updated, self._updated = self._updated, 0
+        return messages.highres_imu(self._sample, self._mag_b_ut, self._baro, updated)
+
+    def _gps_raw(self, now_us: int) -> Any:
+        if self._fix is None or not self.health.is_alive(GPS, now_us):
+            return messages.gps_absent(now_us)
+        return messages.gps_raw_int(self._fix)
+
+    def _scaled_pressure(self, _now_us: int) -> Any:
+        return None if self._baro is None else messages.scaled_pressure(self._baro)
+
+    def _system_time(self, now_us: int) -> Any:
+        offset = self._unix_offset_us
+        return messages.system_time(now_us, None if offset is None else now_us + offset)
+
+    def _home_position(self, _now_us: int) -> Any:
+        return None if self.home is None else messages.home_position(self.home)
+
+    def _extended_sys_state(self, _now_us: int) -> Any:
+        return mavlink.MAVLink_extended_sys_state_message(
+            mavlink.MAV_VTOL_STATE_UNDEFINED, self.motion.landed_state
+        )
+
+    def _heartbeat(self, now_us: int) -> Any:
+        # Somebody else flies the aircraft by hand; the gateway only watches.
+        base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        if self.armed:
+            base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        return mavlink.MAVLink_heartbeat_message(
+            getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}"),
+            mavlink.MAV_AUTOPILOT_GENERIC,
+            base_mode,
+            custom_mode=0,
+            system_status=self._system_status(now_us),
+            mavlink_version=3,
+        )
+
+    def _system_status(self, now_us: int) -> int:
+        status: int = mavlink.MAV_STATE_STANDBY
+        if self.state is None:
+            status = mavlink.MAV_STATE_BOOT
+        elif self.calibrating:
+            status = mavlink.MAV_STATE_CALIBRATING
+        elif not self.health.is_alive(GYRO, now_us):
+            status = mavlink.MAV_STATE_CRITICAL
+        elif self.motion.landed_state == IN_AIR:
+            status = mavlink.MAV_STATE_ACTIVE
+        return status
+
+
+def _intervals(settings: VehicleSettings) -> dict[int, int]:
+    """Give the interval of every message; a rate's setting is named as its message."""
+    found = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: interval_us(HEARTBEAT_HZ)}
+    for name, rate in msgspec.structs.asdict(settings.rates).items():
+        message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
+        found[getattr(mavlink, message)] = interval_us(rate)
+    return found

@@ -1,0 +1,169 @@
+import math
+
+import numpy as np
+import pytest
+
+from gateway.analysis.flight_arrays import FusionSettings, fixes_of
+from gateway.analysis.tuning.contest import (
+    Axis,
+    SweepError,
+    Trials,
+    Values,
+    full_key,
+    grid,
+    make_contest,
+    optimise,
+    parse_axis,
+    settings_at,
+    tabulate,
+    with_value,
+)
+from gateway.analysis.tuning.workers import pool
+from tests.analysis.flights import short_case, short_flight
+
+ALPHA, BETA = "estimation.paper.alpha_accel", "estimation.paper.beta_velocity"
+LATENCY = "estimation.reference.gps_latency_s"
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("alpha", ALPHA),
+        ("beta", BETA),
+        ("gps_latency_s", LATENCY),
+        ("sensing.accel_cutoff_hz", "sensing.accel_cutoff_hz"),
+        ("reference.declination_deg", "estimation.reference.declination_deg"),
+    ],
+)
+def test_a_setting_is_found_by_its_name(name: str, key: str) -> None:
+    assert full_key(name) == key
+
+
+def test_an_unknown_setting_is_told() -> None:
+    with pytest.raises(SweepError, match="no setting ends in 'gama'"):
+        full_key("gama")
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("0.1:0.9:9", (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)),
+        ("0.5,0.1", (0.5, 0.1)),
+        ("0:1", (0.0, 1.0)),
+        ("0.25", (0.25,)),
+    ],
+)
+def test_values_are_read(text: str, values: tuple[float, ...]) -> None:
+    assert parse_axis("alpha", text).values == values
+
+
+def test_names_are_values_too() -> None:
+    axis = parse_axis("accel_filter", "butterworth, chebyshev")
+    assert axis == Axis("sensing.accel_filter", ("butterworth", "chebyshev"))
+
+
+@pytest.mark.parametrize("text", ["0:2:3", "a:b:c", "-0.1", "chebyshev"])
+def test_values_that_are_not_allowed_are_told(text: str) -> None:
+    with pytest.raises(SweepError, match="alpha"):
+        parse_axis("alpha", text)
+
+
+def test_a_value_lands_where_it_belongs() -> None:
+    changed = with_value(FusionSettings(), ALPHA, 0.7)
+    assert changed.estimation.paper.alpha_accel == 0.7
+    assert changed.estimation.paper.beta_velocity == 0.1
+    assert changed.sensing == FusionSettings().sensing
+
+
+def test_varying_an_estimators_setting_chooses_it() -> None:
+    contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
+    settings = settings_at(contest, (0.3, 0.4))
+    assert settings.estimation.estimator == "paper"
+    assert settings.estimation.paper.alpha_accel == 0.3
+
+
+def test_two_estimators_at_once_are_refused() -> None:
+    other = next(k for k in ("estimation.complementary", "estimation.eskf"))
+    keys = [ALPHA, f"{other}.x"]
+    with pytest.raises(SweepError, match="several estimators"):
+        make_contest(short_flight(), short_case().fusion, keys)
+
+
+@pytest.mark.parametrize(("interval_s", "share"), [(0.0, 0.8), (1.0, 0.2)])
+def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
+    flight = short_flight()
+    contest = make_contest(flight, short_case().fusion, [ALPHA], hold_out=5, interval_s=interval_s)
+    fused, held = fixes_of(contest.judge.fused), contest.judge.held
+    assert len(fused) + len(held) == len(fixes_of(flight))
+    assert not set(fused.arrival_us.tolist()) & set(held.arrival_us.tolist())
+    assert len(fused) / len(fixes_of(flight)) == pytest.approx(share, abs=0.03)
+
+
+def test_a_grid_is_every_point() -> None:
+    axes = [Axis("a", (1, 2)), Axis("b", (3, 4, 5))]
+    assert grid(axes) == [(1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5)]
+
+
+def test_a_grid_too_large_is_refused() -> None:
+    with pytest.raises(SweepError, match="1000000 points"):
+        grid([Axis("a", tuple(range(1000))), Axis("b", tuple(range(1000)))])
+
+
+def test_several_processes_give_the_same_as_one() -> None:
+    contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
+    points = grid([Axis(ALPHA, (0.1, 0.9)), Axis(BETA, (0.1, 0.9))])
+    with pool(contest, 2) as run:
+        several = dict(run(points))
+    with pool(contest, 1) as run:
+        one = dict(run(points))
+    assert several == one
+    assert one[0]["held_m"] < one[3]["held_m"]
+
+
+def test_withheld_fixes_find_the_latency() -> None:
+    """Interpolated GPS would choose no compensation at all: it copies the late fixes."""
+    flight, fusion = short_flight(), short_case().fusion
+    contest = make_contest(flight, fusion, [LATENCY])
+    latencies = (0.0, 0.08, 0.16, 0.24, 0.32)
+    points: list[Values] = [(latency,) for latency in latencies]
+    trials = Trials(contest)
+    table = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "held")
+    assert table.iloc[0][LATENCY] == pytest.approx(0.16, abs=0.09)
+    copied = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "interpolated")
+    assert copied.iloc[0][LATENCY] < table.iloc[0][LATENCY]
+
+
+def test_the_best_stands_first_and_what_is_not_known_is_left_out() -> None:
+    scores = [((k,), {"held_m": m, "reference_m": math.nan}) for k, m in enumerate((3.0, 1.0, 2.0))]
+    table = tabulate(["k"], scores, "held")
+    assert table["k"].tolist() == [1, 2, 0]
+    assert "reference_m" not in table
+    with pytest.raises(SweepError, match="no reference of the place"):
+        tabulate(["k"], scores, "reference")
+
+
+def test_the_optimiser_finds_the_bottom_of_a_bowl() -> None:
+    def bowl(points: list[Values]) -> list[float]:
+        return [
+            math.nan if p[0] > 0.95 else (float(p[0]) - 0.3) ** 2 + (float(p[1]) - 0.7) ** 2
+            for p in points
+        ]
+
+    best: list[float] = []
+    found = optimise([Axis("a", (0.0, 1.0)), Axis("b", (0.0, 1.0))], bowl, 25, best.append)
+    assert found == pytest.approx((0.3, 0.7), abs=0.02)
+    assert best == sorted(best, reverse=True)
+
+
+@pytest.mark.parametrize("values", [(0.5,), ("butterworth", "chebyshev"), (0.5, 0.5)])
+def test_the_optimiser_needs_a_range(values: Values) -> None:
+    with pytest.raises(SweepError, match="needs a range"):
+        optimise([Axis("a", values)], lambda points: [0.0] * len(points), 1)
+
+
+def test_an_attitude_is_judged_by_the_reference() -> None:
+    contest = make_contest(short_flight(), short_case().fusion, ["estimation.paper.alpha_gyro"])
+    trials = Trials(contest)
+    close, far = trials.run((0.995,)), trials.run((0.1,))
+    assert close["attitude_deg"] < far["attitude_deg"]
+    assert np.isfinite(close["reference_m"])

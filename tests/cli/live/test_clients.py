@@ -1,0 +1,220 @@
+"""The commands about clients, against a control socket with canned answers."""
+
+import asyncio
+import dataclasses
+import io
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.live import clients
+from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams, socket_path
+from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink
+from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.status import Snapshot
+
+pytestmark = pytest.mark.io
+
+NAN = float("nan")
+CLIENT = ClientStats(
+    client_id=1,
+    name="tablet",
+    endpoint="udp:10.0.0.7:14550?name=tablet",
+    remote="10.0.0.7:14550",
+    state="open",
+    trusted=True,
+    systems=((255, 190),),
+    sent=5000,
+    dropped=2,
+    bytes_sent=200_000,
+    received=10,
+    bytes_received=200,
+    bytes_garbage=0,
+    queued=3,
+    since_us=0,
+    heard_us=1_000_000,
+    round_trip_us=1500,
+)
+RADIO = dataclasses.replace(CLIENT, name="radio", state="unreachable", reason="No such device")
+OPEN = ListenerStats("udp-listen:0.0.0.0:14551", "", "open", "", 14551, 1, 0)
+CLOSED = ListenerStats(
+    "observers", "tcp-listen:[::]:5760?name=observers", "closed", "Address already in use", 0, 0, 8
+)
+NODE = NodeLink(NodeId(1, 2), 0, 100, 7, 0, 0, 1, 60.0, 0, 0.0)
+SNAPSHOT = Snapshot(
+    time_us=3_723_000_000,
+    report=LinkReport(0, True, "/dev/ttyUSB0", 0, 103, 4, (), (NODE,), None),
+    states=(
+        (
+            1,
+            NavState(
+                time_us=0,
+                q_nb=(1.0, 0.0, 0.0, 0.0),
+                rate_b_radps=(0.0, 0.0, 0.0),
+                lat_deg=47.5,
+                lon_deg=NAN,
+                alt_amsl_m=NAN,
+                vel_n_mps=(NAN, NAN, NAN),
+                attitude_std_rad=(NAN, NAN, NAN),
+                vel_std_mps=(NAN, NAN, NAN),
+                pos_std_m=(NAN, NAN, NAN),
+                flags=NavFlags.ATTITUDE_VALID | NavFlags.AT_REST,
+            ),
+        ),
+    ),
+    clients=(CLIENT, RADIO),
+    sent=((30, 9),),
+    hub=HubCounters(published=9, looped=1),
+    listeners=(OPEN, CLOSED),
+    refused=3,
+)
+
+
+class Url(msgspec.Struct):
+    url: str
+
+
+class Name(msgspec.Struct):
+    name: str
+
+
+class Place(msgspec.Struct):
+    lat_deg: float | None
+    lon_deg: float | None
+    alt_amsl_m: float | None
+    vehicle_id: int | None
+
+
+class Gateway:
+    """A control socket in a loop of its own, as the command would meet it."""
+
+    def __init__(self) -> None:
+        self.asked: list[object] = []
+        self.loop = asyncio.new_event_loop()
+        self.server = ControlServer(socket_path("run"))
+        self.server.register("status", NoParams, lambda _: SNAPSHOT)
+        self.server.register("clients.list", NoParams, lambda _: SNAPSHOT.clients)
+        self.server.register("clients.add", Url, self._add)
+        self.server.register("clients.remove", Name, self._remove)
+        self.server.register("reload", NoParams, lambda _: "settings of the hub applied")
+        self.server.register("mark", Place, self._mark)
+        self.thread = threading.Thread(target=self.loop.run_forever)
+
+    def _add(self, params: Url) -> list[str]:
+        self.asked.append(params)
+        return ["udp:127.0.0.1:14550", params.url]
+
+    def _mark(self, params: Place) -> str:
+        self.asked.append(params)
+        return "marked"
+
+    def _remove(self, params: Name) -> list[str]:
+        raise ControlError(f"no endpoint is called {params.name!r}")
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gateway]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("COLUMNS", "140")
+    gateway = Gateway()
+    gateway.loop.run_until_complete(gateway.server.start())
+    gateway.thread.start()
+    yield gateway
+    gateway.loop.call_soon_threadsafe(gateway.server.close)
+    gateway.loop.call_soon_threadsafe(gateway.loop.stop)
+    gateway.thread.join()
+    gateway.loop.run_until_complete(asyncio.sleep(0))
+    gateway.loop.close()
+
+
+def run(*words: str) -> Any:
+    return CliRunner().invoke(app, list(words))
+
+
+def test_status_for_people(gateway: Gateway) -> None:
+    text = run("status").output
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in text
+    assert "aircraft 1: 47.500000 —, — m" in text
+    assert "MAVLink frames: 9 published, 1 looped" in text
+    assert "requests: 3 refused" in text
+    assert "tablet" in text
+    assert "255.190" in text
+    assert "radio: No such device" in text
+    rows = [line.split() for line in text.splitlines()]
+    assert ["udp-listen:0.0.0.0:14551", "open", "1", "0"] in rows
+    assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
+
+
+def test_status_for_programs(gateway: Gateway) -> None:
+    found = json.loads(run("status", "--json").output)
+    assert found["clients"][0]["round_trip_us"] == 1500
+    assert found["states"][0][1]["lon_deg"] is None
+    assert found["hub"]["published"] == 9
+
+
+def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
+    assert "3722.0" in run("clients", "list").output
+    assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
+    assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
+    assert gateway.asked == [Url("udp:10.0.0.8:14550")]
+    told = "observers: Address already in use; trying again until it works"
+    assert told in run("clients", "add", CLOSED.endpoint).output
+    refused = run("clients", "remove", "phone")
+    assert refused.exit_code == 2
+    assert "no endpoint is called 'phone'" in refused.output
+
+
+def test_client_stands_on_one_line_of_a_narrow_terminal() -> None:
+    client = dataclasses.replace(
+        CLIENT,
+        name="udp:127.0.0.1:14550",
+        state="refused",
+        sent=1234567,
+        systems=(),
+        heard_us=SNAPSHOT.time_us - 12_300_000,
+    )
+    paper = io.StringIO()
+    terminal = Console(file=paper, width=80, force_terminal=True, color_system=None)
+    found = json.loads(msgspec.json.encode([client]))
+    terminal.print(clients._clients(found, SNAPSHOT.time_us))
+    assert [line.split()[:3] for line in paper.getvalue().splitlines()[2:]] == [
+        ["udp:127.0.0.1:14550", "refused", "1234567"]
+    ]
+
+
+def test_piped_tables_and_texts_are_never_wrapped(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    lines = run("status").output.splitlines()
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in lines
+    assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
+
+
+def test_mark_takes_places_of_the_south_and_west(gateway: Gateway) -> None:
+    assert run("mark", "-7.76", "-110.4", "--alt", "-3").output == "marked\n"
+    assert gateway.asked == [Place(-7.76, -110.4, -3.0, None)]
+    assert run("mark", "--hight", "3").exit_code == 2
+
+
+def test_reload(gateway: Gateway) -> None:
+    assert "applied" in run("reload").output
+
+
+def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    answer = run("status")
+    assert answer.exit_code == 2
+    assert "nothing runs" in answer.output
+
+
+def test_unknown_numbers_are_shown_as_such() -> None:
+    assert clients._number(None, ".1f") == "—"

@@ -1,0 +1,58 @@
+"""`mavgate record …` with a gateway that runs."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.edges.operator.control_socket import ControlServer, socket_path
+from gateway.edges.operator.control_verbs import RecorderVerbs
+from tests.conftest import ManualClock
+from tests.edges.disk.test_recorder import Bench
+from tests.flightlog.frames import make_frames
+
+pytestmark = pytest.mark.io
+
+Run = Callable[..., Awaitable[str]]
+
+
+@pytest.fixture
+async def gateway(
+    tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Bench]:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    bench = Bench(tmp_path / "elsewhere", clock, mode="manual")
+    bench.recorder.start()
+    server = ControlServer(socket_path("run"))
+    RecorderVerbs(bench.recorder).register(server)
+    await server.start()
+    yield bench
+    server.close()
+    bench.recorder.close()
+
+
+async def run(*args: str, code: int = 0) -> str:
+    result = await asyncio.to_thread(CliRunner().invoke, app, ["record", *args])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
+    assert "recording" in await run("start")
+    gateway.send(make_frames(9))
+    await run("note", "over the wood")
+    # Also before anything of it is on the disk.
+    assert "first" in await run("save", "first")
+    await gateway.recorder.settle()
+    assert "stop it first" in await run("delete", "first", "--yes", code=2)
+    assert "idle" in await run("stop")
+    # The folder is the one of the gateway that runs, whatever the user's settings say.
+    assert "first" in await run("list")
+    assert '"name":"first"' in await run("list", "--json")
+    assert "first_01.tlog" in await run("delete", "first", "--yes")
+    assert "first" not in await run("list")
+    assert list(gateway.recorder.folder.iterdir()) == []

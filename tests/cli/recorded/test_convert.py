@@ -1,0 +1,334 @@
+"""The commands that read recordings, run as people run them."""
+
+import gzip
+import json
+import math
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.config import GatewaySettings
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableFault, TableHeader, TableReader
+from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
+from tests.flightlog.frames import START_US, make_records, make_tlog
+from tests.test_replay import fly, make_flight
+
+pytestmark = pytest.mark.io
+
+RECORDS = make_records(500)
+
+
+def run(*args: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.fixture(autouse=True)
+def _home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the user's own settings and sockets out."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture
+def tlog(tmp_path: Path) -> Path:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(make_tlog(RECORDS))
+    return path
+
+
+@pytest.fixture
+def table(tmp_path: Path, rng: np.random.Generator) -> Path:
+    path = tmp_path / "flight.csv"
+    path.write_bytes(fly(GatewaySettings().default_aircraft, make_flight(rng, 20))[0])
+    return path
+
+
+def read_tlog(path: Path) -> list[TlogRecord]:
+    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
+    assert batch.damage == ()
+    return list(batch.records())
+
+
+def read_table(path: Path) -> tuple[TableHeader, list[TableRow]]:
+    reader = TableReader()
+    events = reader.feed(path.read_bytes(), final=True)
+    assert not [event for event in events if isinstance(event, TableFault)]
+    assert reader.header is not None
+    return reader.header, [event for event in events if isinstance(event, TableRow)]
+
+
+def test_trim_a_tlog(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "part.tlog"
+    run("convert", tlog, "-o", out, "--from", "0:02", "--to", "4")
+    assert read_tlog(out) == RECORDS[100:201]
+
+
+def test_join_tlogs_by_time(tmp_path: Path) -> None:
+    for name, records in (("a", RECORDS[::2]), ("b", RECORDS[1::2])):
+        (tmp_path / f"{name}.tlog").write_bytes(make_tlog(records))
+    out = tmp_path / "all.tlog"
+    run("convert", tmp_path / "b.tlog", tmp_path / "a.tlog", "-o", out)
+    assert read_tlog(out) == RECORDS
+
+
+def test_nothing_is_overwritten_unless_forced(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.tlog"
+    out.write_text("dear")
+    assert "--force" in run("convert", tlog, "-o", out, code=2)
+    assert out.read_text() == "dear"
+    run("convert", tlog, "-o", out, "--force")
+    assert read_tlog(out) == RECORDS
+
+
+def test_a_table_becomes_the_tlog_of_its_flight(table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.tlog"
+    run("convert", table, "-o", out)
+    records = read_tlog(out)
+    stamps = [record.time_us for record in records]
+    assert stamps == sorted(set(stamps))
+    log = mavutil.mavlogfile(str(out))
+    last = None
+    while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
+        last = message
+    log.close()
+    assert last is not None
+    assert last.lat / 1e7 == pytest.approx(47.1234567, abs=1e-3)
+
+
+def test_a_table_fused_again_is_the_same_table(table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, "--fuse")
+    assert out.read_bytes() == table.read_bytes()
+
+
+def test_a_table_fused_with_other_settings_is_another(table: Path, tmp_path: Path) -> None:
+    config = tmp_path / "other.toml"
+    config.write_text('[estimation]\nestimator = "paper"\n')
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, "--fuse", "--settings", "current", "--config", config)
+    (_, before), (_, after) = read_table(table), read_table(out)
+    assert [row.raw for row in after] == [row.raw for row in before]
+    assert after[-1].state != before[-1].state
+
+
+def test_positions_on_straight_lines(table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, "--fuse", "--position", "interpolated")
+    _, rows = read_table(out)
+    fixes = [(row.gps.time_us, row.gps.alt_amsl_m) for row in rows if row.gps]
+    latency_us = round(1e6 * GatewaySettings().default_aircraft.estimation.reference.gps_latency_s)
+    times, alts = np.array(fixes).T
+    middle = rows[len(rows) // 2].state
+    assert middle is not None
+    assert middle.alt_amsl_m == pytest.approx(np.interp(middle.time_us, times - latency_us, alts))
+
+
+@pytest.mark.parametrize("ending", ["kml", "gpx"])
+@pytest.mark.parametrize("source", ["table", "tlog"])
+def test_a_track_for_a_map(
+    request: pytest.FixtureRequest, table: Path, tmp_path: Path, ending: str, source: str
+) -> None:
+    path = table
+    if source == "tlog":
+        path = tmp_path / "x.tlog"
+        run("convert", table, "-o", path)
+    out = tmp_path / f"track.{ending}"
+    run("convert", path, "-o", out)
+    tags = [element.tag.partition("}")[2] for element in ET.parse(out).iter()]
+    assert tags.count("coord" if ending == "kml" else "trkpt") > 50
+
+
+def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:
+    text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
+    assert "tells no position" in " ".join(text.split())
+    assert not (tmp_path / "out.kml").exists()
+
+
+def test_an_autopilots_tlog_becomes_a_table_that_is_fused(tmp_path: Path) -> None:
+    mav = mavlink.MAVLink(None, 4, 1)
+    records = []
+    for i in range(1000):
+        messages = [mavlink.MAVLink_raw_imu_message(20_000 * i, 0, 0, -1000, 0, 0, 0, 200, 0, 400)]
+        if i % 10 == 0:
+            fix = (20_000 * i, 3, 471_000_000, 85_000_000, 430_000, 100, 100, 0, 0, 11)
+            messages.append(mavlink.MAVLink_gps_raw_int_message(*fix))
+        for message in messages:
+            frame = bytes(message.pack(mav))
+            records.append(TlogRecord(START_US + 20_000 * i, frame))
+    source, out = tmp_path / "autopilot.tlog", tmp_path / "flight.csv"
+    source.write_bytes(make_tlog(records))
+    run("convert", source, "-o", out)
+    header, rows = read_table(out)
+    assert (header.vehicle_id, header.unix_us_at_zero) == (4, START_US)
+    states = [row.state for row in rows if row.state is not None]
+    assert len(states) == 1000
+    assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
+    again = tmp_path / "again.csv"
+    run("convert", out, "-o", again, "--fuse")
+    assert again.read_bytes() == out.read_bytes()
+
+
+def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
+    lines = ["time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"]
+    lines[0] += "gps_vn,gps_ve,gps_vd"
+    for i in range(500):
+        gps = f"{0.02 * i},47.1,8.5,430,0,0,0" if i % 10 == 0 else ",,,,,,"
+        lines.append(f"{0.02 * i},0,0,-9.81,0,0,0,20,0,40,430,{gps}")
+    source = tmp_path / "log.csv.gz"
+    source.write_bytes(gzip.compress("\n".join(lines).encode()))
+    out = tmp_path / "flight.csv"
+    run("convert", source, "-o", out)
+    _, rows = read_table(out)
+    states = [row.state for row in rows if row.state is not None]
+    assert len(states) == 500
+    assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
+    assert math.isfinite(states[-1].alt_amsl_m)
+    own = tmp_path / "map.toml"
+    own.write_text('[columns]\ntime_us = "t"\naccel_x_b_mps2 = "ax"\ngyro_x_b_radps = "gx"\n')
+    refused = run("convert", source, "-o", tmp_path / "x.csv", "--columns", own, code=2)
+    assert "has no column t" in " ".join(refused.split())
+    own.write_text(own.read_text().replace('"t"', '{ column = "time_s", scale = 1e6 }'))
+    run("convert", source, "-o", tmp_path / "x.csv", "--columns", own)
+    _, rows = read_table(tmp_path / "x.csv")
+    assert (len(rows), rows[-1].gps) == (500, None)
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (("-o", "x.txt"), "must end in"),
+        (("-o", "x.tlog", "--from", "soon"), "no moment"),
+    ],
+)
+def test_wrong_wishes_are_refused(tlog: Path, args: tuple[str, ...], text: str) -> None:
+    assert text in " ".join(run("convert", tlog, *args, code=2).split())
+
+
+def test_info_for_programs(tlog: Path, table: Path) -> None:
+    info = json.loads(run("info", tlog, "--json"))
+    assert (info["kind"], info["records"]) == ("tlog", 500)
+    assert info["duration_s"] == pytest.approx(9.98)
+    info = json.loads(run("info", table, "--json"))
+    assert info["kind"] == "table"
+    assert info["header"]["vehicle_id"] == 1
+
+
+def test_info_for_people(tlog: Path) -> None:
+    text = run("info", tlog)
+    assert "500 records" in text
+    assert "HEARTBEAT" in text
+    tlog.write_bytes(tlog.read_bytes()[:-3])
+    assert "damaged" in run("info", tlog)
+
+
+@pytest.mark.parametrize("content", [b"", b"not MAVLink at all"])
+def test_info_of_what_is_no_recording(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.tlog"
+    path.write_bytes(content)
+    for command in ("info", "recover", "play"):
+        assert f"{path}: is no recording" in run(command, path, code=2)
+    assert f"{path}: is no recording" in run("convert", path, "-o", tmp_path / "x.kml", code=2)
+    assert not list(tmp_path.glob("x.*.tlog"))
+    assert "No such file" in run("info", tmp_path / "none.tlog", code=2)
+
+
+def test_recover_a_tlog(tlog: Path, tmp_path: Path) -> None:
+    data = tlog.read_bytes()
+    tlog.write_bytes(data[:1000] + b"\xaa" * 77 + data[1000:-5] + bytes(4096))
+    text = run("recover", tlog)
+    found = read_tlog(tmp_path / "flight.recovered.tlog")
+    assert len(found) >= 498
+    assert all(record in RECORDS for record in found)
+    assert "bytes left out" in text
+    assert tlog.read_bytes()[1000:1077] == b"\xaa" * 77
+
+
+def test_recover_a_table(table: Path, tmp_path: Path) -> None:
+    whole = table.read_bytes()
+    lines = whole.split(b"\n")
+    lines[10] = b"\0" * 50
+    table.write_bytes(b"\n".join(lines)[:-7])
+    text = run("recover", table)
+    assert "line 11" in text
+    _, rows = read_table(tmp_path / "flight.recovered.csv")
+    assert len(rows) == len(lines) - 4 - 2
+
+
+def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
+    whole = table.read_bytes()
+    table.write_bytes(whole.replace(b"# header: {", b"# header: }", 1))
+    text = run("recover", table)
+    assert "head is lost" in text
+    header, rows = read_table(tmp_path / "flight.recovered.csv")
+    assert header.settings == {}
+    assert len(rows) == whole.count(b"\n") - 3
+    run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
+
+
+def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> None:
+    plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
+    run("convert", table, "-o", plain, "--from", "5", "--to", "10")
+    run("convert", table, "-o", fused, "--from", "5", "--to", "10", "--fuse")
+    assert fused.read_bytes() == plain.read_bytes()
+    header, rows = read_table(fused)
+    assert not header.cold_start
+    assert 0 < len(rows) < len(read_table(table)[1])
+
+
+def test_a_table_tells_what_it_was_fused_with(table: Path, tmp_path: Path) -> None:
+    config = tmp_path / "other.toml"
+    config.write_text('[estimation]\nestimator = "paper"\n')
+    again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
+    run("convert", table, "-o", again, "--fuse", "--settings", "current", "--config", config)
+    run("convert", again, "-o", twice, "--fuse")
+    assert twice.read_bytes() == again.read_bytes() != table.read_bytes()
+
+
+def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.csv"
+    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
+    text = run("convert", table, other, "-o", tmp_path / "x.csv", code=2)
+    assert "aircraft 1 and 2" in " ".join(text.split())
+
+
+def test_recover_of_a_sound_file_says_so(tlog: Path, tmp_path: Path) -> None:
+    assert "nothing was damaged" in run("recover", tlog)
+    assert (tmp_path / "flight.recovered.tlog").read_bytes() == tlog.read_bytes()
+
+
+def test_record_without_a_gateway(tmp_path: Path) -> None:
+    config = tmp_path / "x.toml"
+    config.write_text(f'[recording]\nfolder = "{tmp_path}/rec"\n')
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    (folder / "a_01.tlog").write_bytes(make_tlog(RECORDS))
+    assert "nothing runs" in run("record", "start", code=2)
+    listed = msgspec.json.decode(run("record", "list", "--json", "-c", config))
+    assert [recording["name"] for recording in listed] == ["a"]
+    run("record", "save", "first flight", "-c", config)
+    assert "aborted" in run("record", "delete", "last", "-c", config, code=1).lower()
+    assert [path.name for path in folder.iterdir()] == ["first flight_01.tlog"]
+    run("record", "delete", "last", "--yes", "-c", config)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [[], ["--fuse"]])
+def test_remarks_stay_in_their_place(table: Path, tmp_path: Path, options: list[str]) -> None:
+    mark = '# mark: {"time_us":123456,"text":"over the wood"}'
+    lines = table.read_text().splitlines()
+    lines.insert(len(lines) // 2, mark)
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path / "again.csv"
+    run("convert", table, "-o", out, *options)
+    assert out.read_text().splitlines().index(mark) == lines.index(mark)
+    run("convert", table, "-o", tmp_path / "again.tlog")

@@ -1,0 +1,93 @@
+"""`mavgate fuse` on small logs."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.flightlog.table.row import row_to_line
+from gateway.flightlog.table.table import encode_head, encode_state
+from gateway.replay import header_for
+from tests.test_replay import fly_from_the_middle
+
+HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    lines = ["# still gps_latency_s=0.3 declination_deg=10.0", HEAD]
+    for k in range(500):
+        mag = "20.0,0.0,40.0" if k % 10 == 0 else ",,"
+        gps = f"{k / 100:.2f},47.0,8.0,500.0,0,0,0" if k % 20 == 0 else ",,,,,,"
+        lines.append(f"{k / 100:.2f},0.0,0.0,-9.8,0.0,0.0,0.0,{mag},{gps}")
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def run(log: Path, *arguments: str) -> list[dict[str, str]]:
+    out = log.with_name("out.csv")
+    empty = log.with_name("defaults.toml")
+    empty.write_text("")
+    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out), *arguments])
+    assert result.exit_code == 0, result.output
+    with out.open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: str) -> None:
+    rows = run(log, "--estimator", estimator)
+    assert len(rows) == 500
+    last = rows[-1]
+    assert float(last["time_s"]) == pytest.approx(4.99)
+    assert float(last["lat_deg"]) == pytest.approx(47.0, abs=1e-6)
+    assert float(last["alt_amsl_m"]) == pytest.approx(500.0, abs=0.5)
+    yaw = 2.0 * math.atan2(float(last["qz"]), float(last["qw"]))
+    assert math.degrees(yaw) == pytest.approx(10.0, abs=0.5)
+    known = last["pos_std_north_m"] != ""
+    assert known == (estimator == "eskf")
+
+
+@pytest.mark.io
+def test_a_recording_gives_its_own_states_also_from_its_middle(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    settings, state, rows = fly_from_the_middle("complementary", rng)
+    path = tmp_path / "flight.csv"
+    head = encode_head(header_for(settings, 1)) + encode_state(state)
+    path.write_text(head + "".join(map(row_to_line, rows)))
+    recorded = [row.state for row in rows if row.state]
+    again = run(path)
+    assert [row["qw"] for row in again] == [f"{known.q_nb[0]:.10g}" for known in recorded]
+    assert [row["lat_deg"] for row in again] == [f"{known.lat_deg:.10g}" for known in recorded]
+
+
+@pytest.mark.io
+def test_blank_before_anything_is_known(log: Path) -> None:
+    first = run(log, "--estimator", "complementary")[0]
+    assert first["lat_deg"] == ""
+    assert first["qw"] != ""
+
+
+@pytest.mark.io
+def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
+    config = log.with_name("c.toml")
+    config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
+    last = run(log, "--estimator", "complementary", "--config", str(config))[-1]
+    yaw = 2.0 * math.atan2(float(last["qz"]), float(last["qw"]))
+    assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
+
+
+@pytest.mark.io
+def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.csv"
+    path.write_text("a,b\n1,2\n")
+    result = CliRunner().invoke(app, ["fuse", str(path), "-o", str(tmp_path / "out.csv")])
+    assert result.exit_code == 2
+    assert not (tmp_path / "out.csv").exists()

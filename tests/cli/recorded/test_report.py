@@ -1,0 +1,68 @@
+import errno
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.analysis.reporting.page import Report
+from gateway.cli.app import app
+from gateway.cli.recorded import report
+from gateway.flightlog.table.row import row_to_line
+from gateway.flightlog.table.table import TableHeader, encode_head
+from tests.analysis.test_sources import rows
+
+pytestmark = pytest.mark.io
+
+
+@pytest.mark.slow
+def test_a_recording_is_reported_beside_other_settings(tmp_path: Path) -> None:
+    recording, other = tmp_path / "flight.csv", tmp_path / "other.toml"
+    recording.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, rows(raw=True))))
+    other.write_text('[estimation]\nestimator = "paper"\n')
+    folder = tmp_path / "out"
+    arguments = ["--against-config", str(other), "--reference", str(recording), "-o", str(folder)]
+    result = CliRunner().invoke(app, ["report", str(recording), *arguments])
+    assert result.exit_code == 0, result.output
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert "Flight report: flight.csv" in page
+    assert "Comparison" in page
+    assert (folder / "comparison_difference.svg").exists()
+    assert (folder / "timing.csv").exists()
+
+
+def test_a_file_without_a_flight_is_told(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.csv"
+    empty.write_text(encode_head(TableHeader()))
+    result = CliRunner().invoke(app, ["report", str(empty), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "holds no row" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_must_be_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without(name: str) -> ModuleSpec | None:
+        return None if name == "jinja2" else find_spec(name)
+
+    monkeypatch.setattr(report, "find_spec", without)
+    result = CliRunner().invoke(app, ["report"])
+    assert result.exit_code == 2
+    assert "needs jinja2;" in result.output
+    assert "-m pip install jinja2\n" in result.output
+
+
+def test_a_folder_that_cannot_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "page"))
+
+    monkeypatch.setattr("gateway.analysis.reporting.page.write_report", full)
+    empty = Report("", "", [], [])
+    monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda *_: empty)
+    monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_: None)
+    monkeypatch.setattr(report, "load_flight", lambda *_: None)
+    result = CliRunner().invoke(app, ["report", "-o", str(tmp_path / "page")])
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'page'}: No space left" in result.output

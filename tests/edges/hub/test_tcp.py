@@ -1,0 +1,189 @@
+"""TCP both ways and serial ports: broken and stalled peers, and what overtakes what."""
+
+import asyncio
+import os
+import pty
+import socket
+import termios
+from typing import Any
+
+import pytest
+
+from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
+
+pytestmark = pytest.mark.io
+
+
+async def connect(rig: Any, port: int) -> socket.socket:
+    client = socket.socket()
+    client.setblocking(False)
+    rig.closing.append(client.close)
+    await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
+    return client
+
+
+async def read_frames(client: socket.socket, count: int) -> list[bytes]:
+    splitter, frames = MavlinkSplitter(), []
+    while len(frames) < count:
+        data = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(client, 4096), 5)
+        assert data
+        frames += splitter.feed(data)
+    return frames
+
+
+class TestTcpListen:
+    async def test_both_ways(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        client = await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        frames = await read_frames(client, 2)
+        assert [(message_id_of(frame), frame[4]) for frame in frames] == [(0, 0), (30, 1)]
+        said = rig.sender(255, 190).heartbeat()
+        client.send(said[:5])
+        client.send(said[5:])
+        await rig.until(lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].trusted
+
+    async def test_the_end_of_a_connection_is_the_end_of_the_client(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        client = await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        client.close()
+        await rig.until(lambda: not hub.clients())
+
+    async def test_at_most_so_many(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
+        for _ in range(2):
+            await connect(rig, hub.listening_ports()[0])
+        third = await connect(rig, hub.listening_ports()[0])
+        assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(third, 1), 5) == b""
+        assert len(hub.clients()) == 2
+
+    async def test_a_stalled_client_loses_its_own_oldest_telemetry(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0", queue_bytes=4096)
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        port = hub.listening_ports()[0]
+        stalled, lively = await connect(rig, port), await connect(rig, port)
+        await rig.until(lambda: len(hub.clients()) == 2)
+        splitter, got = MavlinkSplitter(), []
+        sent = 0
+        while hub.clients()[0].dropped < 1000:
+            for _ in range(50):
+                hub.send(rig.out(rig.vehicle.raw_imu()))
+                sent += 1
+            await asyncio.sleep(0)
+            data = await asyncio.get_running_loop().sock_recv(lively, 65536)
+            got += splitter.feed(data)
+        while len(got) < sent + 1:
+            data = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(lively, 65536), 5)
+            got += splitter.feed(data)
+        slow, fast = hub.clients()
+        assert (fast.sent, fast.dropped) == (sent + 1, 0)
+        assert [frame[4] for frame in got] == [n & 0xFF for n in range(sent + 1)]
+        assert slow.sent + slow.dropped == sent + 1
+        late = await read_frames(stalled, slow.sent)
+        assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
+        assert hub.clients()[0].queued == 0
+
+
+class TestTcpOut:
+    async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
+        self, rig: Any
+    ) -> None:
+        with socket.socket() as place:
+            place.bind(("127.0.0.1", 0))
+            port = place.getsockname()[1]
+        hub = rig.hub(f"tcp:127.0.0.1:{port}")
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        for _ in range(2):
+            with socket.create_server(("127.0.0.1", port)) as server:
+                server.setblocking(False)
+                rig.clock.us += 2_000_000
+                connection, _ = await asyncio.wait_for(
+                    asyncio.get_running_loop().sock_accept(server), 5
+                )
+            await rig.until_open(hub)
+            frame = rig.vehicle.attitude()
+            hub.send(rig.out(frame))
+            assert len(await read_frames(connection, 1)) == 1
+            connection.close()
+            await rig.until(lambda: hub.clients()[0].state != "open")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients()[0].dropped == 1
+
+
+class TestSerial:
+    @pytest.fixture
+    def line(self, rig: Any) -> tuple[int, str]:
+        near, far = pty.openpty()
+        rig.closing += [lambda: os.close(near), lambda: os.close(far)]
+        os.set_blocking(near, False)
+        attributes = termios.tcgetattr(near)
+        attributes[3] &= ~(termios.ECHO | termios.ICANON)
+        termios.tcsetattr(near, termios.TCSANOW, attributes)
+        return near, os.ttyname(far)
+
+    async def test_both_ways(self, rig: Any, line: tuple[int, str]) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:57600")
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert os.read(near, 100) == frame
+        said = rig.sender(255, 190).heartbeat()
+        os.write(near, b"noise" + said)
+        await rig.until(lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert hub.clients()[0].bytes_garbage == 5
+
+    async def test_the_attitude_overtakes_and_numbers_stay_in_order(
+        self, rig: Any, line: tuple[int, str]
+    ) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:9600")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        for _ in range(20):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+        hub.send(rig.out(rig.vehicle.attitude()))
+        waiting = hub.clients()[0].queued
+        assert waiting > 10
+        splitter, frames = MavlinkSplitter(), []
+        while len(frames) < 22:
+            rig.clock.us += 5_000
+            await asyncio.sleep(0.001)
+            try:
+                frames += splitter.feed(os.read(near, 4096))
+            except BlockingIOError:
+                continue
+        ids = [message_id_of(frame) for frame in frames]
+        assert ids.index(30) <= 22 - waiting + 1
+        assert [frame[4] for frame in frames] == list(range(22))
+
+    async def test_a_port_that_goes_and_comes_back(
+        self, rig: Any, line: tuple[int, str], tmp_path: Any
+    ) -> None:
+        device = tmp_path / "radio"
+        device.symlink_to(line[1])
+        hub = rig.hub(f"serial:{device}:57600")
+        await rig.until_open(hub)
+        near, far = pty.openpty()
+        hub._clients[1]._broke(OSError("pulled out"))
+        device.unlink()
+        rig.clock.us = 2_000_000
+        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(hub)
+        (client,) = hub.clients()
+        assert (client.state, client.dropped) == ("unreachable", 1)
+        assert client.reason == "No such file or directory"
+        device.symlink_to(os.ttyname(far))
+        rig.clock.us = 4_000_000
+        await rig.until_open(hub)
+        assert hub.clients()[0].reason == ""
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert len(os.read(near, 100)) == len(frame)
+        os.close(near)
+        await rig.until(lambda: hub.clients()[0].state == "unreachable")
+        os.close(far)

@@ -1,0 +1,161 @@
+"""The live view: what an operator reads, and that nothing unknown looks like a figure."""
+
+import logging
+import math
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from gateway.edges.operator.live_view import LiveView, summary_line
+from gateway.geometry.quaternion import from_euler
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    LinkReport,
+    NavFlags,
+    NavState,
+    NodeId,
+    NodeLink,
+    PipeCounters,
+    ReceiverStatus,
+)
+from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.status import Snapshot
+
+NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
+RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)
+REPORT = LinkReport(
+    10_000_000, True, "/dev/ttyUSB0", 40_000, 1000, 2, (("crc", 7),), (NODE,), RECEIVER
+)
+FLYING = NavState(
+    time_us=9_990_000,
+    q_nb=from_euler(math.radians(-12.0), math.radians(3.0), math.radians(-90.0)),
+    rate_b_radps=(0.0, 0.0, 0.0),
+    lat_deg=-7.765612,
+    lon_deg=110.372834,
+    alt_amsl_m=171.5,
+    vel_n_mps=(3.0, -4.0, -1.5),
+    attitude_std_rad=UNKNOWN_VEC3,
+    vel_std_mps=UNKNOWN_VEC3,
+    pos_std_m=UNKNOWN_VEC3,
+    flags=NavFlags.ATTITUDE_VALID | NavFlags.POSITION_VALID | NavFlags.GPS_REJECTED,
+)
+LOST = replace(FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3)
+CLIENT = ClientStats(
+    client_id=1,
+    name="",
+    endpoint="udp:127.0.0.1:14550",
+    remote="127.0.0.1:14550",
+    state="open",
+    trusted=True,
+    systems=((255, 190),),
+    sent=1200,
+    dropped=3,
+    bytes_sent=50_000,
+    received=9,
+    bytes_received=200,
+    bytes_garbage=0,
+    queued=0,
+    since_us=0,
+    heard_us=9_500_000,
+    round_trip_us=None,
+)
+SNAPSHOT = Snapshot(
+    10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)), HubCounters()
+)
+
+
+def text_of(*snapshots: Snapshot, width: int = 100) -> str:
+    view = LiveView()
+    for snapshot in snapshots:
+        drawn = view.draw(snapshot)
+    console = Console(width=width, no_color=True)
+    with console.capture() as captured:
+        console.print(drawn)
+    return captured.get()
+
+
+def test_link_node_aircraft_and_client_are_shown() -> None:
+    text = text_of(SNAPSHOT)
+    for part in (
+        "/dev/ttyUSB0 connected",
+        "1000 frames, 2 lost on the line, 7 crc faults",
+        "channel 76, noise 4 %",
+        "1.0",
+        "1.00",
+        "-12.0",
+        "270.0",
+        "-7.765612",
+        "5.0",
+        "+1.5",
+        "GPS rejected",
+        "127.0.0.1:14550",
+    ):
+        assert part in text
+
+
+def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
+    far = replace(FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6)
+    long = replace(CLIENT, sent=123_456_789, dropped=1_234_567, received=1_234_567)
+    port = ListenerStats("udp-listen:127.0.0.1:14551", "", "open", "", 14551, 0, 0)
+    sent = tuple((number, 9) for number in (0, 1, 2, 24, 29, 30, 31, 33, 42, 62, 74, 105, 230))
+    full = replace(SNAPSHOT, states=((1, far),), clients=(long,), listeners=(port,), sent=sent)
+    text = text_of(full, width=80)
+    for part in ("-77.123456", "-170.123456", "12345.6", "123456789", "1234567", port.name):
+        assert part in text
+    assert "…" not in text
+    assert len(text.splitlines()) <= 24
+
+
+def test_a_client_is_called_by_its_name() -> None:
+    tablet = replace(CLIENT, name="tablet", remote="10.0.0.7:14550")
+    assert "tablet 10.0.0.7:14550" in text_of(replace(SNAPSHOT, clients=(tablet,)))
+
+
+def test_rates_are_those_since_the_previous_view() -> None:
+    later = replace(SNAPSHOT, time_us=12_000_000, sent=((0, 12), (31, 600)))
+    text = text_of(SNAPSHOT, later)
+    assert "ATTITUDE_QUATERNION" in text
+    assert "50.0" in text
+    assert "1.0" in text
+
+
+def test_what_stands_in_the_way_is_told() -> None:
+    closed = ListenerStats("udp-listen:[::]:5760", "", "closed", "Address already in use", 0, 0, 0)
+    radio = replace(CLIENT, name="radio", state="unreachable", reason="Permission denied")
+    text = text_of(replace(SNAPSHOT, listeners=(closed,), clients=(CLIENT, radio)))
+    assert "udp-listen:[::]:5760: Address already in use" in text
+    assert "radio: Permission denied" in text
+
+
+@pytest.mark.parametrize("word", ["nan", "None"])
+def test_unknown_is_a_dash(word: str) -> None:
+    assert word not in text_of(replace(SNAPSHOT, states=((1, LOST),)))
+    assert word not in summary_line(replace(SNAPSHOT, states=((1, LOST),)))
+
+
+def test_an_empty_gateway_can_be_drawn() -> None:
+    report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
+    text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
+    assert "auto not connected" in text
+    assert "No aircraft heard yet" in text
+
+
+def test_the_newest_log_lines_are_on_the_screen() -> None:
+    view = LiveView()
+    for number in range(20):
+        record = logging.LogRecord("x", logging.WARNING, "", 0, "trouble %d", (number,), None)
+        view.log.handle(record)
+    console = Console(width=100, no_color=True)
+    with console.capture() as captured:
+        console.print(view.draw(SNAPSHOT))
+    assert "trouble 19" in captured.get()
+    assert "trouble 14" not in captured.get()
+
+
+def test_summary_line() -> None:
+    assert summary_line(SNAPSHOT) == (
+        "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
+        "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 clients"
+    )

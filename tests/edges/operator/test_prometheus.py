@@ -1,0 +1,158 @@
+"""The Prometheus text and the port that serves it."""
+
+import asyncio
+import socket
+
+import pytest
+
+from gateway.edges.operator import prometheus
+from gateway.edges.operator.prometheus import MetricsServer, prometheus_text
+from gateway.records import LinkReport, NodeId, NodeLink
+from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.status import Snapshot
+
+NODE = NodeLink(
+    node=NodeId(1, 2),
+    pipe=0,
+    received=100,
+    lost=3,
+    duplicates=0,
+    reordered=0,
+    restarts=0,
+    rate_hz=60.0,
+    last_time_us=0,
+    clock_skew_ppm=0.0,
+)
+REPORT = LinkReport(
+    time_us=0,
+    connected=True,
+    port="/dev/ttyUSB0",
+    bytes_received=0,
+    frames=103,
+    frames_lost=0,
+    faults=(("crc", 4),),
+    nodes=(NODE,),
+    receiver=None,
+)
+CLIENT = ClientStats(
+    client_id=7,
+    name='the "tablet"',
+    endpoint="udp:10.0.0.7:14550",
+    remote="10.0.0.7:14550",
+    state="open",
+    trusted=True,
+    systems=(),
+    sent=5000,
+    dropped=2,
+    bytes_sent=200_000,
+    received=10,
+    bytes_received=200,
+    bytes_garbage=0,
+    queued=1,
+    since_us=0,
+    heard_us=1_000_000,
+    round_trip_us=1500,
+)
+SNAPSHOT = Snapshot(
+    time_us=3_000_000,
+    report=REPORT,
+    states=(),
+    clients=(CLIENT,),
+    sent=(),
+    hub=HubCounters(published=9),
+    listeners=(
+        ListenerStats("here", "tcp-listen:0.0.0.0:1?name=here", "closed", "taken", 0, 0, 4),
+    ),
+    refused=5,
+    forged=6,
+)
+PORT = '{name="here",endpoint="tcp-listen:0.0.0.0:1?name=here"}'
+LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "mavgate_up_seconds 3",
+        "mavgate_receiver_connected 1",
+        'mavgate_receiver_faults_total{kind="crc"} 4',
+        'mavgate_node_lost_total{vehicle="1",node="2"} 3',
+        'mavgate_node_rate_hz{vehicle="1",node="2"} 60',
+        "mavgate_hub_published_total 9",
+        f"mavgate_client_sent_total{LABELS} 5000",
+        f"mavgate_client_round_trip_seconds{LABELS} 0.0015",
+        f"mavgate_client_silent_seconds{LABELS} 2",
+        f"mavgate_client_open{LABELS} 1",
+        f"mavgate_listener_open{PORT} 0",
+        f"mavgate_listener_turned_away_total{PORT} 4",
+        "mavgate_requests_refused_total 5",
+        "mavgate_requests_forged_total 6",
+    ],
+)
+def test_samples(line: str) -> None:
+    assert line in prometheus_text(SNAPSHOT).splitlines()
+
+
+def test_every_family_is_declared_once_before_its_samples() -> None:
+    declared: list[str] = []
+    for line in prometheus_text(SNAPSHOT).splitlines():
+        if line.startswith("# TYPE"):
+            declared.append(line.split()[2])
+        elif not line.startswith("#"):
+            assert line.split("{")[0].split()[0] == declared[-1]
+    assert len(declared) == len(set(declared))
+
+
+@pytest.mark.io
+class TestServer:
+    async def ask(self, port: int, request: bytes) -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(request)
+        answer = await asyncio.wait_for(reader.read(), 5)
+        writer.close()
+        return answer
+
+    async def test_serves_and_refuses(self) -> None:
+        server = MetricsServer(lambda: SNAPSHOT)
+        server.listen(_free_port())
+        answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+        head, _, body = answer.partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 200 OK")
+        assert f"Content-Length: {len(body)}".encode() in head
+        assert body.decode() == prometheus_text(SNAPSHOT)
+        assert (await self.ask(server.port, b"POST / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 405")
+        port = server.port
+        server.close()
+        await asyncio.sleep(0)
+        assert server.port == 0
+        with pytest.raises(ConnectionRefusedError):
+            await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
+
+    async def test_zero_serves_none(self) -> None:
+        server = MetricsServer(lambda: SNAPSHOT)
+        server.listen(0)
+        assert (server.port, server.listeners()) == (0, ())
+
+    async def test_a_taken_port_is_told_and_used_when_it_is_free(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(prometheus, "RETRY_S", 0.0)
+        server = MetricsServer(lambda: SNAPSHOT)
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+            server.listen(port)
+            await asyncio.sleep(0)
+            (stats,) = server.listeners()
+            assert (stats.state, stats.reason) == ("closed", "Address already in use")
+        while not server.port:
+            await asyncio.sleep(0)
+        assert (server.port, server.listeners()[0].state) == (port, "open")
+        assert caplog.text.count("no metrics") == 1
+        server.close()
+        assert server.listeners() == ()
+
+
+def _free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])

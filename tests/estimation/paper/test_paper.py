@@ -1,0 +1,357 @@
+import math
+
+import numpy as np
+import pytest
+
+from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
+from gateway.geometry.geodesy import displacement_m
+from gateway.geometry.quaternion import from_euler, rotate_inverse, to_euler
+from gateway.records import GpsFixType, ImuSample, NavFlags, NavState, Vec3
+from tests.estimation.samples import LAT_DEG, LON_DEG, G, fix, imu, times
+
+NO_DECLINATION = ReferenceSettings(gps_latency_s=0.0, declination="fixed")
+
+
+def make(reference: ReferenceSettings = NO_DECLINATION, **settings: object) -> PaperEstimator:
+    return PaperEstimator(PaperSettings(**settings), reference, RestSettings())
+
+
+def run(estimator: PaperEstimator, samples: list[ImuSample]) -> NavState:
+    for sample in samples:
+        state = estimator.update_imu(sample)
+    return state
+
+
+def tilted(roll: float, pitch: float) -> Vec3:
+    return rotate_inverse(from_euler(roll, pitch, 0.0), (0.0, 0.0, -G))
+
+
+def metres(state: NavState) -> tuple[float, float]:
+    return displacement_m(LAT_DEG, LON_DEG, state.lat_deg, state.lon_deg, 500.0)
+
+
+@pytest.mark.parametrize(("roll", "pitch"), [(0.0, 0.0), (0.5, -0.3), (-1.2, 0.9), (3.0, 0.2)])
+def test_starts_at_the_accelerometers_tilt(roll: float, pitch: float) -> None:
+    state = run(make(), [imu(0, tilted(roll, pitch))])
+    assert to_euler(state.q_nb)[:2] == pytest.approx((roll, pitch))
+    assert NavFlags.ATTITUDE_VALID in state.flags
+    assert NavFlags.HEADING_VALID not in state.flags
+    assert math.isnan(state.lat_deg)
+
+
+class TestGainEnds:
+    def test_gyro_gain_one_is_the_gyroscope_alone(self) -> None:
+        samples = [imu(t, tilted(0.3, 0.1), (0.2, 0.0, 0.0)) for t in times(1.01)]
+        state = run(make(alpha_gyro=1.0), [imu(0), *samples[1:]])
+        assert to_euler(state.q_nb) == pytest.approx((0.2, 0.0, 0.0), abs=1e-9)
+
+    def test_gyro_gain_zero_is_the_accelerometer_alone(self) -> None:
+        samples = [imu(t, tilted(0.3, 0.1), (0.2, 0.0, 0.0)) for t in times(1.01)]
+        state = run(make(alpha_gyro=0.0), [imu(0), *samples[1:]])
+        assert to_euler(state.q_nb)[:2] == pytest.approx((0.3, 0.1), abs=1e-9)
+
+    @pytest.mark.parametrize(("gain", "north_m"), [(0.0, 7.0), (1.0, 0.0)])
+    def test_position_gain(self, gain: float, north_m: float) -> None:
+        estimator = make(alpha_accel=0.0, beta_velocity=gain)
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        estimator.update_gps(fix(510_000, north_m=7.0))
+        assert metres(run(estimator, [imu(510_000)]))[0] == pytest.approx(north_m, abs=0.02)
+
+    @pytest.mark.parametrize(("gain", "north_mps"), [(0.0, 4.0), (1.0, 0.0)])
+    def test_velocity_gain(self, gain: float, north_mps: float) -> None:
+        estimator = make(alpha_accel=gain)
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        estimator.update_gps(fix(510_000, vel=(4.0, 0.0, 0.0)))
+        assert run(estimator, [imu(510_000)]).vel_n_mps[0] == pytest.approx(north_mps, abs=1e-9)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 179.0, -179.0, -45.0])
+def test_compass_under_tilt_with_declination(yaw_deg: float) -> None:
+    yaw, declination = math.radians(yaw_deg), math.radians(5.0)
+    q = from_euler(0.4, -0.2, yaw)
+    north = (20.0 * math.cos(declination), 20.0 * math.sin(declination), 40.0)
+    mag, accel = rotate_inverse(q, north), rotate_inverse(q, (0.0, 0.0, -G))
+    reference = ReferenceSettings(declination="fixed", declination_deg=5.0)
+    state = run(make(reference), [imu(t, accel, mag=mag) for t in times(5.0)])
+    difference = math.remainder(to_euler(state.q_nb)[2] - yaw, 2.0 * math.pi)
+    assert difference == pytest.approx(0.0, abs=1e-6)
+    assert NavFlags.HEADING_VALID in state.flags
+
+
+def test_dead_reckons_between_fixes_with_gravity_removed() -> None:
+    estimator = make()
+    q = from_euler(0.0, 0.0, math.pi / 2.0)
+    north = (25.0, 0.0, 40.0)
+    still = [imu(t, mag=rotate_inverse(q, north)) for t in times(1.0)]
+    run(estimator, still)
+    estimator.update_gps(fix(1_000_000))
+    # Nose east: one second of forward acceleration is an eastward way.
+    moving = [imu(1_000_000 + t, (1.0, 0.0, -G), mag=None) for t in times(1.0)]
+    state = run(make_gyro_only(estimator), moving)
+    assert metres(state) == pytest.approx((0.0, 0.5), abs=0.02)
+    assert state.vel_n_mps == pytest.approx((0.0, 1.0, 0.0), abs=0.01)
+
+
+def make_gyro_only(estimator: PaperEstimator) -> PaperEstimator:
+    """Move a state into an estimator whose accelerometer does not pull the attitude."""
+    other = make(alpha_gyro=1.0)
+    other.state = estimator.state
+    return other
+
+
+def test_latency_moves_the_fix_forward() -> None:
+    estimator = make(ReferenceSettings(gps_latency_s=0.5, declination="fixed"), beta_velocity=0.0)
+    run(estimator, [imu(0)])
+    estimator.update_gps(fix(0, vel=(10.0, -20.0, 2.0)))
+    state = run(estimator, [imu(0)])
+    assert metres(state) == pytest.approx((5.0, -10.0), abs=0.02)
+    assert state.alt_amsl_m == pytest.approx(499.0)
+
+
+def test_latency_is_made_up_for_by_what_the_accelerometer_saw() -> None:
+    """Northwards with 2 m/s2, at 20 m/s after 10 s; the fix is half a second old."""
+    reference = ReferenceSettings(gps_latency_s=0.5, declination="fixed")
+    estimator = make(reference, alpha_gyro=1.0, alpha_accel=0.0, beta_velocity=0.0)
+    run(estimator, [imu(0)])
+    state = run(estimator, [imu(t, (2.0, 0.0, -G)) for t in times(10.01)])
+    assert math.isnan(state.lat_deg)
+    estimator.update_gps(fix(10_005_000, north_m=9.5**2, vel=(19.0, 0.0, 0.0)))
+    state = run(estimator, [imu(10_010_000, (2.0, 0.0, -G))])
+    assert state.vel_n_mps == pytest.approx((20.0, 0.0, 0.0), abs=0.03)
+    assert metres(state) == pytest.approx((100.2, 0.0), abs=0.1)
+
+
+def test_velocity_from_the_bearing_where_the_receiver_tells_none() -> None:
+    estimator = make(alpha_accel=0.0)
+    run(estimator, [imu(0)])
+    unknown = (math.nan, math.nan, math.nan)
+    estimator.update_gps(fix(0, vel=unknown))
+    estimator.update_gps(fix(1_000_000, north_m=3.0, east_m=4.0, vel=unknown, alt_m=501.0))
+    state = run(estimator, [imu(0)])
+    assert state.vel_n_mps == pytest.approx((3.0, 4.0, -1.0), abs=0.03)
+
+
+def test_blending_at_every_sample_pulls_back_to_the_held_fix() -> None:
+    ends = {}
+    for blend in ("at_fix", "every_sample"):
+        estimator = make(alpha_gyro=1.0, blend=blend)
+        run(estimator, [imu(0)])
+        estimator.update_gps(fix(0, vel=(10.0, 0.0, 0.0)))
+        ends[blend] = metres(run(estimator, [imu(t) for t in times(1.01)]))[0]
+    assert ends["at_fix"] == pytest.approx(10.0, abs=0.02)
+    assert ends["every_sample"] < 0.1
+
+
+def noisy_flight(seed: int) -> list[ImuSample]:
+    rng = np.random.default_rng(seed)
+    return [
+        imu(
+            t,
+            tuple(rng.normal((0, 0, -G), 1.0).tolist()),
+            tuple(rng.normal(0, 0.2, 3).tolist()),
+            tuple(rng.normal((20, 0, 40), 1.0).tolist()) if t % 100_000 == 0 else None,
+        )
+        for t in times(4.0)
+    ]
+
+
+def noisy_rest(
+    rng: np.random.Generator, bias: Vec3, begin_us: int, long_s: float
+) -> list[ImuSample]:
+    """Stand still; the gyroscope is off."""
+    return [
+        imu(
+            begin_us + t,
+            tuple(rng.normal((0, 0, -G), 0.03).tolist()),
+            tuple(rng.normal(bias, math.radians(0.1)).tolist()),
+        )
+        for t in times(long_s)
+    ]
+
+
+BIAS = (math.radians(3.0), math.radians(-2.0), math.radians(1.0))
+
+
+class TestGyroscopeBias:
+    def test_is_what_the_gyroscope_shows_at_rest(self, rng: np.random.Generator) -> None:
+        estimator = make()
+        run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
+        estimator.update_gps(fix(20_000_000, vel=(20.0, 0.0, 0.0)))
+        still = [imu(20_000_000 + t, gyro=BIAS) for t in times(60.0)]
+        state = run(estimator, still)
+        assert state.rate_b_radps == pytest.approx((0.0, 0.0, 0.0), abs=math.radians(0.05))
+        assert to_euler(state.q_nb)[:2] == pytest.approx((0.0, 0.0), abs=math.radians(1.0))
+
+    def test_is_not_learned_in_motion(self, rng: np.random.Generator) -> None:
+        estimator, rate = make(), BIAS
+        run(estimator, noisy_rest(rng, (0.0, 0.0, 0.0), 0, 5.0))
+        for second in range(5, 15):
+            estimator.update_gps(fix(second * 1_000_000, vel=(20.0, 0.0, 0.0)))
+            state = run(estimator, noisy_rest(rng, rate, second * 1_000_000, 1.0))
+        assert state.rate_b_radps == pytest.approx(rate, abs=math.radians(0.5))
+
+    def test_follows_from_rest_to_rest(self, rng: np.random.Generator) -> None:
+        estimator = make()
+        run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
+        run(estimator, [imu(20_000_000 + t, gyro=(1.0, 0.0, 0.0)) for t in times(1.0)])
+        state = run(estimator, noisy_rest(rng, (0.0, 0.0, 0.0), 21_000_000, 20.0))
+        assert estimator.state[1].bias_b == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+        assert NavFlags.ATTITUDE_VALID in state.flags
+
+
+def test_a_long_turn_does_not_level_the_horizon() -> None:
+    """Two minutes of circling at 20 m/s, always the same way: the accelerometer says level."""
+    bank, speed_mps = math.radians(30.0), 20.0
+    turn_radps = G * math.tan(bank) / speed_mps
+    estimator, worst = make(), 0.0
+    run(estimator, [imu(0, tilted(bank, 0.0))])
+    rate = rotate_inverse(from_euler(bank, 0.0, 0.0), (0.0, 0.0, turn_radps))
+    for t in times(120.0):
+        yaw = turn_radps * t * 1e-6
+        q = from_euler(bank, 0.0, yaw)
+        if t % 1_000_000 == 0:
+            course = (speed_mps * math.cos(yaw), speed_mps * math.sin(yaw), 0.0)
+            estimator.update_gps(fix(t, vel=course))
+        mag = rotate_inverse(q, (20.0, 0.0, 40.0)) if t % 100_000 == 0 else None
+        state = estimator.update_imu(imu(t, (0.0, 0.0, -G / math.cos(bank)), rate, mag=mag))
+        roll, pitch, found = to_euler(state.q_nb)
+        off = (roll - bank, pitch, math.remainder(found - yaw, 2.0 * math.pi))
+        worst = max(worst, *map(abs, off))
+    assert math.degrees(worst) < 6.5, math.degrees(worst)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_split_run_equals_one_run(seed: int) -> None:
+    samples = noisy_rest(np.random.default_rng(seed), BIAS, -3_000_000, 3.0) + noisy_flight(seed)
+    whole, first, second = make(), make(), make()
+    for estimator in (whole, first):
+        run(estimator, samples[:350])
+        estimator.update_gps(fix(500_000, vel=(1.0, 2.0, 3.0)))
+    run(first, samples[350:511])
+    second.state = first.state
+    assert run(whole, samples[350:]) == run(second, samples[511:])
+
+
+def test_norm_stays_one() -> None:
+    state = run(make(), noisy_flight(9))
+    assert sum(x * x for x in state.q_nb) == pytest.approx(1.0, abs=1e-12)
+
+
+class TestNonsense:
+    def test_not_finite_is_left_out_and_told(self) -> None:
+        estimator = make()
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        state = run(estimator, [imu(510_000, (math.nan, 0.0, -G), mag=(math.nan, 0.0, 0.0))])
+        assert NavFlags.SENSOR_FAULT | NavFlags.DEGRADED in state.flags
+        assert all(map(math.isfinite, (*state.q_nb, state.lat_deg, *state.vel_n_mps)))
+        assert NavFlags.SENSOR_FAULT not in run(estimator, [imu(520_000)]).flags
+
+    @pytest.mark.parametrize("bad", [1e30, 1e300, -1e4])
+    def test_a_value_beyond_any_sensor_leaves_no_trace(self, bad: float) -> None:
+        estimator = make()
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        broken = [imu(500_000 + t, (bad, 0.0, bad), (0.0, bad, 0.0)) for t in times(0.2)]
+        assert NavFlags.SENSOR_FAULT in run(estimator, broken).flags
+        estimator.update_gps(fix(700_000))
+        state = run(estimator, [imu(710_000)])
+        assert NavFlags.SENSOR_FAULT not in state.flags
+        assert state.q_nb == pytest.approx((1.0, 0.0, 0.0, 0.0))
+        assert metres(state) == pytest.approx((0.0, 0.0), abs=0.02)
+
+    def test_not_finite_from_the_start(self) -> None:
+        state = run(make(), [imu(0, (math.nan, math.nan, math.nan))])
+        assert NavFlags.ATTITUDE_VALID not in state.flags
+        assert state.q_nb == (1.0, 0.0, 0.0, 0.0)
+
+    def test_a_late_sample_changes_nothing(self) -> None:
+        estimator = make()
+        state = run(estimator, [imu(t, gyro=(0.1, 0.0, 0.0)) for t in times(0.5)])
+        late = run(estimator, [imu(100_000, gyro=(9.0, 9.0, 9.0))])
+        assert (late.q_nb, late.time_us) == (state.q_nb, state.time_us)
+
+    @pytest.mark.parametrize("jump_us", [5_000_000, -5_000_000])
+    def test_a_jump_in_time_is_not_integrated(self, jump_us: int) -> None:
+        estimator = make(alpha_gyro=1.0)
+        run(estimator, [imu(10_000_000 + t) for t in times(0.5)])
+        state = run(estimator, [imu(10_500_000 + jump_us, gyro=(1.0, 0.0, 0.0))])
+        assert to_euler(state.q_nb)[0] == pytest.approx(0.0, abs=1e-9)
+        assert state.time_us == 10_500_000 + jump_us
+
+    def test_unusable_fix_is_ignored(self) -> None:
+        estimator = make()
+        run(estimator, [imu(0)])
+        estimator.update_gps(fix(0, fix_type=GpsFixType.NONE))
+        assert math.isnan(run(estimator, [imu(10_000)]).lat_deg)
+
+
+def test_says_when_it_dead_reckons_and_when_that_ends() -> None:
+    estimator = make()
+    run(estimator, [imu(0)])
+    estimator.update_gps(fix(0))
+    assert NavFlags.USING_GPS in run(estimator, [imu(400_000)]).flags
+    dead = NavFlags.DEAD_RECKONING | NavFlags.DEGRADED | NavFlags.POSITION_VALID
+    assert dead in run(estimator, [imu(5_000_000)]).flags
+    assert NavFlags.POSITION_VALID not in run(estimator, [imu(40_000_000)]).flags
+
+
+def test_reset_forgets() -> None:
+    estimator = make()
+    run(estimator, [imu(0, tilted(1.0, 0.0))])
+    estimator.update_gps(fix(0))
+    estimator.reset()
+    state = run(estimator, [imu(0)])
+    assert math.isnan(state.lat_deg)
+    assert state.q_nb == (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("blend", ["at_fix", "every_sample"])
+def test_a_whole_log_gives_the_same_bits(rng: np.random.Generator, blend: str) -> None:
+    """Rest, noise, a gap, unsound and repeated samples, fixes with and without velocity."""
+    moments = [t for t in times(4.0) if not 1_500_000 < t < 2_300_000]
+    moments.insert(50, moments[49])
+    samples = noisy_rest(rng, BIAS, -3_000_000, 3.0)
+    samples += [
+        ImuSample(
+            time_us=t,
+            accel_b_mps2=(math.nan, 0.0, 0.0) if k == 30 else (0.0, 0.0, -G),
+            gyro_b_radps=(0.0, 0.0, 0.0),
+            accel_lowpass_b_mps2=tuple(rng.normal((0.0, 0.0, -G), 2.0).tolist()),
+            gyro_highpass_b_radps=tuple(rng.normal(0.0, 1.0, 3).tolist()),
+            mag_b_ut=tuple(rng.normal(0.0, 30.0, 3).tolist()) if k % 3 == 0 else None,
+            temperature_degc=20.0,
+            flags=imu(0).flags,
+        )
+        for k, t in enumerate(moments)
+    ]
+    fixes = [
+        fix(t, north_m=t * 1e-5, vel=(math.nan,) * 3 if t == 900_000 else (9.0, 1.0, 0.2))
+        for t in range(300_000, 4_000_000, 200_000)
+    ]
+    reference = ReferenceSettings(gps_latency_s=0.1)
+    estimator = make(reference, blend=blend, alpha_accel=0.7, beta_velocity=0.4)
+    waiting, expected = list(fixes), []
+    for sample in samples:
+        while waiting and waiting[0].time_us <= sample.time_us:
+            estimator.update_gps(waiting.pop(0))
+        s = estimator.update_imu(sample)
+        expected.append((*s.q_nb, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps, float(s.flags)))
+    table = np.array(
+        [
+            (*s.accel_lowpass_b_mps2, *s.gyro_highpass_b_radps, *(s.mag_b_ut or (math.nan,) * 3))
+            for s in samples
+        ]
+    )
+    table[len(samples) - len(moments) + 30, :6] = math.nan
+    found = estimator.run(np.array([s.time_us for s in samples]), table, fixes)
+    np.testing.assert_array_equal(found, np.array(expected))
+
+
+def test_a_log_that_goes_back_is_refused() -> None:
+    with pytest.raises(ValueError, match="go back"):
+        make().run(np.array([2, 1]), np.zeros((2, 9)), [])

@@ -1,0 +1,131 @@
+"""An autopilot's messages become records in SI, on one clock."""
+
+import math
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.flightlog.table.autopilot import AutopilotReader, Imported
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags
+from tests.flightlog.frames import START_US
+
+G = 9.80665
+Message = Any
+
+
+def highres(time_us: int, updated: int = 0b111111111) -> Message:
+    return mavlink.MAVLink_highres_imu_message(
+        time_us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.05, -0.4, 950, 0, 400, 21.5, updated
+    )
+
+
+def raw(time_us: int) -> Message:
+    return mavlink.MAVLink_raw_imu_message(time_us, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
+
+
+def gps(time_us: int, alt_mm: int = 430_000, fix: int = 3) -> Message:
+    return mavlink.MAVLink_gps_raw_int_message(
+        time_us, fix, 471_000_000, 85_000_000, alt_mm, 120, 65535, 1500, 9000, 11
+    )
+
+
+def read(
+    messages: list[tuple[int, Message]], system_id: int = 1, component_id: int = 1
+) -> list[Imported]:
+    reader = AutopilotReader()
+    mav = mavlink.MAVLink(None, system_id, component_id)
+    return [
+        record
+        for at_us, message in messages
+        for record in reader.feed(bytes(message.pack(mav)), START_US + at_us)
+    ]
+
+
+def test_highres_imu_is_taken_in_si() -> None:
+    (imu,) = read([(0, highres(5_000_000))])
+    assert isinstance(imu, ImuCalibrated)
+    assert imu.time_us == 0
+    assert imu.accel_b_mps2 == pytest.approx((0.1, 0.2, -9.8))
+    assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
+    assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
+    assert imu.temperature_degc == pytest.approx(21.5)
+    assert imu.flags is ImuFlags.MAG_NEW
+
+
+def test_a_magnetometer_that_has_nothing_new_is_left_out() -> None:
+    (imu,) = read([(0, highres(0, updated=0b111111))])
+    assert isinstance(imu, ImuCalibrated)
+    assert imu.mag_b_ut is None
+
+
+def test_raw_and_scaled_imu_are_in_thousandths() -> None:
+    scaled = mavlink.MAVLink_scaled_imu_message(20, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
+    for message in (raw(20_000), scaled):
+        (imu,) = read([(0, message)])
+        assert isinstance(imu, ImuCalibrated)
+        assert imu.accel_b_mps2 == pytest.approx((0.01 * G, 0.02 * G, -G))
+        assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
+        assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
+        assert math.isnan(imu.temperature_degc)
+
+
+def test_the_best_imu_message_wins() -> None:
+    records = read([(0, raw(1000)), (10_000, highres(11_000)), (20_000, raw(21_000))])
+    assert [r.time_us for r in records] == [0, 10_000]
+
+
+def test_pressure_in_pascal() -> None:
+    pressure = mavlink.MAVLink_scaled_pressure_message(15, 950.25, 0, 2150)
+    baro = read([(0, raw(10_000)), (5_000, pressure)])[1]
+    assert isinstance(baro, BaroRaw)
+    assert (baro.time_us, baro.pressure_pa, baro.temperature_degc) == (5_000, 95_025.0, 21.5)
+
+
+def test_a_fix_has_the_velocity_of_its_course_and_its_heights() -> None:
+    first, second = read([(0, raw(0)), (0, gps(1_000)), (200_000, gps(201_000, 431_000))])[1:]
+    assert isinstance(first, GpsFix)
+    assert isinstance(second, GpsFix)
+    assert (first.lat_dege7, first.lon_dege7) == (471_000_000, 85_000_000)
+    assert first.fix_type is GpsFixType.FIX_3D
+    assert first.pdop == pytest.approx(1.2)
+    assert math.isnan(first.vel_n_mps[2])
+    assert second.vel_n_mps == pytest.approx((0.0, 15.0, -5.0))
+    assert math.isnan(second.h_acc_m)
+    assert second.utc_us is None
+
+
+def test_no_fix_is_told_as_none() -> None:
+    (fix,) = read([(0, raw(0)), (0, gps(0, fix=1))])[1:]
+    assert isinstance(fix, GpsFix)
+    assert not fix.fix_ok
+
+
+def test_other_systems_and_components_are_left_out() -> None:
+    assert read([(0, raw(0))], component_id=191) == []
+    reader = AutopilotReader(system_id=2)
+    frame = bytes(raw(0).pack(mavlink.MAVLink(None, 1, 1)))
+    assert reader.feed(frame, START_US) == []
+
+
+def test_the_clock_never_falls_whatever_the_messages_say() -> None:
+    times = [5_000_000, 5_010_000, 4_000_000, 100, 5_030_000, 9_000_000_000]
+    records = read([(i * 10_000, raw(t)) for i, t in enumerate(times)])
+    stamps = [r.time_us for r in records]
+    assert stamps == sorted(stamps)
+    assert stamps[-1] <= 60_000
+
+
+def test_damage_is_counted() -> None:
+    frame = bytearray(raw(0).pack(mavlink.MAVLink(None, 1, 1)))
+    frame[-1] ^= 0xFF
+    reader = AutopilotReader()
+    assert reader.feed(bytes(frame), START_US) == []
+    assert reader.undecoded == 1
+
+
+@pytest.mark.parametrize(("dt_us", "is_told"), [(2_000_000, True), (2_000_001, False)])
+def test_climb_is_told_of_heights_close_in_time(dt_us: int, is_told: bool) -> None:
+    later = (dt_us, gps(1_000 + dt_us, 431_000))
+    fixes = [r for r in read([(0, raw(0)), (0, gps(1_000)), later]) if isinstance(r, GpsFix)]
+    assert math.isfinite(fixes[1].vel_n_mps[2]) == is_told

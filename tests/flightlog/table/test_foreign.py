@@ -1,0 +1,76 @@
+"""Other people's columns become our rows."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from gateway.flightlog.table.foreign import Column, ColumnMap, ForeignReader
+from gateway.flights.reading import TRACKER_LOG
+from gateway.records import GpsFixType, ImuFlags
+from gateway.sensing.chain import pressure_altitude_m
+
+TRACKER = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"
+NAMES += "gps_vn,gps_ve,gps_vd,note"
+
+
+def read(*lines: str) -> tuple[ForeignReader, list[Any]]:
+    reader = ForeignReader(TRACKER)
+    return reader, list(reader.rows(["# made by somebody", NAMES, *lines]))
+
+
+def test_a_full_line() -> None:
+    _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,20,5,-40,512.5,1.45,47.1,8.5,430,1,2,3,hi")
+    (row,) = rows
+    assert row.time_us == 1_500_000
+    assert row.imu.accel_b_mps2 == (0.1, 0.2, -9.8)
+    assert row.imu.gyro_b_radps == (0.01, 0.02, 0.03)
+    assert row.imu.mag_b_ut == (20.0, 5.0, -40.0)
+    assert row.imu.flags is ImuFlags.MAG_NEW
+    assert pressure_altitude_m(row.baro.pressure_pa) == pytest.approx(512.5, abs=1e-6)
+    assert (row.gps.time_us, row.gps.lat_dege7, row.gps.lon_dege7) == (
+        1_450_000,
+        471_000_000,
+        85_000_000,
+    )
+    assert row.gps.vel_n_mps == (1.0, 2.0, 3.0)
+    assert row.gps.fix_type is GpsFixType.FIX_3D
+    assert math.isnan(row.gps.h_acc_m)
+    assert row.raw is row.state is None
+
+
+def test_blank_cells_are_nothing_new() -> None:
+    _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,,,,,,,,,,,,")
+    (row,) = rows
+    assert row.imu.mag_b_ut is None
+    assert row.imu.flags is ImuFlags(0)
+    assert row.baro is row.gps is None
+
+
+def test_lines_that_cannot_be_read_are_counted() -> None:
+    reader, rows = read("x,1", ",,,", "2,0,0,0,0,0,0,,,,,,,,,,,,")
+    assert len(rows) == 1
+    assert reader.faults == 2
+
+
+def test_scale_and_offset() -> None:
+    columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
+    (row,) = ForeignReader(ColumnMap(columns=columns)).rows(["t,p", "2,95000"])
+    assert row.time_us == 2005
+    assert row.baro is not None
+    assert row.baro.pressure_pa == 95_000.0
+
+
+def test_a_file_without_the_columns_is_refused() -> None:
+    with pytest.raises(ValueError, match="no column ax, ay"):
+        list(ForeignReader(TRACKER).rows(["time_s,az", "1,2"]))
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"), [({"wings": "w", "time_us": "t"}, "wings"), ({}, "time_us")]
+)
+def test_a_wrong_map_is_refused(columns: dict[str, str], text: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=text):
+        msgspec.convert({"columns": columns}, ColumnMap)

@@ -1,0 +1,254 @@
+import math
+import re
+import struct
+from typing import Annotated
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.sensing.calibration import NodeCalibration
+from gateway.settings import Settings, fields_of, setting
+from gateway.vehicle.actions import SaveSettings, SettingsChange
+from gateway.vehicle.services.parameters.parameter_names import parameter_name
+from gateway.vehicle.services.parameters.parameters import ParameterTable, decode_value
+from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from tests.vehicle.ground_station import GroundStation, kinds
+from tests.vehicle.test_start_up import load_parameters
+
+REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
+INT32 = mavlink.MAV_PARAM_TYPE_INT32
+ERROR = {
+    "unknown": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST,
+    "range": mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE,
+    "denied": mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED,
+}
+
+
+def set_message(name: str, value: float, kind: int = REAL32) -> mavlink.MAVLink_param_set_message:
+    return mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, kind)
+
+
+def values(station: GroundStation) -> dict[str, float]:
+    return {m.param_id: m.param_value for m in load_parameters(station).values()}
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "axis", "name"),
+    [
+        ("paper", "alpha_gyro", "", "PAPER_ALPHA_GYRO"),
+        ("rates", "attitude_quaternion", "", "RATE_ATT_QUAT"),
+        ("rates", "global_position_int", "", "RATE_GLB_POS_INT"),
+        ("calibration", "mag_hard_iron", "X", "CAL_MG_HRD_IRN_X"),
+        ("estimation", "estimator", "", "EST_ESTIMATOR"),
+        ("alpha", "alpha", "", "ALPHA"),
+        ("compass", "norm_tolerance", "", "COMPASS_NORM_TOL"),
+    ],
+)
+def test_names(section: str, key: str, axis: str, name: str) -> None:
+    assert parameter_name(section, key, axis) == name
+
+
+def test_the_list_has_every_setting_once(station: GroundStation) -> None:
+    found = values(station)
+    assert found["TUNING_CUTOFF"] == 10.0
+    assert found["TUNING_ORDER"] == 2.0
+    assert found["TUNING_ENABLED"] == 1.0
+    assert [found[f"TUNING_BIAS_{axis}"] for axis in "XYZ"] == [0.0, 1.0, 2.0]
+    assert found["INNER_ALPHA_GYRO"] == 0.75
+    assert found["VEH_TYPE"] == 1.0, "a choice is its place in the list"
+    assert found["RATE_ATT_QUAT"] == 50.0
+    assert not any("SHAPE" in name or "PASS" in name for name in found), "texts are none"
+
+
+def test_the_list_is_paced_and_goes_to_the_one_who_asked(station: GroundStation) -> None:
+    first = station.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    assert len(first) == 10
+    assert station.vehicle.next_due_us() <= station.clock.now_us + 10_000
+    rest = station.wait(0.1)
+    assert "PARAM_VALUE" not in station.broadcasts
+    assert kinds(rest).count("PARAM_VALUE") == first[0].param_count - 10
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_lost_values_are_asked_for_again(station: GroundStation, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    station.loses = lambda *_: rng.random() < 0.3
+    load_parameters(station)
+
+
+def test_read_by_name_and_by_index(station: GroundStation) -> None:
+    request = mavlink.MAVLink_param_request_read_message
+    [named] = station.send(request(1, 1, b"TUNING_ORDER", -1))
+    [indexed] = station.send(request(1, 1, b"", named.param_index))
+    assert named.param_id == indexed.param_id == "TUNING_ORDER"
+    assert named.param_type == REAL32
+
+
+@pytest.mark.parametrize(("name", "index"), [(b"NO_SUCH", -1), (b"", 32_000), (b"", -2)])
+def test_unknown_names_are_refused(station: GroundStation, name: bytes, index: int) -> None:
+    [error] = station.send(mavlink.MAVLink_param_request_read_message(1, 1, name, index))
+    assert (error.get_type(), error.error) == ("PARAM_ERROR", ERROR["unknown"])
+
+
+@pytest.mark.parametrize(
+    ("name", "sent", "path", "stored"),
+    [
+        ("TUNING_CUTOFF", 12.5, "cutoff_hz", 12.5),
+        ("TUNING_CUTOFF", struct.unpack("<f", struct.pack("<f", 0.1))[0], "cutoff_hz", 0.1),
+        ("TUNING_ORDER", 4.0, "order", 4),
+        ("TUNING_ENABLED", 0.0, "enabled", False),
+        ("TUNING_BIAS_Y", -3.5, "bias_mps2", (0.0, -3.5, 2.0)),
+    ],
+)
+def test_a_change_takes_effect_and_is_told_to_all(
+    station: GroundStation, name: str, sent: float, path: str, stored: object
+) -> None:
+    other = GroundStation(station.vehicle, station.clock, client_id=8)
+    [value] = station.send(set_message(name, sent))
+    assert value.param_value == pytest.approx(sent)
+    assert station.broadcasts == {"PARAM_VALUE"}
+    [change] = station.of(SettingsChange)
+    assert (change.vehicle_id, change.section, change.path) == (1, "tuning", path)
+    assert getattr(change.settings, path) == stored
+    assert values(other)[name] == pytest.approx(sent)
+
+
+def test_a_change_in_an_inner_section(station: GroundStation) -> None:
+    station.send(set_message("INNER_ALPHA_GYRO", 0.5))
+    [change] = station.of(SettingsChange)
+    assert change.path == "inner.alpha_gyro"
+    assert change.settings.inner.alpha_gyro == 0.5
+
+
+def test_rates_change_live(station: GroundStation) -> None:
+    station.send(set_message("RATE_ATT_QUAT", 5.0))
+    assert station.vehicle.telemetry.streams[31].interval_us == 200_000
+    station.send(set_message("VEH_TYPE", 2.0))
+    [_, beat] = station.request(0)
+    assert beat.type == mavlink.MAV_TYPE_QUADROTOR
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("TUNING_CUTOFF", 0.0),
+        ("TUNING_CUTOFF", 1e9),
+        ("TUNING_CUTOFF", math.nan),
+        ("TUNING_CUTOFF", math.inf),
+        ("TUNING_ORDER", 9.0),
+        ("VEH_TYPE", 99.0),
+        ("VEH_TYPE", -1.0),
+    ],
+)
+def test_a_value_out_of_range_changes_nothing(
+    station: GroundStation, name: str, value: float
+) -> None:
+    before = values(station)
+    error, answer = station.send(set_message(name, value))
+    assert (answer.param_id, answer.param_value) == (name, pytest.approx(before[name]))
+    assert (error.get_type(), error.error) == ("PARAM_ERROR", ERROR["range"])
+    assert station.of(SettingsChange) == []
+    assert values(station) == before
+
+
+def test_setting_an_unknown_name_is_refused(station: GroundStation) -> None:
+    [error] = station.send(set_message("NO_SUCH_PARAM_16", 1.0))
+    assert (error.get_type(), error.error) == ("PARAM_ERROR", ERROR["unknown"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        (INT32, "<i"),
+        (mavlink.MAV_PARAM_TYPE_UINT8, "<Bxxx"),
+        (mavlink.MAV_PARAM_TYPE_INT16, "<hxx"),
+    ],
+)
+def test_integers_encoded_byte_wise_are_understood(
+    station: GroundStation, kind: int, code: str
+) -> None:
+    encoded = struct.unpack("<f", struct.pack(code, 5))[0]
+    assert decode_value(encoded, kind) == 5.0
+    station.send(set_message("TUNING_ORDER", encoded, kind))
+    assert values(station)["TUNING_ORDER"] == 5.0
+
+
+def test_an_untrusted_client_changes_nothing_and_is_told(station: GroundStation) -> None:
+    station.trusted = False
+    found = station.send(set_message("TUNING_ORDER", 5.0))
+    assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
+    assert (found[0].error, found[1].param_value) == (ERROR["denied"], 2.0)
+    assert found[2].text == "Refused PARAM_SET of system 255"
+    assert station.vehicle.refusals == 1
+    assert station.of(SettingsChange) == []
+    assert values(station)["TUNING_ORDER"] == 2.0, "reading is free"
+
+
+def test_storage_writes_only_when_asked(station: GroundStation) -> None:
+    station.send(set_message("TUNING_ORDER", 5.0))
+    assert station.of(SaveSettings) == []
+    assert station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)[0].result == 0
+    [save] = station.of(SaveSettings)
+    assert dict(save.sections)["tuning"].order == 5
+
+
+def test_storage_goes_back_to_the_defaults(station: GroundStation) -> None:
+    station.send(set_message("TUNING_ORDER", 5.0))
+    station.send(set_message("RATE_ATT", 1.0))
+    found = station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2)
+    told = {m.param_id: m.param_value for m in found if m.get_type() == "PARAM_VALUE"}
+    assert told == {"TUNING_ORDER": 2.0, "RATE_ATT": 50.0}
+    assert station.vehicle.telemetry.streams[30].interval_us == 20_000
+    assert station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 0)[0].result == 3
+
+
+def test_the_defaults_leave_alone_what_is_no_parameter() -> None:
+    settings = VehicleSettings(signing_passphrase="correct horse", node_silent_s=9.0)
+    table = ParameterTable({"vehicle": settings})
+    fresh = table.reset("vehicle")
+    assert fresh == VehicleSettings(signing_passphrase="correct horse")
+
+
+def test_two_settings_of_one_name_are_a_fault_of_the_caller() -> None:
+    class Twice(Settings, frozen=True):
+        """Two keys that differ beyond sixteen characters."""
+
+        bcdfghjklmnpqrstvwx: Annotated[float, setting("One.")] = 0.0
+        bcdfghjklmnpqrstvwz: Annotated[float, setting("Two.")] = 0.0
+
+    with pytest.raises(ValueError, match="used twice"):
+        ParameterTable({"twice": Twice()})
+
+
+def test_every_rate_is_named_as_its_message() -> None:
+    for field in RateSettings.__struct_fields__:
+        assert hasattr(mavlink, f"MAVLINK_MSG_ID_{field.removesuffix('_hz').upper()}")
+
+
+def test_the_gateways_own_settings_have_names_that_tell() -> None:
+    settings = GatewaySettings()
+    sections = {
+        "vehicle": settings.vehicle,
+        "sensing": settings.sensing,
+        "estimation": settings.estimation,
+        "calibration": NodeCalibration(),
+    }
+    table = ParameterTable(sections)
+    assert {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "SENS_ACC_CUTOFF", "REF_GPS_LATENCY"} <= set(
+        table.index
+    )
+    for parameter in table.parameters:
+        assert re.fullmatch(r"[A-Z][A-Z0-9_]{1,15}", parameter.name)
+        assert table.number(parameter) == pytest.approx(
+            parameter.to_number(parameter.field.default)
+        ), "the default is within its own range"
+        assert parameter.field.meaning, parameter.name
+
+
+def test_an_angle_of_a_mounting_is_described_by_the_first_sentence_of_the_mounting() -> None:
+    table = ParameterTable({"calibration": NodeCalibration()})
+    meaning = table.parameters[table.index["CAL_MNT_ROLL"]].field.meaning
+    told = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]
+    assert f" of the {told[0].lower()}{told[1:]}. Yaw is turned first" in meaning

@@ -1,0 +1,190 @@
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.geometry.quaternion import from_euler, rotate_inverse
+from gateway.records import Vec3
+from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured
+from gateway.vehicle.services.calibrator import fit_sphere
+from tests.vehicle.ground_station import GroundStation
+from tests.vehicle.samples import sample_at, state_at
+
+G = 9.80665
+CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
+ACCEPTED, NOT_NOW, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 3, 4, 5
+GYRO, MAG = (1,), (0, 1)
+SIX_SIDES, LEVEL, SIMPLE = (0, 0, 0, 0, 1), (0, 0, 0, 0, 2), (0, 0, 0, 0, 4)
+
+Motion = Callable[[float], dict[str, Any]]
+
+
+def run(station: GroundStation, seconds: float, motion: Motion) -> list[Any]:
+    """Feed samples at 100 Hz; acknowledgements and texts."""
+    found = []
+    for _ in range(round(seconds * 100)):
+        now_us = station.clock.advance(0.01)
+        sample = sample_at(now_us, **motion(now_us * 1e-6))
+        found += station.receive(station.vehicle.on_state(state_at(now_us), sample, now_us))
+        found += station.receive(station.vehicle.poll(now_us))
+    return [m for m in found if m.get_type() in ("COMMAND_ACK", "STATUSTEXT")]
+
+
+def acks(found: list[Any]) -> list[int]:
+    return [m.result for m in found if m.get_type() == "COMMAND_ACK"]
+
+
+def cal_texts(found: list[Any]) -> list[str]:
+    texts = [m.text for m in found if m.get_type() == "STATUSTEXT"]
+    return [text.removeprefix("[cal] ") for text in texts if text.startswith("[cal] ")]
+
+
+def rest(gyro: Vec3 = (0.0, 0.0, 0.0), accel: Vec3 = (0.0, 0.0, -G), noise: float = 0.01) -> Motion:
+    rng = np.random.default_rng(1)
+
+    def motion(_time_s: float) -> dict[str, Any]:
+        jitter = rng.normal(scale=noise, size=(2, 3))
+        return {
+            "gyro_b_radps": tuple((np.array(gyro) + jitter[0]).tolist()),
+            "accel_b_mps2": tuple((np.array(accel) + jitter[1]).tolist()),
+        }
+
+    return motion
+
+
+def measured(station: GroundStation) -> CalibrationMeasured:
+    [found] = station.of(CalibrationMeasured)
+    return found
+
+
+def test_gyro(station: GroundStation) -> None:
+    found = station.command(CALIBRATE, *GYRO)
+    assert acks(found) == [IN_PROGRESS]
+    assert cal_texts(found) == ["calibration started: 2 gyro"]
+    found = run(station, 4.0, rest(gyro=(0.02, -0.03, 0.01)))
+    assert acks(found) == [IN_PROGRESS] * 9 + [ACCEPTED]
+    progress = [m.progress for m in found if m.get_type() == "COMMAND_ACK"][:-1]
+    assert progress == [10, 20, 30, 40, 50, 60, 70, 80, 90]
+    assert cal_texts(found)[-1] == "calibration done: gyro"
+    assert (measured(station).vehicle_id, measured(station).kind) == (1, CalibrationKind.GYRO)
+    assert measured(station).error_b == pytest.approx((0.02, -0.03, 0.01), abs=0.003)
+
+
+def test_level(station: GroundStation) -> None:
+    station.command(CALIBRATE, *LEVEL)
+    tilted = rotate_inverse(from_euler(0.1, -0.05, 0.0), (0.0, 0.0, -G))
+    run(station, 4.0, rest(accel=tilted))
+    assert measured(station).kind is CalibrationKind.LEVEL
+    assert measured(station).error_b == pytest.approx((0.1, -0.05, 0.0), abs=0.001)
+
+
+def test_simple_accelerometer(station: GroundStation) -> None:
+    station.command(CALIBRATE, *SIMPLE)
+    run(station, 4.0, rest(accel=(0.3, -0.2, -G + 0.1)))
+    assert measured(station).kind is CalibrationKind.ACCEL
+    assert measured(station).error_b == pytest.approx((0.3, -0.2, 0.1), abs=0.005)
+
+
+def test_accelerometer_on_six_sides(station: GroundStation) -> None:
+    bias = np.array((0.3, -0.2, 0.1))
+    assert acks(station.command(CALIBRATE, *SIX_SIDES)) == [IN_PROGRESS]
+    found = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            side = bias + sign * G * np.eye(3)[axis]
+            found += run(station, 2.5, rest(accel=tuple(side.tolist())))
+            found += run(station, 0.5, lambda t: {"gyro_b_radps": (3.0 * math.sin(9.0 * t),) * 3})
+    assert acks(found)[-1] == ACCEPTED
+    sides = [text.split()[0] for text in cal_texts(found) if "side done" in text]
+    assert sides == ["front", "back", "left", "right", "down"]
+    assert measured(station).error_b == pytest.approx(tuple(bias), abs=0.005)
+
+
+def tumble(centre: Vec3, radius: float) -> Motion:
+    def motion(time_s: float) -> dict[str, Any]:
+        q = from_euler(2.1 * time_s, 1.3 * math.sin(0.7 * time_s), 0.9 * time_s)
+        field = rotate_inverse(q, (0.4 * radius, 0.0, 0.9165 * radius))
+        return {"mag_b_ut": tuple(f + c for f, c in zip(field, centre, strict=True))}
+
+    return motion
+
+
+def test_magnetometer(station: GroundStation) -> None:
+    station.command(CALIBRATE, *MAG)
+    found = run(station, 30.0, tumble((12.0, -7.0, 30.0), 48.0))
+    assert acks(found)[-1] == ACCEPTED
+    assert measured(station).kind is CalibrationKind.MAG
+    assert measured(station).error_b == pytest.approx((12.0, -7.0, 30.0), abs=0.1)
+
+
+def test_magnetometer_that_is_not_turned_enough(station: GroundStation) -> None:
+    def flat(time_s: float) -> dict[str, Any]:
+        return {"mag_b_ut": (20.0 * math.cos(time_s), 20.0 * math.sin(time_s), 40.0)}
+
+    station.command(CALIBRATE, *MAG)
+    found = run(station, 70.0, flat)
+    assert acks(found)[-1] == FAILED
+    assert station.of(CalibrationMeasured) == []
+
+
+@pytest.mark.parametrize("params", [GYRO, LEVEL, SIMPLE])
+def test_movement_fails(station: GroundStation, params: tuple[int, ...]) -> None:
+    station.command(CALIBRATE, *params)
+    found = run(station, 4.0, lambda t: {"gyro_b_radps": (math.sin(5.0 * t), 0.0, 0.0)})
+    assert acks(found)[-1] == FAILED
+    assert cal_texts(found)[-1] == "calibration failed: it was moved"
+    assert station.of(CalibrationMeasured) == []
+
+
+@pytest.mark.parametrize(("noise_radps", "result"), [(0.03, ACCEPTED), (0.08, FAILED)])
+def test_trembling_of_a_hand_is_no_rest(
+    station: GroundStation, noise_radps: float, result: int
+) -> None:
+    station.command(CALIBRATE, *GYRO)
+    assert acks(run(station, 4.0, rest(noise=noise_radps)))[-1] == result
+
+
+def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
+    station.command(CALIBRATE, *GYRO)
+    assert acks([m for m in station.wait(61.0) if m.get_type() == "COMMAND_ACK"]) == [FAILED]
+
+
+def test_cancelling(station: GroundStation) -> None:
+    station.command(CALIBRATE, *GYRO)
+    found = station.command(CALIBRATE)
+    assert (acks(found), cal_texts(found)) == ([ACCEPTED], ["calibration cancelled"])
+    assert acks(run(station, 4.0, rest())) == []
+    assert acks(station.command(CALIBRATE)) == [ACCEPTED], "nothing to cancel is no fault"
+
+
+def test_one_at_a_time(station: GroundStation) -> None:
+    station.command(CALIBRATE, *GYRO)
+    assert acks(station.command(CALIBRATE, *GYRO)) == [IN_PROGRESS], "sent again for a lost ACK"
+    assert acks(station.command(CALIBRATE, *MAG)) == [NOT_NOW]
+
+
+@pytest.mark.parametrize(
+    "params", [(1, 1), (2,), (0, 0, 1), (0, 0, 0, 1), (0,) * 6 + (1,), (1, 0, 0, 0, 2)]
+)
+def test_what_cannot_be_calibrated(station: GroundStation, params: tuple[int, ...]) -> None:
+    assert acks(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
+
+
+def test_the_heartbeat_tells_of_it(station: GroundStation) -> None:
+    station.command(CALIBRATE, *GYRO)
+    beats = [m for m in station.wait(1.5) if m.get_type() == "HEARTBEAT"]
+    assert beats[-1].system_status == mavlink.MAV_STATE_CALIBRATING
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sphere(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.normal(scale=20.0, size=3), float(rng.uniform(20.0, 60.0))
+    points = rng.normal(size=(200, 3))
+    points = centre + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+    found, found_radius = fit_sphere(points)
+    assert found == pytest.approx(tuple(centre), abs=1e-9)
+    assert found_radius == pytest.approx(radius)

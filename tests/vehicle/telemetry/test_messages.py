@@ -1,0 +1,194 @@
+"""Each message, decoded by pymavlink, against the units and signs of the definition."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import GpsFixType, NavFlags
+from gateway.vehicle.encoder import Encoder
+from gateway.vehicle.home import Home, Place
+from gateway.vehicle.telemetry import messages
+from tests.vehicle.samples import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
+
+
+def through_the_wire(message: Any) -> Any:
+    [found] = decode([Encoder(1).encode(message)])
+    return found
+
+
+def test_attitude_quaternion() -> None:
+    found = through_the_wire(messages.attitude_quaternion(STATE))
+    assert found.time_boot_ms == 1000
+    assert (found.q1, found.q2, found.q3, found.q4) == pytest.approx(STATE.q_nb, abs=1e-7)
+    rates = (found.rollspeed, found.pitchspeed, found.yawspeed)
+    assert rates == pytest.approx(STATE.rate_b_radps)
+    assert found.repr_offset_q == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_attitude_is_in_radians_with_the_nose_up_positive() -> None:
+    found = through_the_wire(messages.attitude(STATE))
+    angles = (found.roll, found.pitch, found.yaw)
+    assert angles == pytest.approx((0.1, -0.2, math.radians(-88.5)), abs=1e-6)
+    assert found.yawspeed == pytest.approx(-0.03)
+
+
+def test_global_position_int() -> None:
+    found = through_the_wire(messages.global_position_int(STATE, 500.0))
+    assert (found.lat, found.lon) == (471_234_567, -87_654_321)
+    assert (found.alt, found.relative_alt) == (523_456, 23_456)
+    assert (found.vx, found.vy, found.vz) == (300, -400, -125)
+    assert found.hdg == 27_150
+
+
+def test_global_position_int_without_heading() -> None:
+    state = replace(STATE, flags=STATE.flags & ~NavFlags.HEADING_VALID)
+    assert through_the_wire(messages.global_position_int(state, 500.0)).hdg == 65535
+
+
+def test_global_position_int_saturates() -> None:
+    state = replace(STATE, vel_n_mps=(1e6, -1e6, math.nan), alt_amsl_m=1e9)
+    found = through_the_wire(messages.global_position_int(state, -1e9))
+    assert (found.vx, found.vy, found.vz) == (32767, -32768, 0)
+    assert found.alt == found.relative_alt == 2**31 - 1
+
+
+def test_vfr_hud() -> None:
+    found = through_the_wire(messages.vfr_hud(STATE))
+    assert found.groundspeed == pytest.approx(5.0)
+    assert found.climb == pytest.approx(1.25)
+    assert found.alt == pytest.approx(523.456, abs=1e-3)
+    # Half way between two degrees: the float may fall on either side.
+    assert found.heading in (271, 272)
+    assert found.throttle == 0
+    assert found.airspeed == found.groundspeed, "no sensor: as ArduPilot does without one"
+
+
+def test_vfr_hud_of_nothing_is_unknown() -> None:
+    found = through_the_wire(messages.vfr_hud(NOTHING))
+    assert all(math.isnan(v) for v in (found.airspeed, found.groundspeed, found.alt, found.climb))
+
+
+def test_highres_imu() -> None:
+    updated = messages.ACCEL_UPDATED | messages.GYRO_UPDATED | messages.MAG_UPDATED
+    found = through_the_wire(messages.highres_imu(SAMPLE, (20.0, -5.0, 43.0), BARO, updated))
+    assert found.time_usec == 1_000_000
+    assert (found.xacc, found.yacc, found.zacc) == SAMPLE.accel_b_mps2
+    assert (found.xgyro, found.ygyro, found.zgyro) == SAMPLE.gyro_b_radps
+    assert (found.xmag, found.ymag, found.zmag) == pytest.approx((0.2, -0.05, 0.43))
+    assert found.abs_pressure == pytest.approx(951.23)
+    assert found.pressure_alt == pytest.approx(529.5)
+    assert found.temperature == pytest.approx(31.5)
+    assert math.isnan(found.diff_pressure)
+    assert found.fields_updated == 0b1_1111_1111
+
+
+def test_highres_imu_without_magnetometer_and_barometer() -> None:
+    found = through_the_wire(messages.highres_imu(SAMPLE, (math.nan,) * 3, None, 0))
+    unknown = (found.xmag, found.ymag, found.zmag, found.abs_pressure, found.pressure_alt)
+    assert all(math.isnan(value) for value in unknown)
+
+
+def test_scaled_pressure() -> None:
+    found = through_the_wire(messages.scaled_pressure(BARO))
+    assert found.press_abs == pytest.approx(951.23)
+    assert math.isnan(found.press_diff)
+    assert found.temperature == -1234
+
+
+def test_gps_raw_int() -> None:
+    found = through_the_wire(messages.gps_raw_int(FIX))
+    assert found.fix_type == mavlink.GPS_FIX_TYPE_3D_FIX
+    assert (found.lat, found.lon, found.alt) == (471_234_567, -87_654_321, 520_250)
+    assert found.alt_ellipsoid == 567_750
+    assert (found.eph, found.epv) == (65535, 65535)
+    assert found.vel == 500
+    assert found.cog == round(math.degrees(math.atan2(-4.0, 3.0)) * 100) % 36000
+    assert found.satellites_visible == 11
+    assert (found.h_acc, found.v_acc, found.vel_acc) == (1250, 2500, 125)
+    assert found.hdg_acc == 150_000
+    assert found.yaw == 0
+
+
+def test_gps_raw_int_at_rest_has_no_course() -> None:
+    found = through_the_wire(messages.gps_raw_int(replace(FIX, vel_n_mps=(0.1, 0.1, 0.0))))
+    assert (found.vel, found.cog) == (14, 65535)
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "fix_ok", "expected"),
+    [
+        (GpsFixType.NONE, False, mavlink.GPS_FIX_TYPE_NO_FIX),
+        (GpsFixType.DEAD_RECKONING, True, mavlink.GPS_FIX_TYPE_NO_FIX),
+        (GpsFixType.FIX_2D, True, mavlink.GPS_FIX_TYPE_2D_FIX),
+        (GpsFixType.FIX_3D, True, mavlink.GPS_FIX_TYPE_3D_FIX),
+        (GpsFixType.FIX_3D, False, mavlink.GPS_FIX_TYPE_NO_FIX),
+        (GpsFixType.GNSS_AND_DEAD_RECKONING, True, mavlink.GPS_FIX_TYPE_3D_FIX),
+        (GpsFixType.TIME_ONLY, True, mavlink.GPS_FIX_TYPE_NO_FIX),
+    ],
+)
+def test_fix_types(fix_type: GpsFixType, fix_ok: bool, expected: int) -> None:
+    fix = replace(FIX, fix_type=fix_type, fix_ok=fix_ok)
+    assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
+
+
+def test_gps_raw_int_with_unknown_accuracies() -> None:
+    nan = math.nan
+    fix = replace(
+        NO_FIX, alt_ellipsoid_m=nan, h_acc_m=nan, v_acc_m=nan, speed_acc_mps=nan, course_acc_deg=nan
+    )
+    found = through_the_wire(messages.gps_raw_int(fix))
+    assert (found.h_acc, found.v_acc, found.vel_acc, found.hdg_acc, found.alt_ellipsoid) == (0,) * 5
+    assert (found.vel, found.cog) == (65535, 65535)
+
+
+def test_gps_absent() -> None:
+    found = through_the_wire(messages.gps_absent(5_000_000))
+    assert found.fix_type == mavlink.GPS_FIX_TYPE_NO_GPS
+    assert found.satellites_visible == 255
+    assert (found.eph, found.vel, found.cog) == (65535,) * 3
+
+
+def test_estimator_status() -> None:
+    found = through_the_wire(messages.estimator_status(STATE))
+    assert found.flags == (
+        mavlink.ESTIMATOR_ATTITUDE
+        | mavlink.ESTIMATOR_VELOCITY_HORIZ
+        | mavlink.ESTIMATOR_VELOCITY_VERT
+        | mavlink.ESTIMATOR_POS_HORIZ_REL
+        | mavlink.ESTIMATOR_POS_HORIZ_ABS
+        | mavlink.ESTIMATOR_POS_VERT_ABS
+        | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+        | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+    )
+    assert found.pos_horiz_accuracy == pytest.approx(1.0)
+    assert found.pos_vert_accuracy == pytest.approx(2.0)
+    assert math.isnan(found.vel_ratio)
+
+
+def test_estimator_status_of_nothing() -> None:
+    found = through_the_wire(messages.estimator_status(NOTHING))
+    assert found.flags == mavlink.ESTIMATOR_CONST_POS_MODE
+    rejected = replace(NOTHING, flags=NavFlags.GPS_REJECTED | NavFlags.DEAD_RECKONING)
+    assert messages.estimator_status(rejected).flags == mavlink.ESTIMATOR_GPS_GLITCH
+
+
+def test_home_position() -> None:
+    home = Home(Place(47.5, -8.25, 432.1), 7_000_000)
+    found = through_the_wire(messages.home_position(home))
+    assert (found.latitude, found.longitude, found.altitude) == (475_000_000, -82_500_000, 432_100)
+    assert (found.x, found.y, found.z) == (0.0, 0.0, 0.0)
+    assert all(math.isnan(v) for v in (*found.q, found.approach_x, found.approach_z))
+    assert found.time_usec == 7_000_000
+
+
+def test_system_time() -> None:
+    assert through_the_wire(messages.system_time(2_000_000, None)).time_unix_usec == 0
+    found = through_the_wire(messages.system_time(2_000_000, 1_790_000_000_123_456))
+    assert (found.time_unix_usec, found.time_boot_ms) == (1_790_000_000_123_456, 2000)
+
+
+def test_boot_time_wraps_after_49_days() -> None:
+    assert messages.boot_ms(2**32 * 1000 + 5_000) == 5

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from gateway.vehicle.telemetry.streams import OFF, Stream, interval_us
+
+
+def sent(stream: Stream, times_us: np.ndarray) -> np.ndarray:
+    return np.array([t for t in times_us.tolist() if stream.offer(t)])
+
+
+def sample_times(
+    rate_hz: float, seconds: float, jitter_us: float = 0.0, seed: int = 1
+) -> np.ndarray:
+    exact = np.arange(round(rate_hz * seconds)) * (1e6 / rate_hz)
+    noise = np.random.default_rng(seed).uniform(-jitter_us, jitter_us, exact.size)
+    return (exact + noise + 1e6).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("sample_hz", "wanted_hz", "expected_hz"),
+    [
+        (200, 50, 50),
+        (100, 50, 50),
+        (60, 50, 50),
+        (1000, 50, 50),
+        (71.3, 50, 50),
+        (333, 10, 10),
+        (60, 10, 10),
+        (50, 50, 50),
+        (40, 50, 40),
+        (5, 50, 5),
+        (60, 40, 40),
+    ],
+)
+def test_rate_is_the_wanted_one_or_the_samples(
+    sample_hz: float, wanted_hz: float, expected_hz: float
+) -> None:
+    times = sample_times(sample_hz, 60.0, jitter_us=0.05e6 / sample_hz)
+    found = sent(Stream(interval_us(wanted_hz)), times)
+    assert found.size / 60.0 == pytest.approx(expected_hz, rel=0.01)
+
+
+@pytest.mark.parametrize("skew_ppm", [-300.0, 0.0, 300.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_beating_where_the_samples_are_nearly_a_multiple(skew_ppm: float, seed: int) -> None:
+    """A node's crystal is off by some hundred ppm and its stamps jitter: still every 4th sample."""
+    times = sample_times(200.0 * (1.0 + skew_ppm * 1e-6), 120.0, jitter_us=1000.0, seed=seed)
+    found = np.searchsorted(times, sent(Stream(20_000), times))
+    assert set(np.diff(found[50:])) == {4}
+
+
+def test_the_first_sample_is_sent_at_once() -> None:
+    assert Stream(1_000_000).offer(123_456)
+
+
+def test_no_burst_after_a_gap() -> None:
+    stream = Stream(20_000)
+    times = [*range(0, 1_000_000, 10_000), *range(60_000_000, 61_000_000, 10_000)]
+    found = [t for t in times if stream.offer(t)]
+    late = [t for t in found if t >= 60_000_000]
+    assert late[0] == 60_000_000
+    assert len(late) == 50
+
+
+@pytest.mark.parametrize("ask", [Stream.offer, Stream.tick])
+def test_off_sends_nothing(ask: object) -> None:
+    stream = Stream(interval_us(0.0))
+    assert stream.interval_us == OFF
+    assert not any(ask(stream, t) for t in range(0, 10_000_000, 100_000))
+    assert stream.due_us is None
+
+
+def test_timed_messages_keep_their_grid_when_polled_late() -> None:
+    stream = Stream(1_000_000)
+    assert [t for t in range(0, 5_000_000, 70_000) if stream.tick(t)] == [
+        0, 1_050_000, 2_030_000, 3_010_000, 4_060_000,
+    ]  # fmt: skip
+    assert stream.due_us == 5_000_000
+
+
+def test_a_new_interval_takes_effect_at_the_next_sample() -> None:
+    stream = Stream(1_000_000)
+    assert stream.offer(0)
+    stream.change(100_000)
+    assert [t for t in range(10_000, 500_000, 10_000) if stream.offer(t)] == [
+        10_000, 110_000, 210_000, 310_000, 410_000,
+    ]  # fmt: skip
+
+
+def test_samples_from_the_past_do_no_harm() -> None:
+    stream = Stream(20_000)
+    for time_us in (100_000, 110_000, 50_000, 120_000, 0, 130_000):
+        stream.offer(time_us)
+    found = [t for t in range(140_000, 1_140_000, 10_000) if stream.offer(t)]
+    assert len(found) == pytest.approx(50, abs=1)
