@@ -30,10 +30,10 @@ from gateway.records import (
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.sensing.recalibration import (
-    absorb_accel_error,
-    absorb_gyro_error,
-    absorb_mag_error,
-    absorb_tilt,
+    remove_accel_error,
+    remove_gyro_error,
+    remove_mag_error,
+    remove_tilt,
 )
 from gateway.settings import Settings
 from gateway.vehicle.actions import Action as VehicleAction
@@ -63,10 +63,10 @@ Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlace
 """Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
 
 ABSORB: Final = {
-    CalibrationKind.GYRO: absorb_gyro_error,
-    CalibrationKind.ACCEL: absorb_accel_error,
-    CalibrationKind.LEVEL: absorb_tilt,
-    CalibrationKind.MAG: absorb_mag_error,
+    CalibrationKind.GYRO: remove_gyro_error,
+    CalibrationKind.ACCEL: remove_accel_error,
+    CalibrationKind.LEVEL: remove_tilt,
+    CalibrationKind.MAG: remove_mag_error,
 }
 
 
@@ -205,8 +205,8 @@ class Aircraft:
             elif isinstance(action, CalibrationMeasured):
                 calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
                 actions += self._change("calibration", calibration)
-                told = self.vehicle.take_settings("calibration", calibration)
-                actions += self.perform(told, now_us)
+                found = self.vehicle.take_settings("calibration", calibration)
+                actions += self.perform(found, now_us)
             else:
                 actions.append(action)
         return actions

@@ -42,7 +42,7 @@ from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
-from gateway.vehicle.telemetry.events import NOTICE, WARNING, Told
+from gateway.vehicle.telemetry.events import NOTICE, WARNING, StatusText
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ class Daemon:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
         self._read = read
-        self._places = PlaceFiles(aircraft_folder(settings), self._tell_kept)
+        self._places = PlaceFiles(aircraft_folder(settings), self._announce_places)
         at_zero_us = unix_time_us() - self.now_us()
         default, places = settings.default_aircraft, self._places.load()
         self._broken_places = dict(self._places.broken)
@@ -100,7 +100,7 @@ class Daemon:
             self.now_us,
             unix_time_us,
             self._table_head,
-            self._tell,
+            self._announce,
             lambda vehicle_id: self._pipeline.aircraft[vehicle_id].fusion_state,
         )
         self._heard: bytes | None = None
@@ -163,9 +163,9 @@ class Daemon:
         self._metrics.listen(settings.hub.metrics_port)
         self._notifier.ready()
         later = "; others need a new start" if settings != now else ""
-        told = f"settings of the hub and of signing applied{later}"
-        log.info(told)
-        return told
+        status = f"settings of the hub and of signing applied{later}"
+        log.info(status)
+        return status
 
     def close(self) -> None:
         """End everything: first what comes in, then what goes out."""
@@ -215,11 +215,11 @@ class Daemon:
         self._pipeline.disconnect(port)
 
     def _on_trouble(self, text: str) -> None:
-        self._tell(True, text)
+        self._announce(True, text)
 
-    def _tell(self, is_trouble: bool, text: str) -> None:
-        told = Told(WARNING if is_trouble else NOTICE, text)
-        self._perform(self._pipeline.say(told, self.now_us()))
+    def _announce(self, is_trouble: bool, text: str) -> None:
+        status = StatusText(WARNING if is_trouble else NOTICE, text)
+        self._perform(self._pipeline.say(status, self.now_us()))
 
     async def _open_control(self) -> None:
         try:
@@ -248,7 +248,7 @@ class Daemon:
         self._perform(self._pipeline.poll(now_us))
         for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
             # After its first heartbeat, before which ground stations hear nothing of it.
-            self._tell_kept(vehicle_id, self._broken_places.pop(vehicle_id))
+            self._announce_places(vehicle_id, self._broken_places.pop(vehicle_id))
         self._recorder.set_in_flight(self._pipeline.in_flight)
         trouble, recording = self._recorder.trouble, self._recorder.recording
         self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
@@ -284,18 +284,18 @@ class Daemon:
             file = save_aircraft(self._settings, vehicle_id, aircraft.settings)
         except OSError as error:
             log.warning("settings of aircraft %d cannot be saved: %s", vehicle_id, error)
-            told = Told(WARNING, f"Settings not saved: {error.strerror}")
+            status = StatusText(WARNING, f"Settings not saved: {error.strerror}")
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, file)
-            told = Told(NOTICE, f"Settings saved: {file.name}")
-        self._tell_of(aircraft, told)
+            status = StatusText(NOTICE, f"Settings saved: {file.name}")
+        self._announce_for(aircraft, status)
 
-    def _tell_kept(self, vehicle_id: int, trouble: str | None) -> None:
-        told = Told(NOTICE, "Mission, mark and home are kept again")
+    def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
+        status = StatusText(NOTICE, "Mission, mark and home are kept again")
         if trouble is not None:
-            told = Told(WARNING, f"Mission, mark and home not kept: {trouble}")
-        self._tell_of(self._pipeline.aircraft[vehicle_id], told)
+            status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
+        self._announce_for(self._pipeline.aircraft[vehicle_id], status)
 
-    def _tell_of(self, aircraft: Aircraft, told: Told) -> None:
+    def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
         now_us = self.now_us()
-        self._perform(aircraft.perform(aircraft.vehicle.say(told, now_us), now_us))
+        self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))

@@ -28,7 +28,7 @@ from gateway.vehicle.home import Place
 from gateway.vehicle.reader import BAD_SIGNATURE
 from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.events import Told
+from gateway.vehicle.telemetry.events import StatusText
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import Signer
 from gateway.wire.mavlink_splitter import origin_of, restamp
@@ -168,11 +168,11 @@ class Pipeline:
         for aircraft in self.aircraft.values():
             aircraft.vehicle.forget_client(client_id)
 
-    def say(self, told: Told, now_us: int) -> list[Action]:
+    def say(self, status: StatusText, now_us: int) -> list[Action]:
         """Let every aircraft tell its clients a text."""
         actions: list[Action] = []
         for aircraft in self.aircraft.values():
-            actions += aircraft.perform(aircraft.vehicle.say(told, now_us), now_us)
+            actions += aircraft.perform(aircraft.vehicle.say(status, now_us), now_us)
         return actions
 
     def mark(self, place: Place | None, vehicle_id: int | None, now_us: int) -> list[Action]:
@@ -211,8 +211,8 @@ class Pipeline:
         """Note whether a recording runs, or why not; ground stations are told."""
         actions: list[Action] = []
         for each in self.aircraft.values():
-            told = each.vehicle.on_recorder(trouble, now_us, recording=recording)
-            actions += each.perform(told, now_us)
+            found = each.vehicle.on_recorder(trouble, now_us, recording=recording)
+            actions += each.perform(found, now_us)
         return actions
 
     def poll(self, now_us: int) -> list[Action]:

@@ -79,7 +79,7 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
     settings : ReferenceSettings
         Tells which fixes are usable.
     earth : EarthField
-        Told the place of a usable fix.
+        Called with the place of a usable fix.
 
     Returns
     -------

@@ -58,13 +58,13 @@ class Kernels(Generic[State, Gains]):
     """`(state, gains, time_us, *imu_row)`."""
     baro: Callable[[State, Gains, float], None]
     gps: Callable[[State, Gains, int, FloatArray], None]
-    tell: Callable[[State, FloatArray], None]
+    write_output: Callable[[State, FloatArray], None]
     """Writes the output row."""
     run: Callable[..., None]
     """`(state, gains, *arrays of a SampleLog, output)`."""
 
 
-class Held(Generic[State]):
+class RecordHandle(Generic[State]):
     """A record as machine code is handed it, by the address of its bytes.
 
     Compiled code asks a record for its `data`, and numpy's own answer describes all the fields
@@ -73,7 +73,7 @@ class Held(Generic[State]):
     Parameters
     ----------
     record : record
-        Stays the same memory for good; another record needs another `Held`.
+        Stays the same memory for good; another record needs another `RecordHandle`.
     """
 
     __slots__ = ("data", "record")
@@ -88,11 +88,13 @@ def direct(function: Callable[..., Result]) -> Callable[..., Result]:
 
     The dispatcher looks the type of every argument up on every call, which for records of many
     fields takes longer than the work. The caller must keep to the types of the first call, and
-    hands records over as `Held`.
+    hands records over as `RecordHandle`.
     """
     overloads = getattr(function, "overloads", {})
     if len(overloads) != 1:
-        return lambda *args: function(*(a.record if isinstance(a, Held) else a for a in args))
+        return lambda *args: function(
+            *(a.record if isinstance(a, RecordHandle) else a for a in args)
+        )
     code: Callable[..., Result] = next(iter(overloads.values())).entry_point
     return code
 
@@ -115,7 +117,7 @@ class KernelEstimator(Generic[State, Gains]):
     ) -> None:
         self._kernels = kernels
         self._gains = gains
-        self._held_gains = Held(gains)
+        self._gains_handle = RecordHandle(gains)
         self._reference = reference
         self._earth = EarthField(reference)
         self._row = np.empty(NAV_COLUMNS)
@@ -126,9 +128,9 @@ class KernelEstimator(Generic[State, Gains]):
         kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
         kernels.baro(scrap, gains, 0.0)
         kernels.gps(scrap, gains, 0, np.zeros(GPS_COLUMNS))
-        kernels.tell(scrap, self._row)
+        kernels.write_output(scrap, self._row)
         self._imu, self._baro = direct(kernels.imu), direct(kernels.baro)
-        self._gps, self._tell = direct(kernels.gps), direct(kernels.tell)
+        self._gps, self._write_output = direct(kernels.gps), direct(kernels.write_output)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -138,11 +140,11 @@ class KernelEstimator(Generic[State, Gains]):
 
     @property
     def _state(self) -> State:
-        return self._held.record
+        return self._handle.record
 
     @_state.setter
     def _state(self, record: State) -> None:
-        self._held = Held(record)
+        self._handle = RecordHandle(record)
 
     @property
     def state(self) -> State:
@@ -178,8 +180,8 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._imu(self._held, self._held_gains, sample.time_us, *imu_row(sample))
-        self._tell(self._held, self._row)
+        self._imu(self._handle, self._gains_handle, sample.time_us, *imu_row(sample))
+        self._write_output(self._handle, self._row)
         return nav_state(sample.time_us, self._row)
 
     def update_baro(self, sample: BaroSample) -> None:
@@ -190,7 +192,7 @@ class KernelEstimator(Generic[State, Gains]):
         sample : BaroSample
             Its pressure altitude is used.
         """
-        self._baro(self._held, self._held_gains, sample.alt_pressure_m)
+        self._baro(self._handle, self._gains_handle, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
         """Take in one GPS fix at its arrival.
@@ -201,7 +203,7 @@ class KernelEstimator(Generic[State, Gains]):
             Fused as of the time it was valid.
         """
         row = gps_row(fix, self._reference, self._earth)
-        self._gps(self._held, self._held_gains, fix.time_us, np.array(row))
+        self._gps(self._handle, self._gains_handle, fix.time_us, np.array(row))
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""

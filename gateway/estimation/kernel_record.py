@@ -145,12 +145,12 @@ def as_vec(v: FloatArray) -> Vec3:
 
 
 @compiled
-def put(target: FloatArray, values: Vec3) -> None:
+def write_vec(target: FloatArray, values: Vec3) -> None:
     """Write three numbers of a record."""
     target[0], target[1], target[2] = values
 
 
 @compiled
-def put_quat(target: FloatArray, values: Quat) -> None:
+def write_quat(target: FloatArray, values: Quat) -> None:
     """Write four numbers of a record."""
     target[0], target[1], target[2], target[3] = values

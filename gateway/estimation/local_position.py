@@ -6,7 +6,7 @@ from typing import Annotated, Final
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_ALT, GPS_LAT, GPS_LON, GPS_VEL
 from gateway.estimation.history import SLOTS
-from gateway.estimation.kernel_record import FloatArray, as_vec, put
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.records import Vec3
 
@@ -118,7 +118,7 @@ def is_relocked(s: PlaceState, relock_s: float, pos: Vec3, vel: Vec3) -> bool:
     east = s.reject_last[2] + vel[1] * dt
     agrees = dt < 5.0 and math.hypot(pos[0] - north, pos[1] - east) < AGREE_M
     s.reject_s = s.reject_s + dt if agrees else 0.0
-    put(s.reject_last, (s.time_s, pos[0], pos[1]))
+    write_vec(s.reject_last, (s.time_s, pos[0], pos[1]))
     return s.reject_s > relock_s
 
 

@@ -72,7 +72,7 @@ class FieldState:
 
 
 @compiled
-def judge_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float) -> float:
+def compare_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float) -> float:
     """Compare the field with the usual one.
 
     Parameters
@@ -120,7 +120,7 @@ def judge_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: float
 
 
 @compiled
-def likeness(s: FieldState, norm: float, dip: float) -> float:
+def field_similarity(s: FieldState, norm: float, dip: float) -> float:
     """Weigh a field by how alike it is to the usual one: what bends the one bends the other.
 
     Parameters

@@ -3,7 +3,7 @@
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, put
+from gateway.estimation.kernel_record import FloatArray, write_vec
 from gateway.records import Vec3
 
 STUCK_S: Final = 1.0
@@ -40,7 +40,7 @@ def is_same(v: Vec3, last: FloatArray) -> bool:
 
 
 @compiled
-def judge_sensors(s: HealthState, gyro: Vec3, accel: Vec3, dt: float) -> tuple[bool, bool]:
+def check_sensors(s: HealthState, gyro: Vec3, accel: Vec3, dt: float) -> tuple[bool, bool]:
     """Tell whether gyroscope and accelerometer may be believed.
 
     Parameters
@@ -61,8 +61,8 @@ def judge_sensors(s: HealthState, gyro: Vec3, accel: Vec3, dt: float) -> tuple[b
     # Both standing still is a perfectly quiet input, not a fault.
     s.stuck_gyro_s = s.stuck_gyro_s + dt if same_gyro and not same_accel else 0.0
     s.stuck_accel_s = s.stuck_accel_s + dt if same_accel and not same_gyro else 0.0
-    put(s.gyro_last, gyro)
-    put(s.accel_last, accel)
+    write_vec(s.gyro_last, gyro)
+    write_vec(s.accel_last, accel)
     return (
         is_sound(gyro, GYRO_LIMIT_RADPS) and s.stuck_gyro_s < STUCK_S,
         is_sound(accel, ACCEL_LIMIT_MPS2) and s.stuck_accel_s < STUCK_S,

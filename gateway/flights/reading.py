@@ -66,7 +66,7 @@ class FlightError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class ReadOptions:
     """How a command wants its flights."""
 
     current: PipelineSettings
@@ -96,14 +96,14 @@ class RecordedTable:
         return (row for row in self.rows if isinstance(row, TableRow))
 
 
-def open_rows(path: Path, wishes: Wishes) -> RecordedTable:
+def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     """Open any file that holds a flight as a table.
 
     Parameters
     ----------
     path : Path
         A table, a foreign CSV, or an autopilot's tlog.
-    wishes : Wishes
+    options : ReadOptions
         Column map, vehicle, settings.
 
     Returns
@@ -120,17 +120,17 @@ def open_rows(path: Path, wishes: Wishes) -> RecordedTable:
     """
     match kind_of(path):
         case FileKind.TABLE:
-            return _open_table(path, wishes)
+            return _open_table(path, options)
         case FileKind.FOREIGN:
-            return _open_foreign(path, wishes)
+            return _open_foreign(path, options)
         case FileKind.TLOG:
-            return _open_autopilot(path, wishes)
+            return _open_autopilot(path, options)
 
 
-def aircraft_of(table: RecordedTable, wishes: Wishes) -> AircraftSettings:
+def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
     """Choose the settings for one table: its own, or those of today."""
-    if wishes.choice == "current" or not table.header.settings:
-        return wishes.current.aircraft.get(table.header.vehicle_id, wishes.current.default)
+    if options.choice == "current" or not table.header.settings:
+        return options.current.aircraft.get(table.header.vehicle_id, options.current.default)
     try:
         return settings_of(table.header)
     except msgspec.ValidationError as error:
@@ -234,10 +234,10 @@ def _moved(record: Moved | None, shift_us: int) -> Moved | None:
     return None if record is None else replace(record, time_us=record.time_us + shift_us)
 
 
-def foreign_rows(lines: Iterable[str], wishes: Wishes) -> Iterator[TableRow]:
+def foreign_rows(lines: Iterable[str], options: ReadOptions) -> Iterator[TableRow]:
     """Read the lines of another program's CSV; raises ValueError as `ForeignReader.rows`."""
-    known = wishes.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
-    reader = ForeignReader(known, wishes.system_id or 1, lenient=wishes.columns is None)
+    known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+    reader = ForeignReader(known, options.system_id or 1, lenient=options.columns is None)
     return reader.rows(lines)
 
 
@@ -250,9 +250,9 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
         yield rest.decode(errors="replace")
 
 
-def _open_table(path: Path, wishes: Wishes) -> RecordedTable:
+def _open_table(path: Path, options: ReadOptions) -> RecordedTable:
     reader = TableReader()
-    events = read_events(path, reader, wishes.progress)
+    events = read_events(path, reader, options.progress)
     lines = (event for event in events if isinstance(event, Line))
     head: list[Line] = []
     for line in lines:
@@ -262,20 +262,20 @@ def _open_table(path: Path, wishes: Wishes) -> RecordedTable:
     raise FlightError(f"{path}: holds no row")
 
 
-def _open_foreign(path: Path, wishes: Wishes) -> RecordedTable:
-    rows = foreign_rows(_lines(path, wishes.progress), wishes)
+def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
+    rows = foreign_rows(_lines(path, options.progress), options)
     try:
         first = next(rows, None)
     except ValueError as error:
         raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
-    return _headed(first, rows, wishes, wishes.system_id or 1, None)
+    return _headed(first, rows, options, options.system_id or 1, None)
 
 
-def _open_autopilot(path: Path, wishes: Wishes) -> RecordedTable:
-    reader, builder = AutopilotReader(wishes.system_id), RowBuilder()
-    records = recorded_frames([path], wishes.progress)
+def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
+    reader, builder = AutopilotReader(options.system_id), RowBuilder()
+    records = recorded_frames([path], options.progress)
 
     def rows() -> Iterator[TableRow]:
         for record in records:
@@ -289,18 +289,18 @@ def _open_autopilot(path: Path, wishes: Wishes) -> RecordedTable:
         raise FlightError(
             f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )
-    return _headed(first, stream, wishes, reader.system_id or 1, reader.unix_us_at_zero)
+    return _headed(first, stream, options, reader.system_id or 1, reader.unix_us_at_zero)
 
 
 def _headed(
     first: TableRow,
     rest: Iterator[TableRow],
-    wishes: Wishes,
+    options: ReadOptions,
     vehicle_id: int,
     unix_us_at_zero: int | None,
 ) -> RecordedTable:
     """Give rows of another program the head of a table, with the settings of today."""
-    current = wishes.current.aircraft.get(vehicle_id, wishes.current.default)
+    current = options.current.aircraft.get(vehicle_id, options.current.default)
     # Its values are calibrated already, whatever the calibration of the aircraft of that number.
     calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
     known = header_for(calibrated, vehicle_id)

@@ -16,8 +16,8 @@ from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.reading import (
     Line,
+    ReadOptions,
     RecordedTable,
-    Wishes,
     aircraft_of,
     foreign_rows,
     joined_rows,
@@ -37,7 +37,7 @@ class Refusion:
     ----------
     files : sequence of Path
         Anything that `open_rows` reads, of one aircraft.
-    wishes : Wishes
+    options : ReadOptions
         Settings, and how positions are told.
 
     Raises
@@ -46,14 +46,14 @@ class Refusion:
         If there is no flight in a file, or they do not belong together.
     """
 
-    def __init__(self, files: Sequence[Path], wishes: Wishes) -> None:
-        self._table = table = joined_rows([open_rows(file, wishes) for file in files])
-        self._aircraft, self._zero_us = aircraft_of(table, wishes), table.header.unix_us_at_zero
-        self._recorded = wishes.choice == "recorded"
+    def __init__(self, files: Sequence[Path], options: ReadOptions) -> None:
+        self._table = table = joined_rows([open_rows(file, options) for file in files])
+        self._aircraft, self._zero_us = aircraft_of(table, options), table.header.unix_us_at_zero
+        self._recorded = options.choice == "recorded"
         correct = None
-        if wishes.position == "interpolated":
+        if options.position == "interpolated":
             latency_s = self._aircraft.estimation.reference.gps_latency_s
-            correct = InterpolatedPosition(_fixes_of(files, wishes), latency_s)
+            correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
         common = PipelineSettings(self._aircraft, {}, self._zero_us or 0, correct)
         self._replay = Replay(Pipeline(common), follow=self._recorded)
 
@@ -102,11 +102,11 @@ class Refusion:
             yield from builder.flush()
 
 
-def end_of(file: Path, wishes: Wishes) -> int | None:
+def end_of(file: Path, options: ReadOptions) -> int | None:
     """Tell the civil time of a table's last row without reading all of it; None if unknown."""
     head, tail = read_ends(file)
     if kind_of(file) is FileKind.FOREIGN:
-        rows = list(foreign_rows((head + tail).decode(errors="replace").splitlines(), wishes))
+        rows = list(foreign_rows((head + tail).decode(errors="replace").splitlines(), options))
         zero_us = 0
     else:
         reader = TableReader()
@@ -116,8 +116,8 @@ def end_of(file: Path, wishes: Wishes) -> int | None:
     return zero_us + rows[-1].time_us if rows else None
 
 
-def _fixes_of(files: Iterable[Path], wishes: Wishes) -> Iterator[GpsFix]:
+def _fixes_of(files: Iterable[Path], options: ReadOptions) -> Iterator[GpsFix]:
     """Read the fixes beside the rows, a little ahead of them."""
-    quiet = replace(wishes, progress=None)
+    quiet = replace(options, progress=None)
     table = joined_rows([open_rows(file, quiet) for file in files])
     return (row.gps for row in table.plain_rows if row.gps is not None)

@@ -15,7 +15,7 @@ class Digest:
     in_full : int
         Most lines told in full in one minute.
     rest : str
-        Told after the number of the others.
+        Called after the number of the others.
     """
 
     def __init__(self, in_full: int, rest: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gateway.geometry.rotation import Matrix3
 from gateway.records import Vec3
 from gateway.sensing.calibration import Correction, NodeCalibration
-from gateway.sensing.recalibration import absorb_tilt
+from gateway.sensing.recalibration import remove_tilt
 from gateway.sensing.solvers import (
     NodeSamples,
     distinct_poses,
@@ -78,7 +78,7 @@ def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeC
     """Turn the mounting by the small tilt that a level aircraft seems to have."""
     x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
     roll, pitch = np.arctan2(-y, -z), np.arctan2(x, np.hypot(y, z))
-    return absorb_tilt(calibration, (float(roll), float(pitch), 0.0))
+    return remove_tilt(calibration, (float(roll), float(pitch), 0.0))
 
 
 def seen_poses(samples: Sequence[NodeSamples]) -> int:

@@ -10,27 +10,27 @@ from gateway.records import Vec3
 from gateway.sensing.calibration import NodeCalibration
 
 
-def absorb_gyro_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
+def remove_gyro_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
     """Shift the gyroscope's bias so that `error_b` (rad/s) vanishes from calibrated samples."""
     bias = _shifted(calibration.gyro_bias_radps, calibration.mounting, None, error_b)
     return msgspec.structs.replace(calibration, gyro_bias_radps=bias)
 
 
-def absorb_accel_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
+def remove_accel_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
     """Shift the accelerometer's bias so that `error_b` (m/s2) vanishes."""
     matrix = calibration.accel_matrix
     bias = _shifted(calibration.accel_bias_mps2, calibration.mounting, matrix, error_b)
     return msgspec.structs.replace(calibration, accel_bias_mps2=bias)
 
 
-def absorb_mag_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
+def remove_mag_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibration:
     """Shift the hard iron so that `error_b` (uT) vanishes."""
     matrix = calibration.mag_soft_iron
     bias = _shifted(calibration.mag_hard_iron_ut, calibration.mag_mounting, matrix, error_b)
     return msgspec.structs.replace(calibration, mag_hard_iron_ut=bias)
 
 
-def absorb_tilt(calibration: NodeCalibration, roll_pitch_yaw_rad: Vec3) -> NodeCalibration:
+def remove_tilt(calibration: NodeCalibration, roll_pitch_yaw_rad: Vec3) -> NodeCalibration:
     """Turn both mountings so that an aircraft that seemed tilted by these angles is level."""
     q = from_euler(*roll_pitch_yaw_rad)
     axes = [rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]

@@ -56,7 +56,7 @@ class CalibrationKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationMeasured:
-    """A remaining error of the calibrated samples, to be absorbed by the calibration."""
+    """A remaining error of the calibrated samples, which the calibration then removes."""
 
     vehicle_id: int
     kind: CalibrationKind

@@ -40,7 +40,7 @@ from gateway.vehicle.services.timing import TimingService
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.announcements import Announcements
-from gateway.vehicle.telemetry.events import INFO, NOTICE, Announcer, Told
+from gateway.vehicle.telemetry.events import INFO, NOTICE, Announcer, StatusText
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.motion import IN_AIR
 from gateway.vehicle.telemetry.telemetry import Telemetry
@@ -205,7 +205,9 @@ class Vehicle:
         had_home = self.telemetry.home is not None
         found = self._replies(self.telemetry.on_gps(fix))
         if self.telemetry.home is not None and not had_home:
-            found += self._replies(self._announcements.say(Told(INFO, "Home set by GPS"), now_us))
+            found += self._replies(
+                self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
+            )
         found += self.places.on_fix(fix, now_us)
         found += self._replies(self._announcements.on_fix(now_us))
         return self._finish(found)
@@ -244,9 +246,9 @@ class Vehicle:
             return self._finish(service.handle(request, now_us))
         self.refusals += 1
         name = _describe(request)
-        told = Told(NOTICE, f"Refused {name} of system {request.system_id}")
+        status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}")
         answers = service.refuse(request)
-        answers += self._replies(self._refusal_texts.say(told, now_us))
+        answers += self._replies(self._refusal_texts.say(status, now_us))
         return self._finish(answers)
 
     def poll(self, now_us: int) -> list[Action]:
@@ -288,7 +290,7 @@ class Vehicle:
         """
         return self._finish(self.places.put_mark(place, now_us))
 
-    def say(self, text: Told, now_us: int) -> list[Action]:
+    def say(self, text: StatusText, now_us: int) -> list[Action]:
         """Tell all an event of the gateway, such as a recording that stopped."""
         return self._finish(self._replies(self._announcements.say(text, now_us)))
 
@@ -307,7 +309,7 @@ class Vehicle:
         return [] if message is None else [message]
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return self._replies(self._announcements.say(Told(NOTICE, text), now_us))
+        return self._replies(self._announcements.say(StatusText(NOTICE, text), now_us))
 
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)

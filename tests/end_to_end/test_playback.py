@@ -207,7 +207,7 @@ async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
     gateway = start_gateway("demo")
     recorder = start_mavproxy(gateway.port)
     recorder.until(r"GLOBAL_POSITION_INT \{time_boot_ms : \d{5}", "status GLOBAL_POSITION_INT")
-    # Told to end, it writes what it still holds; the closed input wakes its keyboard thread.
+    # StatusText to end, it writes what it still holds; the closed input wakes its keyboard thread.
     recorder.process.terminate()
     recorder.process.communicate(timeout=START_LIMIT_S)
     gateway.stop()

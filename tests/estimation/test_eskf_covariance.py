@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.eskf.covariance import (
-    absorb,
     clear,
-    hold,
+    consider,
     inject,
     propagate,
+    update_scalar,
 )
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import (
@@ -87,7 +87,7 @@ def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator)
     before, h = state.P.copy(), rng.normal(size=STATES)
     clear(state)
     state.h[:] = h
-    absorb(state, 2.0, 3.0, 1e12)
+    update_scalar(state, 2.0, 3.0, 1e12)
     gain = before @ h / (h @ before @ h + 3.0)
     np.testing.assert_allclose(state.dx, gain * 2.0, atol=1e-9)
     np.testing.assert_allclose(state.P, before - np.outer(gain, h @ before), atol=1e-8)
@@ -99,8 +99,8 @@ def test_held_states_are_considered_but_not_changed(
     before, h = state.P.copy(), rng.normal(size=STATES)
     clear(state)
     state.h[:] = h
-    hold(state, ACCEL_BIAS, 3)
-    absorb(state, 2.0, 3.0, 1e12)
+    consider(state, ACCEL_BIAS, 3)
+    update_scalar(state, 2.0, 3.0, 1e12)
     held = slice(ACCEL_BIAS, ACCEL_BIAS + 3)
     np.testing.assert_array_equal(state.dx[held], 0.0)
     np.testing.assert_allclose(state.P[held, held], before[held, held])
@@ -114,7 +114,7 @@ def test_an_outlier_moves_little_and_is_never_ignored(state: EskfState) -> None:
         clear(s)
         s.h[POS] = 1.0
         s.P[:] = np.eye(STATES)
-        absorb(s, innovation, 1.0, 25.0)
+        update_scalar(s, innovation, 1.0, 25.0)
         moves.append(float(s.dx[POS]))
     assert moves[0] == pytest.approx(0.5)
     assert 0.0 < moves[2] < moves[1] < 5.1

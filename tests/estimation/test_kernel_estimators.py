@@ -139,15 +139,15 @@ def test_the_short_way_into_machine_code_gives_the_same_bits(estimator: KernelEs
             continue
         estimator.update_imu(sample)
         kernels.imu(state, estimator._gains, sample.time_us, *imu_row(sample))
-        kernels.tell(state, row)
+        kernels.write_output(state, row)
     assert state.tobytes() == estimator.state.tobytes()
     np.testing.assert_array_equal(row, estimator._row)
 
 
 def test_what_has_no_machine_code_is_handed_the_record(estimator: KernelEstimator) -> None:
     taken = []
-    direct(lambda *arguments: taken.append(arguments))(estimator._held, 1.0)
-    assert taken == [(estimator._held.record, 1.0)]
+    direct(lambda *arguments: taken.append(arguments))(estimator._handle, 1.0)
+    assert taken == [(estimator._handle.record, 1.0)]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -18,12 +18,12 @@ from gateway.estimation.magfield import (
     LIKE_DIP_RAD,
     NEW_FIELD_S,
     CompassSettings,
-    judge_field,
-    likeness,
+    compare_field,
+    field_similarity,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
-from gateway.estimation.sensor_faults import HealthState, judge_sensors
+from gateway.estimation.sensor_faults import HealthState, check_sensors
 
 GAINS = make_gains(ComplementarySettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 LEVEL = (0.0, 0.0, -9.81)
@@ -81,7 +81,7 @@ class TestField:
     ) -> float:
         state.rate_b[2] = rate
         for _ in range(round(seconds * 20)):
-            weight = judge_field(state, GAINS, norm, 1.1, 0.05)
+            weight = compare_field(state, GAINS, norm, 1.1, 0.05)
         return weight
 
     def test_a_strange_field_is_not_believed_and_a_lasting_one_is(self) -> None:
@@ -102,11 +102,11 @@ class TestField:
 
     def test_a_field_counts_by_its_likeness_to_the_usual_one(self) -> None:
         state = new_record(ComplementaryState)
-        assert likeness(state, 45.0, 1.1) == 1.0
+        assert field_similarity(state, 45.0, 1.1) == 1.0
         self.feed(state, 45.0, 10.0)
-        assert likeness(state, 45.0, 1.1) == pytest.approx(1.0)
-        assert likeness(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(0.5)
-        assert likeness(state, 52.0, 1.1) < 0.1
+        assert field_similarity(state, 45.0, 1.1) == pytest.approx(1.0)
+        assert field_similarity(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(0.5)
+        assert field_similarity(state, 52.0, 1.1) < 0.1
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 179.0, -135.0])
@@ -132,10 +132,10 @@ def test_stuck_sensors() -> None:
     state = new_record(HealthState)
     rng = np.random.default_rng(1)
     for _ in range(150):
-        verdict = judge_sensors(state, (0.3, 0.0, 0.0), tuple(rng.normal(size=3)), 0.01)
+        verdict = check_sensors(state, (0.3, 0.0, 0.0), tuple(rng.normal(size=3)), 0.01)
     assert tuple(verdict) == (False, True)
     for _ in range(150):
-        verdict = judge_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.01)
+        verdict = check_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.01)
     assert tuple(verdict) == (True, True)
 
 

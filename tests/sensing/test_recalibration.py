@@ -26,8 +26,8 @@ def corrections(cal: NodeCalibration) -> dict[str, Correction]:
 
 @pytest.mark.parametrize("sensor", ["accel", "gyro", "mag"])
 def test_the_error_vanishes_from_this_sensor_alone(sensor: str, rng: np.random.Generator) -> None:
-    absorbed = getattr(recalibration, f"absorb_{sensor}_error")(CALIBRATION, ERROR)
-    before, after = corrections(CALIBRATION), corrections(absorbed)
+    corrected = getattr(recalibration, f"remove_{sensor}_error")(CALIBRATION, ERROR)
+    before, after = corrections(CALIBRATION), corrections(corrected)
     raw = tuple(rng.normal(size=3).tolist())
     for name, correction in after.items():
         gone = np.array(before[name].apply(raw)) - np.array(correction.apply(raw))
@@ -39,7 +39,7 @@ def test_what_seemed_tilted_is_level() -> None:
     tilt = (0.1, -0.05, 0.0)
     seen = rotate_inverse(from_euler(*tilt), level)
     raw = np.array(CALIBRATION.mounting).T @ np.array(seen)
-    turned = recalibration.absorb_tilt(CALIBRATION, tilt)
+    turned = recalibration.remove_tilt(CALIBRATION, tilt)
     assert np.array(turned.mounting) @ raw == pytest.approx(np.array(level), abs=1e-12)
     assert np.array(turned.mag_mounting) @ np.array(turned.mag_mounting).T == pytest.approx(
         np.eye(3), abs=1e-12

@@ -284,7 +284,7 @@ def optimise(
     generations : int
         How long to search.
     on_generation : callable
-        Told the best score after each generation.
+        Called with the best score after each generation.
 
     Returns
     -------
@@ -307,12 +307,12 @@ def optimise(
         scores = evaluate([tuple(float(v) for v in point) for point in points])
         return [math.inf if math.isnan(s) else s for s in scores]
 
-    def told(intermediate_result: OptimizeResult) -> None:
+    def report_progress(intermediate_result: OptimizeResult) -> None:
         on_generation(float(intermediate_result.fun))
 
     found = differential_evolution(
         lambda _: math.inf, bounds, maxiter=generations, popsize=6, rng=SEED, polish=False,
-        updating="deferred", workers=many, callback=told, tol=1e-3,
+        updating="deferred", workers=many, callback=report_progress, tol=1e-3,
     )  # fmt: skip
     return tuple(float(v) for v in found.x)
 

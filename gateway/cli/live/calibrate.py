@@ -19,7 +19,7 @@ from gateway.cli.support.terminal import console_of
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock
 from gateway.edges.receiver.serial_port import SerialPort, SerialSettings
-from gateway.flights.reading import Wishes, open_rows
+from gateway.flights.reading import ReadOptions, open_rows
 from gateway.pipeline import PipelineSettings
 from gateway.records import ImuRaw
 from gateway.sensing.calibration import NodeCalibration
@@ -180,7 +180,7 @@ def _log_step(
 
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
     with refusing():
-        table = open_rows(path, Wishes(current=PipelineSettings(settings.default_aircraft)))
+        table = open_rows(path, ReadOptions(current=PipelineSettings(settings.default_aircraft)))
         raws = [
             row.raw
             for row in table.plain_rows

@@ -99,7 +99,7 @@ def delete(
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
     if config is None and socket_path("run").exists():
-        found = [_recording(told) for told in ask("record.list")]
+        found = [_recording(fields) for fields in ask("record.list")]
     else:
         found = list_recordings(_folder(config))
     if json:
@@ -122,8 +122,8 @@ def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> 
         refuse(str(error))
 
 
-def _recording(told: dict[str, Any]) -> Recording:
-    return Recording(**{**told, "files": tuple(Path(file) for file in told["files"])})
+def _recording(fields: dict[str, Any]) -> Recording:
+    return Recording(**{**fields, "files": tuple(Path(file) for file in fields["files"])})
 
 
 def _folder(config: Path | None) -> Path:

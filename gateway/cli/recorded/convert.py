@@ -43,8 +43,8 @@ from gateway.flights.reading import (
     NO_RECORDING,
     FlightError,
     Line,
+    ReadOptions,
     RecordedTable,
-    Wishes,
     open_rows,
 )
 from gateway.flights.refusion import Refusion
@@ -90,7 +90,7 @@ def convert(
         refuse(f"{out}: the output must end in {', '.join(OUTPUTS)}")
     refusion: Refusion | None = None
     with progress_of(files) as advance, refusing():
-        wishes = Wishes(
+        options = ReadOptions(
             current=pipeline_settings(read_settings(config)),
             choice=settings,
             position=position,
@@ -101,11 +101,11 @@ def convert(
         limits = (read_moment(begin), read_moment(end))
         kinds = {kind_of(file) for file in files}
         if out.suffix != ".csv" and kinds == {FileKind.TLOG}:
-            pieces = _from_tlogs(files, out, wishes, limits)
+            pieces = _from_tlogs(files, out, options, limits)
         elif kinds == {FileKind.TABLE} and not fuse and out.suffix != ".tlog":
-            pieces = _as_recorded(files, out, wishes, limits)
+            pieces = _as_recorded(files, out, options, limits)
         else:
-            refusion = Refusion(files, wishes)
+            refusion = Refusion(files, options)
             pieces = _fused_again(refusion, out, limits)
         size = write_new(out, pieces, overwrite=force)
     for remark in refusion.remarks if refusion else ():
@@ -113,19 +113,25 @@ def convert(
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)
 
 
-def _from_tlogs(files: list[Path], out: Path, wishes: Wishes, limits: Limits) -> Iterator[bytes]:
-    recorded = reading.recorded_frames(files, wishes.progress)
+def _from_tlogs(
+    files: list[Path], out: Path, options: ReadOptions, limits: Limits
+) -> Iterator[bytes]:
+    recorded = reading.recorded_frames(files, options.progress)
     first = next(recorded, None)
     if first is None:
         raise FlightError(f"{', '.join(map(str, files))}: {NO_RECORDING}")
     records = _within(chain([first], recorded), limits)
     if out.suffix == ".tlog":
         return _tlog_bytes(records)
-    return _map_shape(out, reading.points_of_frames(records, wishes.system_id))
+    return _map_shape(out, reading.points_of_frames(records, options.system_id))
 
 
-def _as_recorded(files: list[Path], out: Path, wishes: Wishes, limits: Limits) -> Iterator[bytes]:
-    return _from_rows(reading.joined_rows([open_rows(file, wishes) for file in files]), out, limits)
+def _as_recorded(
+    files: list[Path], out: Path, options: ReadOptions, limits: Limits
+) -> Iterator[bytes]:
+    return _from_rows(
+        reading.joined_rows([open_rows(file, options) for file in files]), out, limits
+    )
 
 
 def _fused_again(refusion: Refusion, out: Path, limits: Limits) -> Iterator[bytes]:

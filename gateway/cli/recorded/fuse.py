@@ -39,9 +39,9 @@ from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.select import EstimatorName
 from gateway.flights.reading import (
     FlightError,
+    ReadOptions,
     RecordedTable,
     SettingsChoice,
-    Wishes,
     aircraft_of,
     open_rows,
 )
@@ -105,15 +105,15 @@ def fuse_log(
     current = read_settings(config)
     with progress_of([file]) as advance, refusing():
         facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
-        wishes = Wishes(
+        options = ReadOptions(
             current=pipeline_settings(current),
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,
         )
-        table = open_rows(file, wishes)
+        table = open_rows(file, options)
         aircraft = _adjusted(
-            aircraft_of(table, wishes), estimator, gps_latency_s, {} if config else facts
+            aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
         )
         try:
             chain, running = _begin(table, aircraft)
@@ -133,8 +133,8 @@ def _begin(table: RecordedTable, aircraft: AircraftSettings) -> tuple[SensorChai
         try:
             return make_fusion(aircraft, first)
         except ValueError as error:
-            told = console_of(stderr=True)
-            told.print(SETTLES.format(error), markup=False)
+            console = console_of(stderr=True)
+            console.print(SETTLES.format(error), markup=False)
     else:
         table.rows = itertools.chain([first], table.rows)
     return make_fusion(aircraft)

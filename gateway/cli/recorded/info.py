@@ -98,7 +98,7 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
     file : Path
         A tlog or a table.
     advance : callable, optional
-        Told how many more bytes were read.
+        Called with how many more bytes were read.
 
     Returns
     -------

@@ -48,7 +48,7 @@ from gateway.edges.operator.control_verbs import PlayerVerbs
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, check_speed
 from gateway.flightlog.track import Source, Track
-from gateway.flights.reading import NO_RECORDING, FlightError, Wishes
+from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions
 from gateway.flights.refusion import Refusion, end_of
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
@@ -66,7 +66,7 @@ FASTEST: Final = "max"
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class PlayPlan:
     """How to play: range, speed, silences."""
 
     begin: Moment | None
@@ -113,17 +113,17 @@ def play(
     """
     gateway = with_endpoints(read_settings(config), endpoint)
     with ExitStack() as opened, refusing():
-        course = Course(
+        plan = PlayPlan(
             read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused
         )
         today = pipeline_settings(read_settings(config))
-        wishes = Wishes(today, settings, position, read_column_map(columns))
+        options = ReadOptions(today, settings, position, read_column_map(columns))
         with progress_of(files) as advance:
-            flights = _open_all(files, replace(wishes, progress=advance), opened)
+            flights = _open_all(files, replace(options, progress=advance), opened)
             tracks = _lay_out(flights, system or [])
-            _prepare(tracks, course)
+            _prepare(tracks, plan)
         try:
-            asyncio.run(_serve(gateway, tracks, course, [file.name for file in files]))
+            asyncio.run(_serve(gateway, tracks, plan, [file.name for file in files]))
         except ControlError as error:
             refuse(str(error))
 
@@ -251,7 +251,7 @@ class PlayerDaemon:
 async def _serve(
     settings: GatewaySettings,
     tracks: Sequence[Track],
-    course: Course,
+    plan: PlayPlan,
     files: Sequence[str],
 ) -> None:
     now_us = GatewayClock()
@@ -259,11 +259,11 @@ async def _serve(
     player = Player(
         tracks,
         now_us(),
-        speed=course.speed,
-        begin_us=None if course.begin is None else place_in(course.begin, first_us),
-        end_us=None if course.end is None else place_in(course.end, first_us),
-        max_gap_us=None if course.max_gap_s is None else round(course.max_gap_s * US_PER_S),
-        loop=course.loop,
+        speed=plan.speed,
+        begin_us=None if plan.begin is None else place_in(plan.begin, first_us),
+        end_us=None if plan.end is None else place_in(plan.end, first_us),
+        max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
+        loop=plan.loop,
     )
     # It waits for the network, and then if the user wants it to.
     player.pause(now_us())
@@ -273,7 +273,7 @@ async def _serve(
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
     try:
         await daemon.start()
-        if not course.paused:
+        if not plan.paused:
             daemon.edge.resume()
         await _watch(daemon)
     finally:
@@ -307,18 +307,18 @@ async def _watch(daemon: PlayerDaemon) -> None:
     console.print(f"ended: {_place(daemon.edge.status())}")
 
 
-def _open_all(files: Sequence[Path], wishes: Wishes, opened: ExitStack) -> list[list[Source]]:
+def _open_all(files: Sequence[Path], options: ReadOptions, opened: ExitStack) -> list[list[Source]]:
     """Index the tlogs, and begin to fuse what is none; the parts of a recording together."""
     flights: list[list[Source]] = []
     for parts in parts_together(files):
         sources: list[TlogFile | FusedTlog] = []
         if kind_of(parts[0]) is FileKind.TLOG:
             for file in parts:
-                sources.append(TlogFile(file, wishes.progress))
+                sources.append(TlogFile(file, options.progress))
                 opened.callback(sources[-1].close)
         else:
-            refusion = Refusion(parts, wishes)
-            sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], wishes)))
+            refusion = Refusion(parts, options)
+            sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], options)))
             opened.callback(sources[-1].close)
             for remark in refusion.remarks:
                 console_of(stderr=True).print(f"{parts[0]}: {remark}", markup=False)
@@ -329,10 +329,10 @@ def _open_all(files: Sequence[Path], wishes: Wishes, opened: ExitStack) -> list[
     return flights
 
 
-def _prepare(tracks: Sequence[Track], course: Course) -> None:
+def _prepare(tracks: Sequence[Track], plan: PlayPlan) -> None:
     """Fuse tables up to the begin that the user wants."""
-    if course.begin is not None:
-        begin_us = place_in(course.begin, min(track.first_us for track in tracks))
+    if plan.begin is not None:
+        begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
         while not all(track.prepare(begin_us) for track in tracks):
             pass
 

@@ -64,12 +64,14 @@ def sweep(
     it never sees judge it.
     """
     # It loads pandas and the optimisers, which no other command should wait for.
-    from gateway.cli.support.sweeping import Wish, run_sweep
+    from gateway.cli.support.sweeping import SweepOptions, run_sweep
 
     current = or_refuse(lambda: load_settings(config))
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
     run_sweep(
         flight,
         Loading(current, settings, columns, system, reference),
-        Wish(named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table),
+        SweepOptions(
+            named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table
+        ),
     )

@@ -13,7 +13,7 @@ from gateway.cli.live.run import pipeline_settings
 from gateway.cli.support.recording_options import progress_of, read_column_map, refusing
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.flights.reading import FlightError, SettingsChoice, Wishes, aircraft_of, open_rows
+from gateway.flights.reading import FlightError, ReadOptions, SettingsChoice, aircraft_of, open_rows
 
 FlightArgument = Annotated[
     Path | None,
@@ -63,9 +63,9 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         return simulated_flight(settings.simulator, fusion_of(settings))
     files = [file for file in (path, loading.reference) if file is not None]
     with progress_of(files) as advance, refusing():
-        wishes = _wishes(loading, advance)
-        table = open_rows(path, wishes)
-        aircraft = aircraft_of(table, wishes)
+        options = _read_options(loading, advance)
+        table = open_rows(path, options)
+        aircraft = aircraft_of(table, options)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
         story = STORIES[kind_of(path)]
         try:
@@ -77,13 +77,13 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         if loading.reference is None:
             return flight
         return judged_by(
-            flight, open_rows(loading.reference, wishes).plain_rows, loading.reference.name
+            flight, open_rows(loading.reference, options).plain_rows, loading.reference.name
         )
 
 
-def _wishes(loading: Loading, advance: Callable[[int], None]) -> Wishes:
+def _read_options(loading: Loading, advance: Callable[[int], None]) -> ReadOptions:
     settings = loading.settings
-    return Wishes(
+    return ReadOptions(
         current=pipeline_settings(settings),
         choice=loading.choice,
         columns=read_column_map(loading.columns),

@@ -41,7 +41,7 @@ Trial = tuple[Values, dict[str, float]]
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class SweepOptions:
     """What the command line asks for."""
 
     named: Sequence[tuple[str, str]]
@@ -58,39 +58,41 @@ class Wish:
     table: Path | None
 
 
-def run_sweep(path: Path | None, loading: Loading, wish: Wish) -> None:
+def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
     """Try the settings, show the best, and write it as a settings file."""
     try:
-        axes = _axes(wish)
+        axes = _axes(options)
         flight = load_flight(path, loading)
         contest = sweeping.make_contest(
             flight,
             flight.fusion,
             [axis.key for axis in axes],
-            hold_out=wish.hold_out,
-            interval_s=wish.gps_interval_s,
+            hold_out=options.hold_out,
+            interval_s=options.gps_interval_s,
         )
-        with pool(contest, wish.jobs) as run:
-            if wish.generations:
-                trials = _search(axes, run, wish.generations, wish.metric)
+        with pool(contest, options.jobs) as run:
+            if options.generations:
+                trials = _search(axes, run, options.generations, options.metric)
             else:
                 trials = _try_all(sweeping.grid(axes), run)
-        results = sweeping.tabulate(contest.keys, trials, wish.metric)
+        results = sweeping.tabulate(contest.keys, trials, options.metric)
     except SweepError as error:
         refuse(str(error))
-    _show(results, contest, wish.metric)
+    _show(results, contest, options.metric)
     best = tuple(results.iloc[0][list(contest.keys)])
     with refusing():
-        wish.output.write_text(render(_merged(loading.settings, contest, best)), encoding="utf-8")
-        print(wish.output)
-        if wish.table is not None:
-            with wish.table.open("w", encoding="utf-8", newline="") as table:
+        options.output.write_text(
+            render(_merged(loading.settings, contest, best)), encoding="utf-8"
+        )
+        print(options.output)
+        if options.table is not None:
+            with options.table.open("w", encoding="utf-8", newline="") as table:
                 results.to_csv(table, index=False)
 
 
-def _axes(wish: Wish) -> list[Axis]:
-    wanted = list(wish.named)
-    for item in wish.vary:
+def _axes(options: SweepOptions) -> list[Axis]:
+    wanted = list(options.named)
+    for item in options.vary:
         name, equals, text = item.partition("=")
         if not equals:
             raise SweepError(f"--vary {item}: write NAME=VALUES")
@@ -128,10 +130,10 @@ def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) ->
             found.extend((values, scores[k]) for k, values in enumerate(points))
             return [scores[k][COLUMN_OF[metric]] for k in range(len(points))]
 
-        def told(best: float) -> None:
+        def show_progress(best: float) -> None:
             progress.update(task, advance=1, description=f"generations, best {best:.3f}")
 
-        sweeping.optimise(axes, evaluate, generations, told)
+        sweeping.optimise(axes, evaluate, generations, show_progress)
     return found
 
 

@@ -33,7 +33,7 @@ class PlaceFiles:
     folder : Path
         Made when it is needed.
     tell : callable
-        Told the vehicle id and why its places cannot be kept, or None when they are again.
+        Called with the vehicle id and why its places cannot be kept, or None when they are again.
     """
 
     def __init__(self, folder: Path, tell: Callable[[int, str | None], None]) -> None:

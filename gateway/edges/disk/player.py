@@ -18,7 +18,7 @@ LONGEST_WAIT_S: Final = 0.5
 SEEKING: Final = "seeking"
 
 Progress = Callable[[int], None]
-"""Told how many more bytes were read."""
+"""Called with how many more bytes were read."""
 
 
 class TlogFile:
@@ -32,7 +32,7 @@ class TlogFile:
     path : Path
         The file.
     progress : callable, optional
-        Told how many more bytes were indexed.
+        Called with how many more bytes were indexed.
 
     Raises
     ------

@@ -75,7 +75,7 @@ class Recorder:
         Tells what heads a vehicle's table: version, settings, calibration. Session, part and
         start are filled in here.
     announce : callable
-        Told whether it is trouble, and a text for the user.
+        Called with whether it is trouble, and a text for the user.
     state_of : callable
         Tells what the fusion of a vehicle remembers after all that was handed to `flight`.
     """

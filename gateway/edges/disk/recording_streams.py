@@ -17,7 +17,7 @@ TAIL: Final = 1 << 14
 GZIP: Final = ".gz"
 
 Progress = Callable[[int], None]
-"""Told how many more bytes were read."""
+"""Called with how many more bytes were read."""
 
 
 class FileKind(StrEnum):

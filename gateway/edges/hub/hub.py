@@ -365,14 +365,14 @@ class Hub:
                 endpoint.tick(now_us)
         for client in list(self._clients.values()):
             client.tick(now_us)
-        self._tell_trouble(now_us)
+        self._report_trouble(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         if interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
             self._ask_round_trips(now_us)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
-    def _tell_trouble(self, now_us: int) -> None:
+    def _report_trouble(self, now_us: int) -> None:
         if now_us - self._trouble_us < US_PER_S:
             return
         self._trouble_us = now_us

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.complementary.bias import update_bias
-from gateway.estimation.complementary.complementary_output import tell
+from gateway.estimation.complementary.complementary_output import write_output
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
@@ -25,7 +25,14 @@ from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravi
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import recall, remember
 from gateway.estimation.kernel import Kernels
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    IntArray,
+    as_quat,
+    as_vec,
+    write_quat,
+    write_vec,
+)
 from gateway.estimation.local_position import (
     NEVER_S,
     fix_position,
@@ -39,8 +46,8 @@ from gateway.estimation.sensor_faults import (
     ACCEL_LIMIT_MPS2,
     GYRO_LIMIT_RADPS,
     HOLD_S,
+    check_sensors,
     is_sound,
-    judge_sensors,
 )
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import NAN, Vec3
@@ -58,8 +65,8 @@ ZERO: Final = (0.0, 0.0, 0.0)
 @compiled
 def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Set a fresh state."""
-    put_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
-    put_quat(s.q_ei, (1.0, 0.0, 0.0, 0.0))
+    write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
+    write_quat(s.q_ei, (1.0, 0.0, 0.0, 0.0))
     refresh(s)
     for k in range(3):
         s.bias_cov[k, k] = p.bias_initial_radps**2
@@ -85,15 +92,15 @@ def begin(s: ComplementaryState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     if s.fault == 1:
         return
     s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
-    put(s.gyro_lp, gyro)
-    put(s.gyro_rest, gyro)
-    put(s.accel_lp, accel)
-    put(s.force_lp_i, accel)
+    write_vec(s.gyro_lp, gyro)
+    write_vec(s.gyro_rest, gyro)
+    write_vec(s.accel_lp, accel)
+    write_vec(s.force_lp_i, accel)
     take_gravity(s, accel, 1.0, 1e-3)
     # Two turns: the first leaves a remainder where the start is upside down.
     take_gravity(s, accel, 1.0, 1e-3)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
-    put(s.rate_b, gyro)
+    write_vec(s.rate_b, gyro)
     refresh(s)
 
 
@@ -132,7 +139,7 @@ def take_imu(
     if dt > GAP_S:
         bridge_gap(s, dt)
         return
-    sound_gyro, sound_accel = judge_sensors(s, gyro, accel, dt)
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
     s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
     if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
@@ -313,7 +320,7 @@ def run(
             i_gps += 1
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
-        tell(s, out[i])
+        write_output(s, out[i])
 
 
 KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = Kernels(
@@ -322,6 +329,6 @@ KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = Kernels(
     imu=take_imu,
     baro=take_baro,
     gps=take_gps,
-    tell=tell,
+    write_output=write_output,
     run=run,
 )

@@ -27,7 +27,7 @@ from gateway.estimation.flagbits import (
     USING_MAG,
     gps_flags,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.geometry.geodesy import offset_deg
@@ -38,7 +38,7 @@ DEAD_RECKONING_MAX_S: Final = 60.0
 
 
 @compiled
-def tell(s: ComplementaryState, row: FloatArray) -> None:
+def write_output(s: ComplementaryState, row: FloatArray) -> None:
     """Write the output row.
 
     Parameters
@@ -48,8 +48,8 @@ def tell(s: ComplementaryState, row: FloatArray) -> None:
     row : ndarray, shape (NAV_COLUMNS,)
         Filled; standard deviations are not known to this estimator.
     """
-    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
-    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
+    write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
     row[NAV_FLAGS] = float(flags_of(s))
@@ -59,7 +59,7 @@ def tell(s: ComplementaryState, row: FloatArray) -> None:
         return
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
-    put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+    write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
 
 
 @compiled

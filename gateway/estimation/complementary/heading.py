@@ -17,7 +17,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, compare_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 
@@ -66,7 +66,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if norm < MIN_FIELD_UT:
         return
     dt = min(dt, STALE_MAG_S)
-    weight = judge_field(s, p, norm, math.asin(down / norm), dt)
+    weight = compare_field(s, p, norm, math.asin(down / norm), dt)
     if weight <= 0.0:
         return
     declination = s.declination_rad

@@ -16,7 +16,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.heading import is_heading_good, take_match
 from gateway.estimation.complementary.tilt import take_gravity
-from gateway.estimation.kernel_record import as_quat, as_vec, put
+from gateway.estimation.kernel_record import as_quat, as_vec, write_vec
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
 
@@ -54,8 +54,8 @@ def take_fix_velocity(
     if dt < MIN_BASELINE_S:
         return 0.0
     old_force, old_vel = as_vec(s.fix_force_i), as_vec(s.fix_vel)
-    put(s.fix_force_i, force_i)
-    put(s.fix_vel, vel)
+    write_vec(s.fix_force_i, force_i)
+    write_vec(s.fix_vel, vel)
     s.fix_valid_s = valid_s
     if dt > MAX_BASELINE_S:
         return 0.0

@@ -14,7 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, put
+from gateway.estimation.kernel_record import FloatArray, as_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
@@ -59,7 +59,7 @@ def dead_reckon(s: ComplementaryState, force_b: Vec3, dt: float) -> None:
 @compiled
 def restart_at(s: ComplementaryState, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix alone."""
-    put(s.vel_n, vel)
+    write_vec(s.vel_n, vel)
     for k in range(2):
         s.pos_n[k] = pos[k] + vel[k] * lag
     if s.has_height == 0 or s.baro_known == 0:

@@ -14,7 +14,7 @@ import math
 
 from gateway.compiled import compiled
 from gateway.estimation.complementary.complementary_state import ComplementaryState
-from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -63,18 +63,18 @@ def cutoff_radps(tau_s: float) -> float:
 def strapdown(s: ComplementaryState, gyro: Vec3, dt: float) -> None:
     """Integrate the angular rate: eq. 13 with a rotation vector."""
     rate = (gyro[0] - s.bias_b[0], gyro[1] - s.bias_b[1], gyro[2] - s.bias_b[2])
-    put(s.rate_b, rate)
+    write_vec(s.rate_b, rate)
     turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
-    put_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
+    write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
 
 
 @compiled
 def refresh(s: ComplementaryState) -> None:
     """Put the parts of the attitude together: heading, level, gyroscope."""
     level = multiply(as_quat(s.q_ei), as_quat(s.q_ib))
-    put_quat(s.q_eb, level)
+    write_quat(s.q_eb, level)
     half = 0.5 * s.heading_rad
-    put_quat(s.q_nb, normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), level)))
+    write_quat(s.q_nb, normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), level)))
 
 
 @compiled
@@ -115,6 +115,6 @@ def level(s: ComplementaryState) -> None:
     x, y, z = x / norm, y / norm, z / norm
     w = math.sqrt(max(0.5 * (1.0 - z), 1e-6))
     correction = (w, -0.5 * y / w, 0.5 * x / w, 0.0)
-    put_quat(s.q_ei, normalise(multiply(normalise(correction), as_quat(s.q_ei))))
+    write_quat(s.q_ei, normalise(multiply(normalise(correction), as_quat(s.q_ei))))
     s.tilt_sum[0] -= y
     s.tilt_sum[1] += x

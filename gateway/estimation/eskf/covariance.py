@@ -27,7 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, put_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
 SCALE_S: Final = 1.0
@@ -49,8 +49,8 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     dt = s.pending_s
     if dt <= 0.0:
         return
-    transit(s, s.P)
-    transit(s, s.P.T)
+    apply_transition(s, s.P)
+    apply_transition(s, s.P.T)
     symmetrise(s.P)
     turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
@@ -62,7 +62,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[MAG_BIAS + k, MAG_BIAS + k] += p.mag_bias_density * dt
-        fade(s.P, WANDER + k, kept, s.wander_var[k])
+        decay(s.P, WANDER + k, kept, s.wander_var[k])
         s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
     s.P[TILT + 2, TILT + 2] = min(s.P[TILT + 2, TILT + 2], MAX_TILT_VAR)
@@ -73,7 +73,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def transit(s: EskfState, P: FloatArray) -> None:
+def apply_transition(s: EskfState, P: FloatArray) -> None:
     """Multiply `P` by the transition matrix from the left; given `P^T`, `P` from the right."""
     R, W, dt = s.pending_turn, s.pending_scaled, s.pending_s
     f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
@@ -99,7 +99,7 @@ def symmetrise(P: FloatArray) -> None:
 
 
 @compiled
-def fade(P: FloatArray, k: int, kept: float, steady: float) -> None:
+def decay(P: FloatArray, k: int, kept: float, steady: float) -> None:
     """Let one state fade towards zero while noise keeps its variance at `steady`."""
     for j in range(STATES):
         P[k, j] *= kept
@@ -108,7 +108,7 @@ def fade(P: FloatArray, k: int, kept: float, steady: float) -> None:
 
 
 @compiled
-def forget(P: FloatArray, k: int, variance: float) -> None:
+def decorrelate(P: FloatArray, k: int, variance: float) -> None:
     """Give one state a new variance that has nothing to do with the others."""
     for j in range(STATES):
         P[k, j] = 0.0
@@ -120,11 +120,11 @@ def forget(P: FloatArray, k: int, variance: float) -> None:
 def clear(s: EskfState) -> None:
     """Begin a measurement: an empty row, no state held."""
     s.h[:] = 0.0
-    s.held[:] = 0.0
+    s.considered[:] = 0.0
 
 
 @compiled
-def remainder(s: EskfState, innovation: float) -> float:
+def residual(s: EskfState, innovation: float) -> float:
     """Take from an innovation what the measurements before it in the group have explained."""
     for j in range(STATES):
         innovation -= s.h[j] * s.dx[j]
@@ -132,7 +132,7 @@ def remainder(s: EskfState, innovation: float) -> float:
 
 
 @compiled
-def spread(s: EskfState, variance: float) -> float:
+def innovation_variance(s: EskfState, variance: float) -> float:
     """Compute `P h` and the variance of the innovation, `h^T P h` and the noise."""
     total = variance
     for i in range(STATES):
@@ -145,15 +145,15 @@ def spread(s: EskfState, variance: float) -> float:
 
 
 @compiled
-def distance_sq(s: EskfState, innovation: float, variance: float) -> float:
+def normalised_innovation_sq(s: EskfState, innovation: float, variance: float) -> float:
     """Tell the normalised innovation squared of the row in `h`."""
-    rest = remainder(s, innovation)
-    return rest * rest / spread(s, variance)
+    rest = residual(s, innovation)
+    return rest * rest / innovation_variance(s, variance)
 
 
 @compiled
-def absorb(s: EskfState, innovation: float, variance: float, gate_sq: float) -> None:
-    """Update by one number whose row stands in `h`; the states in `held` are only considered.
+def update_scalar(s: EskfState, innovation: float, variance: float, gate_sq: float) -> None:
+    """Update by one number whose row stands in `h`; the states in `considered` are only considered.
 
     Their gain is zero, their uncertainty still counts: the Schmidt-Kalman update. It is for
     measurements whose errors are not white, which other states would take the blame for.
@@ -170,19 +170,19 @@ def absorb(s: EskfState, innovation: float, variance: float, gate_sq: float) -> 
         An innovation further off counts as one so many squared standard deviations away: its
         variance is raised until it is, so an outlier does little and a lasting one wins.
     """
-    rest = remainder(s, innovation)
-    total = max(spread(s, variance), rest * rest / gate_sq)
+    rest = residual(s, innovation)
+    total = max(innovation_variance(s, variance), rest * rest / gate_sq)
     for i in range(STATES):
         gain = s.Ph[i] / total
-        s.dx[i] += (1.0 - s.held[i]) * gain * rest
+        s.dx[i] += (1.0 - s.considered[i]) * gain * rest
         for j in range(STATES):
-            s.P[i, j] -= (1.0 - s.held[i] * s.held[j]) * gain * s.Ph[j]
+            s.P[i, j] -= (1.0 - s.considered[i] * s.considered[j]) * gain * s.Ph[j]
 
 
 @compiled
-def hold(s: EskfState, first: int, count: int) -> None:
+def consider(s: EskfState, first: int, count: int) -> None:
     """Mark states as only considered."""
-    s.held[first : first + count] = 1.0
+    s.considered[first : first + count] = 1.0
 
 
 @compiled
@@ -190,7 +190,7 @@ def inject(s: EskfState) -> None:
     """Move the errors found into the nominal state."""
     d = s.dx
     turn = from_rotation_vector((d[TILT], d[TILT + 1], d[TILT + 2]))
-    put_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
     for k in range(3):
         s.vel_n[k] += d[VEL + k]
         s.pos_n[k] += d[POS + k]

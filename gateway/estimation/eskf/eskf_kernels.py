@@ -5,16 +5,16 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import propagate
-from gateway.estimation.eskf.eskf_output import tell
+from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.measure import (
     UNAIDED_CORRELATION_S,
-    absorb_baro,
-    absorb_compass,
-    absorb_rest,
-    absorb_velocity,
+    update_by_baro,
+    update_by_compass,
+    update_by_rest,
+    update_by_velocity,
 )
 from gateway.estimation.eskf.start import (
     begin,
@@ -28,13 +28,20 @@ from gateway.estimation.eskf.start import (
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
 from gateway.estimation.kernel import Kernels
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    IntArray,
+    as_quat,
+    as_vec,
+    write_quat,
+    write_vec,
+)
 from gateway.estimation.local_position import (
     BARO_STALE_S,
 )
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, judge_field, likeness
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, compare_field, field_similarity
 from gateway.estimation.rest import watch_rest
-from gateway.estimation.sensor_faults import HOLD_S, judge_sensors
+from gateway.estimation.sensor_faults import HOLD_S, check_sensors
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -96,14 +103,14 @@ def take_imu(
         bridge_gap(s, p, dt)
         return
     collect_roughness(s, gyro, accel, dt)
-    sound_gyro, sound_accel = judge_sensors(s, gyro, accel, dt)
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
     s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
     if not sound_gyro:
-        gyro = stand_in_rate(s, dt)
+        gyro = substitute_rate(s, dt)
     else:
         s.missing_gyro_s = 0.0
     if not sound_accel:
-        accel = stand_in_force(s)
+        accel = substitute_force(s)
     integrate(s, gyro, accel, dt)
     if sound_gyro and sound_accel:
         watch_rest(s, p, gyro, accel, is_moving(s, p), dt)
@@ -129,7 +136,7 @@ def collect_roughness(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
 
 
 @compiled
-def stand_in_rate(s: EskfState, dt: float) -> Vec3:
+def substitute_rate(s: EskfState, dt: float) -> Vec3:
     """Hold the last rate for a moment, then none, where the gyroscope fails."""
     held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
     s.missing_gyro_s += dt
@@ -138,7 +145,7 @@ def stand_in_rate(s: EskfState, dt: float) -> Vec3:
 
 
 @compiled
-def stand_in_force(s: EskfState) -> Vec3:
+def substitute_force(s: EskfState) -> Vec3:
     """Assume no acceleration where the accelerometer fails."""
     f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
     b = s.accel_bias_b
@@ -172,11 +179,11 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
         gyro[1] - b[1] - e[1] * gyro[1],
         gyro[2] - b[2] - e[2] * gyro[2],
     )
-    put(s.rate_b, rate)
+    write_vec(s.rate_b, rate)
     # The force of the interval acts, on average, at the attitude half way through it.
     half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
     q = multiply(as_quat(s.q_nb), half)
-    put_quat(s.q_nb, normalise(multiply(q, half)))
+    write_quat(s.q_nb, normalise(multiply(q, half)))
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
     f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
     s.pending_s += dt
@@ -210,9 +217,9 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
     if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
         end_dead_reckoning(s, p)
     if s.at_rest == 1:
-        absorb_rest(s, p)
+        update_by_rest(s, p)
     elif s.aided == 0:
-        absorb_velocity(s, p, p.unaided_var * UNAIDED_CORRELATION_S / dt)
+        update_by_velocity(s, p, p.unaided_var * UNAIDED_CORRELATION_S / dt)
 
 
 @compiled
@@ -238,7 +245,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
         return
     s.mag_s = s.time_s
     dip = math.asin(field[2] / norm)
-    weight = judge_field(s, p, norm, dip, min(dt, STALE_MAG_S)) * likeness(s, norm, dip)
+    weight = compare_field(s, p, norm, dip, min(dt, STALE_MAG_S)) * field_similarity(s, norm, dip)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:
@@ -247,8 +254,8 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
         since = min(s.time_s - s.mag_used_s, STALE_MAG_S)
         s.mag_used_s = s.time_s
-        put(s.field_n, field)
-        absorb_compass(s, p, field, declination, weight, since)
+        write_vec(s.field_n, field)
+        update_by_compass(s, p, field, declination, weight, since)
 
 
 @compiled
@@ -272,7 +279,7 @@ def take_baro(s: EskfState, p: EskfGains, alt_m: float) -> None:
     elif s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:
         restart_baro(s, p)
     else:
-        absorb_baro(s, p, -alt_m)
+        update_by_baro(s, p, -alt_m)
     s.baro_known, s.baro_s = 1, s.time_s
 
 
@@ -300,7 +307,7 @@ def run(
             i_gps += 1
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
-        tell(s, out[i])
+        write_output(s, out[i])
 
 
 KERNELS: Final[Kernels[EskfState, EskfGains]] = Kernels(
@@ -309,6 +316,6 @@ KERNELS: Final[Kernels[EskfState, EskfGains]] = Kernels(
     imu=take_imu,
     baro=take_baro,
     gps=take_gps,
-    tell=tell,
+    write_output=write_output,
     run=run,
 )

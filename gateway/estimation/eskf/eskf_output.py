@@ -29,7 +29,7 @@ from gateway.estimation.flagbits import (
     USING_MAG,
     gps_flags,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.geometry.geodesy import offset_deg
@@ -41,14 +41,14 @@ NO_HOLD_S = 1.0
 
 
 @compiled
-def put_std(row: FloatArray, column: int, s: EskfState, first: int) -> None:
+def write_std(row: FloatArray, column: int, s: EskfState, first: int) -> None:
     """Write three standard deviations."""
     for k in range(3):
         row[column + k] = math.sqrt(max(s.P[first + k, first + k], 0.0))
 
 
 @compiled
-def tell(s: EskfState, row: FloatArray) -> None:
+def write_output(s: EskfState, row: FloatArray) -> None:
     """Write the output row.
 
     Parameters
@@ -58,8 +58,8 @@ def tell(s: EskfState, row: FloatArray) -> None:
     row : ndarray, shape (NAV_COLUMNS,)
         Filled.
     """
-    put_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
-    put(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
+    write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+    write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_VEL : NAV_VEL + 3] = NAN
     row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
     row[NAV_FLAGS] = float(flags_of(s))
@@ -67,19 +67,19 @@ def tell(s: EskfState, row: FloatArray) -> None:
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_known == 1 else NAN
     if s.started == 0:
         return
-    put_std(row, NAV_ATTITUDE_STD, s, TILT)
+    write_std(row, NAV_ATTITUDE_STD, s, TILT)
     if s.has_origin == 0:
         return
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
     if s.aided == 1:
-        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
-        put_std(row, NAV_VEL_STD, s, VEL)
-        put_std(row, NAV_POS_STD, s, POS)
+        write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+        write_std(row, NAV_VEL_STD, s, VEL)
+        write_std(row, NAV_POS_STD, s, POS)
         for k in range(2):
             row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
     elif s.time_s - s.fix_s < FRESH_GPS_S:
-        put(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
+        write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
 
 
 @compiled

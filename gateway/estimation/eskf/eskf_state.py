@@ -44,7 +44,7 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
     h: Annotated[FloatArray, (STATES,)]
     """Scratch: one row of the measurement matrix."""
     Ph: Annotated[FloatArray, (STATES,)]
-    held: Annotated[FloatArray, (STATES,)]
+    considered: Annotated[FloatArray, (STATES,)]
     """Scratch: 1 for the states that a measurement must not change."""
     dx: Annotated[FloatArray, (STATES,)]
     """Scratch: error found so far in one group of measurements."""
@@ -72,7 +72,7 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
     mag_used_s: float
     field_n: Annotated[FloatArray, (3,)]
     """The field that the compass was last used with, NED, uT; all zero before."""
-    iron_doubted: int
+    iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""

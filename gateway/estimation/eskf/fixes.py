@@ -10,10 +10,10 @@ from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import EskfState
 from gateway.estimation.eskf.measure import (
-    absorb_fix,
     lag_integrals,
-    learn_wander,
     place_distance_sq,
+    set_wander_variance,
+    update_by_fix,
 )
 from gateway.estimation.eskf.start import (
     relock_at,
@@ -22,7 +22,7 @@ from gateway.estimation.eskf.start import (
     turn_heading,
 )
 from gateway.estimation.history import recall
-from gateway.estimation.kernel_record import FloatArray, as_vec, put
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.estimation.local_position import (
     NEVER_S,
     fix_position,
@@ -60,7 +60,7 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     if s.started == 0 or row[GPS_USABLE] == 0.0:
         return
     learn_declination(s, row[GPS_DECLINATION])
-    learn_wander(s, p, row)
+    set_wander_variance(s, p, row)
     then = s.then
     wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
     valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, then)
@@ -72,7 +72,7 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
         if told_velocity:
             match_heading(s, valid_s, vel, (then[3], then[4], then[5]))
         if s.heading_known == 0:
-            show_fix(s, pos, vel)
+            follow_fix(s, pos, vel)
             return
     if s.aided == 0:
         restart_at(s, p, pos, vel if told_velocity else ZERO, lag)
@@ -98,7 +98,7 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
     off_m = math.hypot(off_pos[0], off_pos[1])
     note_contradiction(s, off_m if unlikely else 0.0)
     if not unlikely or off_m < p.gate_m:
-        absorb_fix(s, p, row, off_pos, off_vel, once, twice, lag)
+        update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
         accept(s, vel)
     elif is_relocked(s, p.gps_relock_s, pos, vel):
         relock_at(s, p, pos, vel if is_sound(vel, 1000.0) else ZERO, lag)
@@ -116,14 +116,14 @@ def note_contradiction(s: EskfState, off_m: float) -> None:
 def accept(s: EskfState, vel: Vec3) -> None:
     """Note that a fix was used."""
     s.fix_s = s.time_s
-    put(s.fix_vel, vel)
+    write_vec(s.fix_vel, vel)
     s.reject_s, s.reject_last[0] = 0.0, NEVER_S
 
 
 @compiled
-def show_fix(s: EskfState, pos: Vec3, vel: Vec3) -> None:
+def follow_fix(s: EskfState, pos: Vec3, vel: Vec3) -> None:
     """Show a fix as it is while it cannot be fused: without a heading."""
-    put(s.fix_vel, vel)
+    write_vec(s.fix_vel, vel)
     s.fix_s = s.time_s
     s.pos_n[0], s.pos_n[1] = pos[0], pos[1]
     if s.baro_known == 0:
@@ -137,7 +137,7 @@ def match_heading(s: EskfState, valid_s: float, vel: Vec3, integral: Vec3) -> No
     if dt < MIN_BASELINE_S:
         return
     old, force = as_vec(s.fix_vel), as_vec(s.fix_force)
-    put(s.fix_force, integral)
+    write_vec(s.fix_force, integral)
     s.fix_valid_s = valid_s
     if dt > MAX_BASELINE_S:
         return

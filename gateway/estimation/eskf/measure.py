@@ -13,12 +13,12 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
 from gateway.estimation.eskf.covariance import (
-    absorb,
     clear,
-    distance_sq,
-    hold,
+    consider,
     inject,
+    normalised_innovation_sq,
     propagate,
+    update_scalar,
 )
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
@@ -124,22 +124,22 @@ def position_row(s: EskfState, k: int, once: Vec3, twice: Vec3, lag: float) -> N
 
 
 @compiled
-def told(variance: float, accuracy: float, share: float) -> float:
+def reported_variance(variance: float, accuracy: float, share: float) -> float:
     """Take the receiver's word for its accuracy, where it gives one, before our own guess."""
     return (share * accuracy) ** 2 if accuracy > 0.0 else variance
 
 
 @compiled
-def learn_wander(s: EskfState, p: EskfGains, row: FloatArray) -> None:
+def set_wander_variance(s: EskfState, p: EskfGains, row: FloatArray) -> None:
     """Take the size of the GPS position's slow error from a fix's own accuracies."""
     for k in range(3):
         usual = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
-        s.wander_var[k] = told(usual, acc, WANDER_SHARE[k])
+        s.wander_var[k] = reported_variance(usual, acc, WANDER_SHARE[k])
 
 
 @compiled
-def lateness(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
+def delay_variances(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
     """Compute the variances that the jitter of the latency adds to position and velocity."""
     v, j = s.vel_n, p.gps_jitter_sq
     span = max(lag, 0.02)
@@ -162,16 +162,16 @@ def place_distance_sq(
         The larger normalised innovation squared of north and east.
     """
     worst = 0.0
-    variance = told(p.gps_position_var, row[GPS_H_ACC], NOISE_SHARE)
-    late, _ = lateness(s, p, once, lag)
+    variance = reported_variance(p.gps_position_var, row[GPS_H_ACC], NOISE_SHARE)
+    late, _ = delay_variances(s, p, once, lag)
     for k in range(2):
         position_row(s, k, once, twice, lag)
-        worst = max(worst, distance_sq(s, off_pos[k], variance + late[k]))
+        worst = max(worst, normalised_innovation_sq(s, off_pos[k], variance + late[k]))
     return worst
 
 
 @compiled
-def absorb_fix(
+def update_by_fix(
     s: EskfState,
     p: EskfGains,
     row: FloatArray,
@@ -198,18 +198,23 @@ def absorb_fix(
     lag : float
         Age of the fix, s.
     """
-    late_pos, late_vel = lateness(s, p, once, lag)
+    late_pos, late_vel = delay_variances(s, p, once, lag)
     repeated = max(1.0, VELOCITY_CORRELATION_S / max(s.time_s - s.fix_s, 0.05))
     for k in range(3):
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             noise = p.gps_velocity_var if k < 2 else p.gps_climb_var
-            noise = repeated * told(noise, row[GPS_SPEED_ACC], SPEED_SHARE[k]) + late_vel[k]
-            absorb(s, off_vel[k], noise, VELOCITY_GATE_SQ)
+            noise = (
+                repeated * reported_variance(noise, row[GPS_SPEED_ACC], SPEED_SHARE[k])
+                + late_vel[k]
+            )
+            update_scalar(s, off_vel[k], noise, VELOCITY_GATE_SQ)
         position_row(s, k, once, twice, lag)
         noise = p.gps_position_var if k < 2 else p.gps_height_var
-        absorb(s, off_pos[k], told(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq)
+        update_scalar(
+            s, off_pos[k], reported_variance(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq
+        )
     inject(s)
 
 
@@ -229,7 +234,7 @@ def compass_row(s: EskfState, field_n: Vec3) -> None:
 
 
 @compiled
-def absorb_compass(
+def update_by_compass(
     s: EskfState, p: EskfGains, field_n: Vec3, declination: float, weight: float, dt: float
 ) -> None:
     """Update by the direction of the horizontal field, `dt` after the last such update."""
@@ -239,47 +244,47 @@ def absorb_compass(
     compass_row(s, field_n)
     if s.aided == 0:
         # The horizon rests on the accelerometer alone then: keep the field's dip out of it.
-        hold(s, TILT, 2)
-        hold(s, ACCEL_BIAS, 3)
-    absorb(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
+        consider(s, TILT, 2)
+        consider(s, ACCEL_BIAS, 3)
+    update_scalar(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
     inject(s)
 
 
 @compiled
-def absorb_baro(s: EskfState, p: EskfGains, down_m: float) -> None:
+def update_by_baro(s: EskfState, p: EskfGains, down_m: float) -> None:
     """Update by the barometer's depth below zero height."""
     propagate(s, p)
     clear(s)
     s.h[POS + 2] = 1.0
     s.h[BARO_BIAS] = -1.0
-    absorb(s, down_m + s.baro_bias_m - s.pos_n[2], p.baro_var, p.gate_sq)
+    update_scalar(s, down_m + s.baro_bias_m - s.pos_n[2], p.baro_var, p.gate_sq)
     inject(s)
 
 
 @compiled
-def absorb_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
+def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
     """Update by a velocity of about zero, for want of better."""
     propagate(s, p)
     for k in range(3):
         clear(s)
         s.h[VEL + k] = 1.0
         # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
-        hold(s, ACCEL_BIAS, 3)
-        absorb(s, -s.vel_n[k], variance, FAR_SQ)
+        consider(s, ACCEL_BIAS, 3)
+        update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
     inject(s)
 
 
 @compiled
-def absorb_rest(s: EskfState, p: EskfGains) -> None:
+def update_by_rest(s: EskfState, p: EskfGains) -> None:
     """Update by standing still: no velocity, and a rate that is the bias."""
     propagate(s, p)
     rate = as_vec(s.gyro_rest)
     for k in range(3):
         clear(s)
         s.h[GYRO_BIAS + k] = 1.0
-        absorb(s, rate[k] - s.gyro_bias_b[k], REST_RATE_VAR, FAR_SQ)
+        update_scalar(s, rate[k] - s.gyro_bias_b[k], REST_RATE_VAR, FAR_SQ)
     for k in range(3):
         clear(s)
         s.h[VEL + k] = 1.0
-        absorb(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
+        update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
     inject(s)

@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.covariance import forget, propagate
+from gateway.estimation.eskf.covariance import decorrelate, propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -20,7 +20,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row
-from gateway.estimation.kernel_record import as_quat, as_vec, put, put_quat
+from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
 from gateway.geometry.quaternion import from_euler, multiply, normalise
@@ -39,7 +39,7 @@ RELOCK_HEADING_VAR: Final = 0.3**2
 @compiled
 def start(s: EskfState, p: EskfGains) -> None:
     """Set a fresh state."""
-    put_quat(s.q_nb, (1.0, 0.0, 0.0, 0.0))
+    write_quat(s.q_nb, (1.0, 0.0, 0.0, 0.0))
     for k in range(3):
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] = p.gyro_bias_var
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = p.accel_bias_var
@@ -67,18 +67,18 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
     if s.fault == 1:
         return
     s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
-    put(s.gyro_lp, gyro)
-    put(s.gyro_rest, gyro)
-    put(s.accel_lp, accel)
-    put(s.rate_b, gyro)
+    write_vec(s.gyro_lp, gyro)
+    write_vec(s.gyro_rest, gyro)
+    write_vec(s.accel_lp, accel)
+    write_vec(s.rate_b, gyro)
     roll = math.atan2(-accel[1], -accel[2])
     pitch = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
-    put_quat(s.q_nb, from_euler(roll, pitch, 0.0))
-    forget(s.P, TILT, FIRST_TILT_VAR)
-    forget(s.P, TILT + 1, FIRST_TILT_VAR)
-    forget(s.P, TILT + 2, NO_HEADING_VAR)
+    write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
+    decorrelate(s.P, TILT, FIRST_TILT_VAR)
+    decorrelate(s.P, TILT + 1, FIRST_TILT_VAR)
+    decorrelate(s.P, TILT + 2, NO_HEADING_VAR)
     for k in range(3):
-        forget(s.P, VEL + k, p.unaided_var)
+        decorrelate(s.P, VEL + k, p.unaided_var)
 
 
 @compiled
@@ -86,7 +86,7 @@ def turn_heading(s: EskfState, turn_rad: float) -> None:
     """Turn the whole attitude about down."""
     half = 0.5 * turn_rad
     turn = (math.cos(half), 0.0, 0.0, math.sin(half))
-    put_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
     # The integrals stand in the old heading.
     s.ring_count = 0
     s.fix_valid_s = NEVER_S
@@ -96,27 +96,27 @@ def turn_heading(s: EskfState, turn_rad: float) -> None:
 def start_heading_by_compass(s: EskfState, p: EskfGains, turn_rad: float) -> None:
     """Take the heading from the compass."""
     turn_heading(s, turn_rad)
-    forget(s.P, TILT + 2, p.mag_var)
+    decorrelate(s.P, TILT + 2, p.mag_var)
     s.heading_known = 1
 
 
 @compiled
-def doubt_iron(s: EskfState, p: EskfGains) -> None:
+def start_iron_search(s: EskfState, p: EskfGains) -> None:
     """Look for iron that the calibration left, once the GPS can tell it from the heading.
 
     A heading that came from the compass has the iron's error, reversed.
     """
-    if s.iron_doubted == 1:
+    if s.iron_search_started == 1:
         return
-    s.iron_doubted = 1
+    s.iron_search_started = 1
     by_compass = s.field_n[0] != 0.0 or s.field_n[1] != 0.0
     if by_compass:
         compass_row(s, as_vec(s.field_n))
     for k in range(3):
-        forget(s.P, MAG_BIAS + k, p.mag_bias_var)
+        decorrelate(s.P, MAG_BIAS + k, p.mag_bias_var)
         if by_compass:
             share = s.h[MAG_BIAS + k]
-            tie(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
+            set_covariance(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
             s.P[TILT + 2, TILT + 2] += share * share * p.mag_bias_var
 
 
@@ -124,7 +124,7 @@ def doubt_iron(s: EskfState, p: EskfGains) -> None:
 def start_heading_by_match(s: EskfState, turn_rad: float, variance: float) -> None:
     """Take the heading from GPS against inertial acceleration."""
     turn_heading(s, turn_rad)
-    forget(s.P, TILT + 2, variance)
+    decorrelate(s.P, TILT + 2, variance)
     s.heading_known = s.heading_true = 1
 
 
@@ -145,7 +145,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
     """
     propagate(s, p)
     for k in range(3):
-        forget(s.P, VEL + k, FIRST_VELOCITY_VAR)
+        decorrelate(s.P, VEL + k, FIRST_VELOCITY_VAR)
         s.vel_n[k] = vel[k]
     for k in range(2):
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
@@ -156,7 +156,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         if s.baro_known == 1:
             restart_baro(s, p)
     s.aided = 1
-    doubt_iron(s, p)
+    start_iron_search(s, p)
     s.off_last_m = s.contradiction_m = 0.0
 
 
@@ -172,7 +172,7 @@ def restart_baro(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def tie(s: EskfState, i: int, j: int, covariance: float) -> None:
+def set_covariance(s: EskfState, i: int, j: int, covariance: float) -> None:
     """Set one covariance."""
     s.P[i, j] = s.P[j, i] = covariance
 
@@ -182,9 +182,9 @@ def start_position(s: EskfState, k: int, value: float, noise_var: float) -> None
     """Start one coordinate at a fix: the fix's slow error is then its own, reversed."""
     wander_var = s.wander_var[k]
     s.pos_n[k], s.wander_n[k] = value, 0.0
-    forget(s.P, POS + k, wander_var + noise_var)
-    forget(s.P, WANDER + k, wander_var)
-    tie(s, POS + k, WANDER + k, -wander_var)
+    decorrelate(s.P, POS + k, wander_var + noise_var)
+    decorrelate(s.P, WANDER + k, wander_var)
+    set_covariance(s, POS + k, WANDER + k, -wander_var)
 
 
 @compiled
@@ -200,7 +200,7 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
     propagate(s, p)
     s.aided = 0
     for k in range(3):
-        forget(s.P, VEL + k, p.unaided_var)
+        decorrelate(s.P, VEL + k, p.unaided_var)
         s.vel_n[k] = 0.0
 
 

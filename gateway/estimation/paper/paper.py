@@ -39,7 +39,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from gateway.estimation.kernel import Held, direct
+from gateway.estimation.kernel import RecordHandle, direct
 from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
@@ -155,10 +155,10 @@ class PaperEstimator:
     ) -> None:
         self._settings = settings
         self._reference = reference
-        self._rest = Held(filled_record(RestGains, rest_gains(rest)))
+        self._rest = RecordHandle(filled_record(RestGains, rest_gains(rest)))
         self._earth = EarthField(reference)
         self._s = PaperState()
-        self._held = Held(new_record(kernels.Memory))
+        self._handle = RecordHandle(new_record(kernels.Memory))
         # A first call on a scrap compiles, or loads, what `direct` then finds.
         nothing = (UNKNOWN_VEC3,) * 5
         kernels.step(
@@ -170,26 +170,28 @@ class PaperEstimator:
         """Forget everything but the settings."""
         self._earth.reset()
         self._s = PaperState()
-        self._held = Held(new_record(kernels.Memory))
+        self._handle = RecordHandle(new_record(kernels.Memory))
 
     @property
     def state(self) -> tuple[PaperState, kernels.Memory]:
         """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s), copy_record(self._held.record)
+        return replace(self._s), copy_record(self._handle.record)
 
     @state.setter
     def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
-        self._s, self._held = replace(state[0]), Held(copy_record(state[1]))
+        self._s, self._handle = replace(state[0]), RecordHandle(copy_record(state[1]))
 
     def snapshot(self) -> bytes:
         """Write down all that is remembered, the declination included."""
-        return msgspec.msgpack.encode((self._s, pack_record(self._held.record), self._earth.state))
+        return msgspec.msgpack.encode(
+            (self._s, pack_record(self._handle.record), self._earth.state)
+        )
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
         kind = tuple[PaperState, Packed, EarthPlace | None]
         self._s, packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._held = Held(unpack_record(kernels.Memory, packed))
+        self._handle = RecordHandle(unpack_record(kernels.Memory, packed))
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
@@ -221,7 +223,7 @@ class PaperEstimator:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
-                self._held.record.ring_count = 0
+                self._handle.record.ring_count = 0
             s.time_us, dt_us = sample.time_us, 0
         if dt_us > 0:
             s.time_us = sample.time_us
@@ -244,7 +246,7 @@ class PaperEstimator:
         s = self._s
         place, vel = self._read(fix)
         s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
-            self._held.record,
+            self._handle.record,
             place,
             vel,
             fix.time_us,
@@ -317,7 +319,7 @@ class PaperEstimator:
     def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
         s, now_us = self._s, _known(self._s.time_us)
         s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = self._step(
-            self._held,
+            self._handle,
             self._rest,
             self._settings.alpha_gyro,
             s.q_nb,

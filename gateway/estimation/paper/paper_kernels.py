@@ -12,7 +12,7 @@ import numpy as np
 from gateway.compiled import compiled
 from gateway.estimation import flagbits
 from gateway.estimation.history import SLOTS, recall, remember
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, put
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, write_vec
 from gateway.estimation.rest import RestGains, RestState, watch_rest
 from gateway.geometry.geodesy import offset_deg
 from gateway.geometry.quaternion import (
@@ -127,7 +127,7 @@ def unbiased(
     if s.at_rest == 1:
         # A mean while this rest is young, then a low-pass.
         share = dt_s / min(s.rest_s - p.rest_time_s + dt_s, BIAS_TAU_S)
-        put(s.bias_b, blend(1.0 - share, as_vec(s.bias_b), as_vec(s.gyro_rest)))
+        write_vec(s.bias_b, blend(1.0 - share, as_vec(s.bias_b), as_vec(s.gyro_rest)))
     return (gyro[0] - s.bias_b[0], gyro[1] - s.bias_b[1], gyro[2] - s.bias_b[2])
 
 

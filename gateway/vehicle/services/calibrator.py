@@ -32,7 +32,7 @@ from gateway.vehicle.services.commands import (
     Outcome,
     whole,
 )
-from gateway.vehicle.telemetry.events import INFO, Told, chunks
+from gateway.vehicle.telemetry.events import INFO, StatusText, chunks
 
 REST_US: Final = 3 * US_PER_S
 SIDE_US: Final = US_PER_S
@@ -122,7 +122,7 @@ class Calibrator:
         passed_us = sample.time_us - run.window_us
         if passed_us >= length_us:
             return self._on_window(run)
-        return [] if run.six_sides else self._tell(run, 100 * passed_us // length_us)
+        return [] if run.six_sides else self._announce(run, 100 * passed_us // length_us)
 
     def poll(self, now_us: int) -> list[Answer]:
         """Give up in the end."""
@@ -167,8 +167,8 @@ class Calibrator:
             high = [run.sides[2 * n][n] for n in range(3)]
             x, y, z = (0.5 * (a + b) for a, b in zip(low, high, strict=True))
             return self._done(run, (x, y, z))
-        told = _text(f"{SIDES[side]} side done, rotate to a different side")
-        return told + self._tell(run, 100 * len(run.sides) // len(SIDES))
+        texts = _text(f"{SIDES[side]} side done, rotate to a different side")
+        return texts + self._announce(run, 100 * len(run.sides) // len(SIDES))
 
     def _on_mag(self, run: _Run, sample: ImuSample) -> list[Answer]:
         if sample.mag_b_ut is None:
@@ -178,14 +178,14 @@ class Calibrator:
         passed_us = sample.time_us - run.began_us
         enough = len(run.mag) >= MIN_MAG_SAMPLES and len(run.mag) % FIT_EVERY == 0
         if not enough or passed_us < MAG_MIN_US:
-            return self._tell(run, min(90, 100 * passed_us // TIMEOUT_US))
+            return self._announce(run, min(90, 100 * passed_us // TIMEOUT_US))
         points = np.array(run.mag)
         centre, radius = fit_sphere(points)
         if not math.isfinite(radius) or np.ptp(points, axis=0).min() < MIN_SPREAD * radius:
             return self._fail("turn it about all axes") if len(run.mag) >= MAG_SAMPLES else []
         return self._done(run, centre)
 
-    def _tell(self, run: _Run, percent: int) -> list[Answer]:
+    def _announce(self, run: _Run, percent: int) -> list[Answer]:
         step = percent // 10 * 10
         if step <= run.progress:
             return []
@@ -239,4 +239,4 @@ def _vector(values: Any) -> Vec3:
 
 
 def _text(text: str) -> list[Answer]:
-    return [Reply(message) for message in chunks(Told(INFO, f"[cal] {text}"))]
+    return [Reply(message) for message in chunks(StatusText(INFO, f"[cal] {text}"))]

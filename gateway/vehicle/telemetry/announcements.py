@@ -3,25 +3,45 @@
 from typing import Any, Final
 
 from gateway.records import LinkReport, NavFlags
-from gateway.vehicle.telemetry.events import CRITICAL, INFO, NOTICE, WARNING, Announcer, Told
+from gateway.vehicle.telemetry.events import CRITICAL, INFO, NOTICE, WARNING, Announcer, StatusText
 from gateway.vehicle.telemetry.health import Health
 
 FLAG_TEXTS: Final = (
-    (NavFlags.ATTITUDE_VALID, Told(INFO, "Attitude valid"), Told(WARNING, "Attitude not valid")),
-    (NavFlags.HEADING_VALID, Told(INFO, "Heading valid"), Told(WARNING, "Heading not valid")),
+    (
+        NavFlags.ATTITUDE_VALID,
+        StatusText(INFO, "Attitude valid"),
+        StatusText(WARNING, "Attitude not valid"),
+    ),
+    (
+        NavFlags.HEADING_VALID,
+        StatusText(INFO, "Heading valid"),
+        StatusText(WARNING, "Heading not valid"),
+    ),
     (
         NavFlags.DEAD_RECKONING,
-        Told(WARNING, "Position is dead-reckoned"),
-        Told(INFO, "Position follows GPS again"),
+        StatusText(WARNING, "Position is dead-reckoned"),
+        StatusText(INFO, "Position follows GPS again"),
     ),
-    (NavFlags.GPS_REJECTED, Told(WARNING, "GPS fixes rejected"), Told(INFO, "GPS accepted again")),
+    (
+        NavFlags.GPS_REJECTED,
+        StatusText(WARNING, "GPS fixes rejected"),
+        StatusText(INFO, "GPS accepted again"),
+    ),
     (
         NavFlags.MAG_DISTURBED,
-        Told(WARNING, "Magnetic field disturbed"),
-        Told(INFO, "Magnetic field normal again"),
+        StatusText(WARNING, "Magnetic field disturbed"),
+        StatusText(INFO, "Magnetic field normal again"),
     ),
-    (NavFlags.SENSOR_FAULT, Told(CRITICAL, "Sensor fault"), Told(NOTICE, "Sensors well again")),
-    (NavFlags.DEGRADED, Told(WARNING, "Estimator degraded"), Told(INFO, "Estimator well again")),
+    (
+        NavFlags.SENSOR_FAULT,
+        StatusText(CRITICAL, "Sensor fault"),
+        StatusText(NOTICE, "Sensors well again"),
+    ),
+    (
+        NavFlags.DEGRADED,
+        StatusText(WARNING, "Estimator degraded"),
+        StatusText(INFO, "Estimator well again"),
+    ),
 )
 """A flag of the estimator, what is told when it rises, and what when it falls."""
 
@@ -52,14 +72,14 @@ class Announcements:
     def on_fix(self, now_us: int) -> list[Any]:
         """Tell whether GPS fixes come."""
         fixed = self._health.has_fix(now_us)
-        text = Told(NOTICE, "GPS fix") if fixed else Told(WARNING, "GPS fix lost")
+        text = StatusText(NOTICE, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
         """Tell the receiver's and the nodes' coming and going."""
-        text = Told(CRITICAL, f"Receiver lost: {report.port}")
+        text = StatusText(CRITICAL, f"Receiver lost: {report.port}")
         if report.connected:
-            text = Told(NOTICE, f"Receiver connected: {report.port}")
+            text = StatusText(NOTICE, f"Receiver connected: {report.port}")
         found = self._announcer.track("link", report.connected, text, now_us)
         if not report.connected:
             # Without the receiver every node is silent; that need not be said.
@@ -67,15 +87,15 @@ class Announcements:
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
             name = self._health.node_name(node)
-            text = Told(NOTICE, f"{name} is back")
+            text = StatusText(NOTICE, f"{name} is back")
             if node in silent:
-                text = Told(CRITICAL, f"{name} silent")
+                text = StatusText(CRITICAL, f"{name} silent")
             found += self._announcer.track(
                 f"node {node}", node not in silent, text, now_us, initially=True
             )
         return found + self._on_restarts(now_us)
 
-    def say(self, text: Told, now_us: int) -> list[Any]:
+    def say(self, text: StatusText, now_us: int) -> list[Any]:
         """Tell a single event."""
         return self._announcer.say(text, now_us)
 
@@ -92,7 +112,7 @@ class Announcements:
         for node, restarts in sorted(self._health.restarts().items()):
             if restarts > self._restarts.get(node, restarts):
                 found += self.say(
-                    Told(WARNING, f"{self._health.node_name(node)} restarted"), now_us
+                    StatusText(WARNING, f"{self._health.node_name(node)} restarted"), now_us
                 )
             self._restarts[node] = restarts
         return found

@@ -29,7 +29,7 @@ MAX_TEXT_BYTES: Final = 4 * TEXT_BYTES
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StatusText:
     """A text and how grave it is."""
 
     severity: int
@@ -39,8 +39,8 @@ class Told:
 @dataclass(slots=True)
 class _Topic:
     state: object
-    told: object
-    text: Told
+    announced: object
+    text: StatusText
     held_until_us: int = 0
 
 
@@ -54,7 +54,7 @@ class Announcer:
         self._next_id = 0
 
     def track(
-        self, topic: str, state: object, text: Told, now_us: int, *, initially: object = None
+        self, topic: str, state: object, text: StatusText, now_us: int, *, initially: object = None
     ) -> list[Any]:
         """Note the present state of a topic, and tell it if it changed.
 
@@ -64,7 +64,7 @@ class Announcer:
             Name of the topic.
         state : object
             Any value; compared by equality.
-        text : Told
+        text : StatusText
             What to tell of this state.
         now_us : int
             Gateway clock.
@@ -77,9 +77,9 @@ class Announcer:
         """
         known = self._topics.setdefault(topic, _Topic(initially, initially, text))
         known.state, known.text = state, text
-        return self._tell(known, now_us)
+        return self._announce(known, now_us)
 
-    def say(self, text: Told, now_us: int) -> list[Any]:
+    def say(self, text: StatusText, now_us: int) -> list[Any]:
         """Tell a single event, unless there were too many of late."""
         self._refill(now_us)
         if self._tokens == 0:
@@ -89,17 +89,19 @@ class Announcer:
 
     def poll(self, now_us: int) -> list[Any]:
         """Tell the states that changed while their topics were held."""
-        return [message for topic in self._topics.values() for message in self._tell(topic, now_us)]
+        return [
+            message for topic in self._topics.values() for message in self._announce(topic, now_us)
+        ]
 
     def next_due_us(self) -> int | None:
         """Tell when `poll` has something to tell."""
-        pending = (t.held_until_us for t in self._topics.values() if t.state != t.told)
+        pending = (t.held_until_us for t in self._topics.values() if t.state != t.announced)
         return min(pending, default=None)
 
-    def _tell(self, topic: _Topic, now_us: int) -> list[Any]:
-        if topic.state == topic.told or now_us < topic.held_until_us:
+    def _announce(self, topic: _Topic, now_us: int) -> list[Any]:
+        if topic.state == topic.announced or now_us < topic.held_until_us:
             return []
-        topic.told = topic.state
+        topic.announced = topic.state
         topic.held_until_us = now_us + HOLD_US
         return chunks(topic.text, self._number())
 
@@ -114,12 +116,12 @@ class Announcer:
             self._refilled_us += fresh * REFILL_US
 
 
-def chunks(text: Told, number: int = 1) -> list[Any]:
+def chunks(text: StatusText, number: int = 1) -> list[Any]:
     """Encode a text as one STATUSTEXT, or as several that a reader puts together.
 
     Parameters
     ----------
-    text : Told
+    text : StatusText
         ASCII; cut at `MAX_TEXT_BYTES`.
     number : int, optional
         Tells a long text from the one before, 1 to 65535.

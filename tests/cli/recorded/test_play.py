@@ -12,7 +12,7 @@ from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flightlog.track import Track
-from gateway.flights.reading import FlightError, Wishes
+from gateway.flights.reading import FlightError, ReadOptions
 from gateway.pipeline import PipelineSettings
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight, read
@@ -20,7 +20,7 @@ from tests.test_replay import fly, make_flight, read
 pytestmark = pytest.mark.io
 
 RECORDS = make_records(300)
-WISHES = Wishes(PipelineSettings(GatewaySettings().default_aircraft))
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 
 
 def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
@@ -31,7 +31,7 @@ def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
 
 def lay_out(files: list[Path], *wished: int) -> list[Track]:
     with ExitStack() as opened:
-        return _lay_out(_open_all(files, WISHES, opened), wished)
+        return _lay_out(_open_all(files, OPTIONS, opened), wished)
 
 
 def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 import pytest
 
-from gateway.vehicle.telemetry.events import BUCKET, HOLD_US, INFO, WARNING, Announcer, Told
+from gateway.vehicle.telemetry.events import BUCKET, HOLD_US, INFO, WARNING, Announcer, StatusText
 
-GOOD, BAD = Told(INFO, "good"), Told(WARNING, "bad")
+GOOD, BAD = StatusText(INFO, "good"), StatusText(WARNING, "bad")
 
 
 def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
@@ -50,7 +50,7 @@ def test_single_events_are_limited() -> None:
 @pytest.mark.parametrize("size", [1, 49, 50, 51, 99, 100, 101, 199])
 def test_long_texts_are_chunked(size: int) -> None:
     text = "".join(chr(ord("a") + n % 26) for n in range(size))
-    found = Announcer().say(Told(INFO, text), 0)
+    found = Announcer().say(StatusText(INFO, text), 0)
     assert "".join(m.text for m in found) == text
     assert [m.chunk_seq for m in found] == list(range(len(found)))
     if size <= 50:

@@ -25,11 +25,11 @@ from gateway.vehicle.services.home_service import HomeService
 from gateway.vehicle.services.missions.mission import MissionService
 from gateway.vehicle.services.missions.mission_items import FENCE, MISSION, RALLY
 from gateway.vehicle.stored import KINDS, StoredPlaces
-from gateway.vehicle.telemetry.events import INFO, Told
+from gateway.vehicle.telemetry.events import INFO, StatusText
 from gateway.vehicle.telemetry.messages import has_position
 from gateway.vehicle.telemetry.telemetry import Telemetry
 
-Say = Callable[[Told, int], list[Any]]
+Say = Callable[[StatusText, int], list[Any]]
 
 USE_CURRENT: Final = 1
 """First parameter of MAV_CMD_DO_SET_HOME."""
@@ -127,7 +127,7 @@ class PlaceService:
         return home.place.alt_amsl_m if home else NAN
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return [Reply(message) for message in self._say(Told(INFO, text), now_us)]
+        return [Reply(message) for message in self._say(StatusText(INFO, text), now_us)]
 
     def _on_items(self, kind: int, _now_us: int) -> list[Answer]:
         if kind != FENCE:
@@ -154,11 +154,11 @@ class PlaceService:
             place = self._place(command)
         if place is None or not math.isfinite(place.alt_amsl_m):
             return DENIED, []
-        told = self.home.put(place, now_us)
+        announced = self.home.put(place, now_us)
         self.home.keep()
         self.mark.put(place)
         said = self._explain("Home set by a ground station", now_us)
-        return ACCEPTED, [*told, *said, self._save()]
+        return ACCEPTED, [*announced, *said, self._save()]
 
     def _set_roi(self, command: Command, now_us: int) -> Outcome:
         mode = whole(command.params[0])

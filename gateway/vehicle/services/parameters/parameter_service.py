@@ -131,9 +131,9 @@ class ParameterService:
             if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
                 fresh = self.table.reset(key)
                 answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
-        return ACCEPTED, answers + self._told_since(before)
+        return ACCEPTED, answers + self._changed_since(before)
 
-    def told(self, parameter: Parameter) -> Reply:
+    def param_value(self, parameter: Parameter) -> Reply:
         """Tell all the present value of a parameter."""
         return Reply(self._value(parameter))
 
@@ -141,14 +141,14 @@ class ParameterService:
         """Take over a section that was changed elsewhere, and tell what differs."""
         before = self._numbers()
         self.table.sections[section] = settings
-        return self._told_since(before)
+        return self._changed_since(before)
 
     def _numbers(self) -> list[float]:
         return [self.table.number(parameter) for parameter in self.table.parameters]
 
-    def _told_since(self, before: list[float]) -> list[Answer]:
+    def _changed_since(self, before: list[float]) -> list[Answer]:
         changed = zip(self.table.parameters, before, self._numbers(), strict=True)
-        return [self.told(parameter) for parameter, old, new in changed if old != new]
+        return [self.param_value(parameter) for parameter, old, new in changed if old != new]
 
     def _set(self, request: Request, now_us: int) -> list[Answer]:
         message = request.message
@@ -163,8 +163,8 @@ class ParameterService:
         except ValueError:
             self.table.sections[parameter.section] = before
             # The error first: a client that sees only the old value would try again.
-            return [self._error(request, BAD_VALUE), self.told(parameter)]
-        return [*answers, self.told(parameter)]
+            return [self._error(request, BAD_VALUE), self.param_value(parameter)]
+        return [*answers, self.param_value(parameter)]
 
     def _carry_out(self, parameter: Parameter, settings: Settings, now_us: int) -> list[Answer]:
         path = ".".join(parameter.path)
