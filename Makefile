@@ -19,7 +19,7 @@ lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
 
 lock: .venv/.dev
-	$(COMPILE) --output-file requirements.lock pyproject.toml
+	$(COMPILE) --extra panel --output-file requirements.lock pyproject.toml
 	$(COMPILE) --all-extras --constraint requirements.lock $(HEADLESS) \
 		--output-file requirements-dev.lock pyproject.toml
 
