@@ -41,7 +41,7 @@ Scores = dict[str, float]
 
 SEEDS = (11, 12, 13)
 NEES_SEEDS = range(31, 41)
-"""RecordHandle out: no setting was chosen on these."""
+"""Held out: no setting was chosen on these."""
 OUTAGE_EVERY = 2.0
 """An outage begins each so many of its lengths; those too close to another run another time."""
 OUTAGE_REST_S = 20.0

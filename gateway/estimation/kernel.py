@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, cast
+from typing import Generic, TypeVar
 
 import msgspec
 import numpy as np
 
+from gateway.compiled import address_of
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -30,7 +31,6 @@ from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 State = TypeVar("State")
 Gains = TypeVar("Gains")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,49 +54,14 @@ class Kernels(Generic[State, Gains]):
 
     declaration: type[State]
     start: Callable[[State, Gains], None]
-    imu: Callable[..., None]
-    """`(state, gains, time_us, *imu_row)`."""
-    baro: Callable[[State, Gains, float], None]
-    gps: Callable[[State, Gains, int, FloatArray], None]
-    write_output: Callable[[State, FloatArray], None]
-    """Writes the output row."""
+    imu: Callable[[int, int, int, FloatArray, FloatArray], None]
+    """`(state, gains, time_us, imu_row, output_row)`; records by their addresses."""
+    baro: Callable[[int, int, float], None]
+    """`(state, gains, alt_m)`."""
+    gps: Callable[[int, int, int, FloatArray], None]
+    """`(state, gains, arrival_us, gps_row)`."""
     run: Callable[..., None]
     """`(state, gains, *arrays of a SampleLog, output)`."""
-
-
-class RecordHandle(Generic[State]):
-    """A record as machine code is handed it, by the address of its bytes.
-
-    Compiled code asks a record for its `data`, and numpy's own answer describes all the fields
-    anew on every call, which takes several times as long as the work.
-
-    Parameters
-    ----------
-    record : record
-        Stays the same memory for good; another record needs another `RecordHandle`.
-    """
-
-    __slots__ = ("data", "record")
-
-    def __init__(self, record: State) -> None:
-        self.record = record
-        self.data = memoryview(cast(Any, record)).cast("B")
-
-
-def direct(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Find the machine code behind a dispatcher that has compiled for one signature.
-
-    The dispatcher looks the type of every argument up on every call, which for records of many
-    fields takes longer than the work. The caller must keep to the types of the first call, and
-    hands records over as `RecordHandle`.
-    """
-    overloads = getattr(function, "overloads", {})
-    if len(overloads) != 1:
-        return lambda *args: function(
-            *(a.record if isinstance(a, RecordHandle) else a for a in args)
-        )
-    code: Callable[..., Result] = next(iter(overloads.values())).entry_point
-    return code
 
 
 class KernelEstimator(Generic[State, Gains]):
@@ -117,34 +82,29 @@ class KernelEstimator(Generic[State, Gains]):
     ) -> None:
         self._kernels = kernels
         self._gains = gains
-        self._gains_handle = RecordHandle(gains)
+        self._gains_at = address_of(gains)
         self._reference = reference
         self._earth = EarthField(reference)
-        self._row = np.empty(NAV_COLUMNS)
-        self._state = new_record(kernels.declaration)
-        kernels.start(self._state, gains)
-        # A first call on a scrap state compiles, or loads, what `direct` then finds.
-        scrap = copy_record(self._state)
-        kernels.imu(scrap, gains, 0, *([0.0] * IMU_COLUMNS))
-        kernels.baro(scrap, gains, 0.0)
-        kernels.gps(scrap, gains, 0, np.zeros(GPS_COLUMNS))
-        kernels.write_output(scrap, self._row)
-        self._imu, self._baro = direct(kernels.imu), direct(kernels.baro)
-        self._gps, self._write_output = direct(kernels.gps), direct(kernels.write_output)
+        self._row = np.empty(IMU_COLUMNS)
+        self._output = np.empty(NAV_COLUMNS)
+        # A first call on a scrap state compiles, or loads, what a sample would wait for.
+        self._begin()
+        kernels.imu(self._at, self._gains_at, 0, np.zeros(IMU_COLUMNS), self._output)
+        kernels.baro(self._at, self._gains_at, 0.0)
+        kernels.gps(self._at, self._gains_at, 0, np.zeros(GPS_COLUMNS))
+        self._begin()
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
-        self._state = new_record(self._kernels.declaration)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._use(new_record(self._kernels.declaration))
         self._kernels.start(self._state, self._gains)
 
-    @property
-    def _state(self) -> State:
-        return self._handle.record
-
-    @_state.setter
-    def _state(self, record: State) -> None:
-        self._handle = RecordHandle(record)
+    def _use(self, record: State) -> None:
+        self._state, self._at = record, address_of(record)
 
     @property
     def state(self) -> State:
@@ -155,7 +115,7 @@ class KernelEstimator(Generic[State, Gains]):
     def state(self, state: State) -> None:
         if getattr(state, "dtype", None) != getattr(self._state, "dtype", None):
             raise TypeError(f"not a state of this estimator: {type(state)}")
-        self._state = copy_record(state)
+        self._use(copy_record(state))
 
     def snapshot(self) -> bytes:
         """Write down all that is remembered, the place on the Earth included."""
@@ -165,7 +125,7 @@ class KernelEstimator(Generic[State, Gains]):
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
         kind = tuple[Packed, EarthPlace | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._state = unpack_record(self._kernels.declaration, packed)
+        self._use(unpack_record(self._kernels.declaration, packed))
 
     def update_imu(self, sample: ImuSample) -> NavState:
         """Advance by one IMU sample.
@@ -180,9 +140,9 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._imu(self._handle, self._gains_handle, sample.time_us, *imu_row(sample))
-        self._write_output(self._handle, self._row)
-        return nav_state(sample.time_us, self._row)
+        self._row[:] = imu_row(sample)
+        self._kernels.imu(self._at, self._gains_at, sample.time_us, self._row, self._output)
+        return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
         """Take in one barometer sample.
@@ -192,7 +152,7 @@ class KernelEstimator(Generic[State, Gains]):
         sample : BaroSample
             Its pressure altitude is used.
         """
-        self._baro(self._handle, self._gains_handle, sample.alt_pressure_m)
+        self._kernels.baro(self._at, self._gains_at, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
         """Take in one GPS fix at its arrival.
@@ -203,7 +163,7 @@ class KernelEstimator(Generic[State, Gains]):
             Fused as of the time it was valid.
         """
         row = gps_row(fix, self._reference, self._earth)
-        self._gps(self._handle, self._gains_handle, fix.time_us, np.array(row))
+        self._kernels.gps(self._at, self._gains_at, fix.time_us, np.array(row))
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""

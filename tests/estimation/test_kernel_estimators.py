@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gateway.compiled import address_of, record_at
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -16,7 +17,7 @@ from gateway.estimation.columns import (
     NAV_VEL,
     imu_row,
 )
-from gateway.estimation.kernel import KernelEstimator, SampleLog, direct
+from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import layout
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
@@ -131,23 +132,13 @@ def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
     np.testing.assert_array_equal(offline, live)
 
 
-def test_the_short_way_into_machine_code_gives_the_same_bits(estimator: KernelEstimator) -> None:
-    """By address, or through the dispatcher with all its checks."""
-    kernels, state, row = estimator._kernels, estimator.state, np.empty(NAV_COLUMNS)
-    for sample in events(4.0, 6):
-        if not isinstance(sample, ImuSample):
-            continue
-        estimator.update_imu(sample)
-        kernels.imu(state, estimator._gains, sample.time_us, *imu_row(sample))
-        kernels.write_output(state, row)
-    assert state.tobytes() == estimator.state.tobytes()
-    np.testing.assert_array_equal(row, estimator._row)
-
-
-def test_what_has_no_machine_code_is_handed_the_record(estimator: KernelEstimator) -> None:
-    taken = []
-    direct(lambda *arguments: taken.append(arguments))(estimator._handle, 1.0)
-    assert taken == [(estimator._handle.record, 1.0)]
+def test_a_record_is_reached_by_its_address(estimator: KernelEstimator) -> None:
+    """Live steps and a run over the log work on the same record, neither on a copy."""
+    state, before = estimator._state, estimator.state
+    estimator.update_imu(next(item for item in events(1.0, 6) if isinstance(item, ImuSample)))
+    assert estimator._state is state
+    assert state.tobytes() != before.tobytes()
+    assert record_at(address_of(state), state.dtype).tobytes() == state.tobytes()
 
 
 @pytest.mark.parametrize("seed", range(3))

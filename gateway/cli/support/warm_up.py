@@ -8,8 +8,8 @@ from typing import Final, get_args
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores, run_copies
 from gateway.compiled import is_kept
-from gateway.estimation.complementary import complementary_kernels
-from gateway.estimation.eskf import eskf_kernels
+from gateway.estimation.complementary import complementary_live
+from gateway.estimation.eskf import eskf_live
 from gateway.estimation.paper import paper_kernels
 from gateway.estimation.select import EstimationSettings, EstimatorName
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 REHEARSAL_S: Final = 2.0
 NAMES: Final[tuple[EstimatorName, ...]] = get_args(EstimatorName)
-STEPS: Final = (paper_kernels.step, complementary_kernels.take_imu, eskf_kernels.take_imu)
+STEPS: Final = (paper_kernels.step_live, complementary_live.imu_step, eskf_live.imu_step)
 
 
 def compile_everything() -> None:

@@ -24,7 +24,6 @@ from gateway.estimation.complementary.navigation import (
 from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import recall, remember
-from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
@@ -321,14 +320,3 @@ def run(
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
         write_output(s, out[i])
-
-
-KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = Kernels(
-    declaration=ComplementaryState,
-    start=start,
-    imu=take_imu,
-    baro=take_baro,
-    gps=take_gps,
-    write_output=write_output,
-    run=run,
-)

@@ -22,12 +22,10 @@ from gateway.estimation.eskf.start import (
     end_dead_reckoning,
     forget_times,
     restart_baro,
-    start,
     start_heading_by_compass,
 )
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
-from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
@@ -308,14 +306,3 @@ def run(
         r = imu[i]
         take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
         write_output(s, out[i])
-
-
-KERNELS: Final[Kernels[EskfState, EskfGains]] = Kernels(
-    declaration=EskfState,
-    start=start,
-    imu=take_imu,
-    baro=take_baro,
-    gps=take_gps,
-    write_output=write_output,
-    run=run,
-)

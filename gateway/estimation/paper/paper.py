@@ -39,7 +39,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from gateway.estimation.kernel import RecordHandle, direct
+from gateway.compiled import address_of
 from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
@@ -155,43 +155,35 @@ class PaperEstimator:
     ) -> None:
         self._settings = settings
         self._reference = reference
-        self._rest = RecordHandle(filled_record(RestGains, rest_gains(rest)))
+        self._rest = filled_record(RestGains, rest_gains(rest))
         self._earth = EarthField(reference)
         self._s = PaperState()
-        self._handle = RecordHandle(new_record(kernels.Memory))
-        # A first call on a scrap compiles, or loads, what `direct` then finds.
-        nothing = (UNKNOWN_VEC3,) * 5
-        kernels.step(
-            new_record(kernels.Memory), self._rest.record, 1.0, IDENTITY, *nothing, 0, 0, 0.0
-        )
-        self._step = direct(kernels.step)
+        self._memory = new_record(kernels.Memory)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._earth.reset()
         self._s = PaperState()
-        self._handle = RecordHandle(new_record(kernels.Memory))
+        self._memory = new_record(kernels.Memory)
 
     @property
     def state(self) -> tuple[PaperState, kernels.Memory]:
         """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s), copy_record(self._handle.record)
+        return replace(self._s), copy_record(self._memory)
 
     @state.setter
     def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
-        self._s, self._handle = replace(state[0]), RecordHandle(copy_record(state[1]))
+        self._s, self._memory = replace(state[0]), copy_record(state[1])
 
     def snapshot(self) -> bytes:
         """Write down all that is remembered, the declination included."""
-        return msgspec.msgpack.encode(
-            (self._s, pack_record(self._handle.record), self._earth.state)
-        )
+        return msgspec.msgpack.encode((self._s, pack_record(self._memory), self._earth.state))
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
         kind = tuple[PaperState, Packed, EarthPlace | None]
         self._s, packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._handle = RecordHandle(unpack_record(kernels.Memory, packed))
+        self._memory = unpack_record(kernels.Memory, packed)
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
@@ -223,7 +215,7 @@ class PaperEstimator:
             if dt_us < 0:
                 # The clock began anew: the ages of fix and compass mean nothing any more.
                 s.fix_time_us = s.mag_time_us = None
-                self._handle.record.ring_count = 0
+                self._memory.ring_count = 0
             s.time_us, dt_us = sample.time_us, 0
         if dt_us > 0:
             s.time_us = sample.time_us
@@ -246,7 +238,7 @@ class PaperEstimator:
         s = self._s
         place, vel = self._read(fix)
         s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
-            self._handle.record,
+            self._memory,
             place,
             vel,
             fix.time_us,
@@ -294,7 +286,7 @@ class PaperEstimator:
         gains, latency_s = self._settings, self._reference.gps_latency_s
         return kernels.run(
             (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity, latency_s),
-            self._rest.record,
+            self._rest,
             new_record(kernels.Memory),
             gains.blend == "at_fix",
             declination_rad,
@@ -318,9 +310,9 @@ class PaperEstimator:
 
     def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
         s, now_us = self._s, _known(self._s.time_us)
-        s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = self._step(
-            self._handle,
-            self._rest,
+        s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = kernels.step_live(
+            address_of(self._memory),
+            address_of(self._rest),
             self._settings.alpha_gyro,
             s.q_nb,
             accel,
