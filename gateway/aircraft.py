@@ -47,6 +47,7 @@ from gateway.vehicle.actions import (
 )
 from gateway.vehicle.home import Home, Place
 from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.telemetry.events import WARNING, StatusText
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -203,13 +204,22 @@ class Aircraft:
             if isinstance(action, SettingsChange):
                 actions += self._change(action.section, action.settings)
             elif isinstance(action, CalibrationMeasured):
-                calibration = ABSORB[action.kind](self.settings.calibration, action.error_b)
-                actions += self._change("calibration", calibration)
-                found = self.vehicle.take_settings("calibration", calibration)
-                actions += self.perform(found, now_us)
+                actions += self._recalibrate(action, now_us)
             else:
                 actions.append(action)
         return actions
+
+    def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
+        """Take a measured error into the calibration, unless no sensor errs so much."""
+        try:
+            fresh = ABSORB[measured.kind](self.settings.calibration, measured.error_b)
+            calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
+        except ValueError as error:
+            text = StatusText(WARNING, f"Calibration refused: {error}")
+            return self.perform(self.vehicle.say(text, now_us), now_us)
+        changed = self._change("calibration", calibration)
+        found = self.vehicle.take_settings("calibration", calibration)
+        return changed + self.perform(found, now_us)
 
     def change(self, settings: AircraftSettings) -> None:
         """Take over what differs between these settings and those that hold."""
@@ -226,14 +236,17 @@ class Aircraft:
 
     def _change(self, section: str, settings: Settings) -> list[Action]:
         """Rebuild the stage whose settings changed; the others go on undisturbed."""
-        self.settings = msgspec.structs.replace(self.settings, **{section: settings})
+        wanted = msgspec.structs.replace(self.settings, **{section: settings})
         if section in ("sensing", "calibration"):
-            self._chain = SensorChain(self.settings.sensing, self.settings.calibration)
+            self._chain = SensorChain(wanted.sensing, wanted.calibration)
         elif section == "estimation":
-            self._estimator = _succeed(self._estimator, make_estimator(self.settings.estimation))
-        else:
-            return []
-        return [SettingsChanged(self.vehicle_id)]
+            fresh = make_estimator(wanted.estimation)
+            if wanted.estimation.estimator == self.settings.estimation.estimator:
+                fresh.restore(self._estimator.snapshot())
+            self._estimator = fresh
+        # Only now: a stage that cannot be built leaves the settings of the one that runs.
+        self.settings = wanted
+        return [] if section == "vehicle" else [SettingsChanged(self.vehicle_id)]
 
 
 def make_fusion(
@@ -272,14 +285,6 @@ def _fits(settings: AircraftSettings) -> str:
     """Tell version and settings apart from all others, in a few letters."""
     fused_with = (settings.sensing, settings.estimation, settings.calibration)
     return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
-
-
-def _succeed(old: Estimator, new: Estimator) -> Estimator:
-    """Let a retuned estimator go on from the state of the one before, if it is of its kind."""
-    state = getattr(old, "state", None)
-    if state is not None and type(new) is type(old):
-        new.state = state  # type: ignore[attr-defined]
-    return new
 
 
 def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSettings:

@@ -75,7 +75,8 @@ class Field:
     is_rotation: bool
     """Whether the value is the matrix of a rotation."""
     bounds: tuple[float | None, float | None]
-    """Least and greatest allowed number, None where there is no bound."""
+    """Least and greatest allowed number, of a vector of each of its components; None where there
+    is no bound."""
 
 
 def fields_of(kind: type[Settings]) -> list[Field]:
@@ -90,7 +91,9 @@ def fields_of(kind: type[Settings]) -> list[Field]:
 
 def _field(name: str, kind: Any, default: Any) -> Field:
     plain = _plain(kind)
-    meta = next(_metas(kind), msgspec.Meta())
+    metas = list(_metas(kind)) or [msgspec.Meta()]
+    meta = metas[0]
+    bounded = next((m for m in metas if m.ge is not None or m.le is not None), meta)
     extra = meta.extra or {}
     return Field(
         name=name,
@@ -101,7 +104,7 @@ def _field(name: str, kind: Any, default: Any) -> Field:
         meaning=meta.description or "",
         unit=extra.get("unit", ""),
         is_rotation=extra.get("rotation", False),
-        bounds=(meta.ge, meta.le),
+        bounds=(bounded.ge, bounded.le),
     )
 
 

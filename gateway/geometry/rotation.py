@@ -57,6 +57,34 @@ def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
     return (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
 
 
+def determinant(matrix: Matrix3) -> float:
+    """Give the volume of the box that the rows span; negative where they are left-handed."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def is_rotation(matrix: Matrix3, tolerance: float = 1e-3) -> bool:
+    """Tell whether the rows are of length one, at right angles and right-handed.
+
+    Parameters
+    ----------
+    matrix : tuple of 3 tuples of 3 floats
+        Rows.
+    tolerance : float
+        Of every product of two rows; a thousandth allows for rows that a person rounded.
+
+    Returns
+    -------
+    bool
+    """
+    products = (
+        (sum(a * b for a, b in zip(matrix[m], matrix[n], strict=True)), float(m == n))
+        for m in range(3)
+        for n in range(m, 3)
+    )
+    return determinant(matrix) > 0.0 and all(abs(p - wanted) <= tolerance for p, wanted in products)
+
+
 def _cos_sin(angle_deg: float) -> tuple[float, float]:
     quarters, rest_deg = divmod(angle_deg, 90.0)
     if rest_deg == 0.0:

@@ -2,7 +2,9 @@
 
 from typing import Annotated, Final
 
-from gateway.geometry.rotation import Matrix3
+import msgspec
+
+from gateway.geometry.rotation import Matrix3, determinant, is_rotation
 from gateway.records import Int3, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
@@ -20,6 +22,17 @@ MAG_OVERFLOW: Final = -4096
 
 _NO_OFFSET: Final[Vec3] = (0.0, 0.0, 0.0)
 
+_Accel = Annotated[float, msgspec.Meta(ge=-50, le=50)]
+_Rate = Annotated[float, msgspec.Meta(ge=-10, le=10)]
+_Field = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+_Share = Annotated[float, msgspec.Meta(ge=-10, le=10)]
+"""What a sensor can err by: of its full scale the third in acceleration and rate, all in field."""
+_Rows = tuple[
+    tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share]
+]
+_FLAT: Final = 1e-3
+"""Determinant of a matrix that leaves no three axes to tell apart."""
+
 
 class NodeCalibration(Settings, frozen=True):
     """How one IMU node errs and how it is mounted.
@@ -29,24 +42,24 @@ class NodeCalibration(Settings, frozen=True):
     """
 
     mounting: Annotated[
-        Matrix3,
+        _Rows,
         setting(
             "Rotation from accelerometer and gyroscope axes to body FRD. Here the rows of its "
             "matrix, as parameters its angles.",
             rotation=True,
         ),
     ] = FACE_UP
-    accel_bias_mps2: Annotated[Vec3, setting("Accelerometer bias in sensor axes.", "m/s2")] = (
-        _NO_OFFSET
-    )
+    accel_bias_mps2: Annotated[
+        tuple[_Accel, _Accel, _Accel], setting("Accelerometer bias in sensor axes.", "m/s2")
+    ] = _NO_OFFSET
     accel_matrix: Annotated[
-        Matrix3, setting("Rows of the accelerometer's scale and misalignment matrix.")
+        _Rows, setting("Rows of the accelerometer's scale and misalignment matrix.")
     ] = IDENTITY3
-    gyro_bias_radps: Annotated[Vec3, setting("Gyroscope bias in sensor axes.", "rad/s")] = (
-        _NO_OFFSET
-    )
+    gyro_bias_radps: Annotated[
+        tuple[_Rate, _Rate, _Rate], setting("Gyroscope bias in sensor axes.", "rad/s")
+    ] = _NO_OFFSET
     mag_mounting: Annotated[
-        Matrix3,
+        _Rows,
         setting(
             "Rotation from magnetometer axes to body FRD. Here the rows of its matrix, as "
             "parameters its angles.",
@@ -54,10 +67,11 @@ class NodeCalibration(Settings, frozen=True):
         ),
     ] = FACE_UP
     mag_hard_iron_ut: Annotated[
-        Vec3, setting("Field of the aircraft's own magnets in sensor axes.", "uT")
+        tuple[_Field, _Field, _Field],
+        setting("Field of the aircraft's own magnets in sensor axes.", "uT"),
     ] = _NO_OFFSET
     mag_soft_iron: Annotated[
-        Matrix3, setting("Rows of the matrix that turns the measured ellipsoid into a sphere.")
+        _Rows, setting("Rows of the matrix that turns the measured ellipsoid into a sphere.")
     ] = IDENTITY3
     gyro_residual_radps: Annotated[
         float,
@@ -69,6 +83,15 @@ class NodeCalibration(Settings, frozen=True):
     mag_residual_ut: Annotated[
         float, setting("What it left of the field's differences.", "uT", ge=0.0, le=1000.0)
     ] = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse matrices that cannot be what they are said to be."""
+        for name in ("mounting", "mag_mounting"):
+            if not is_rotation(getattr(self, name)):
+                raise ValueError(f"{name} must be a rotation: orthogonal rows of length one")
+        for name in ("accel_matrix", "mag_soft_iron"):
+            if abs(determinant(getattr(self, name))) < _FLAT:
+                raise ValueError(f"{name} must have an inverse: no row made of the others")
 
 
 def transform(matrix: Matrix3, v: Vec3) -> Vec3:

@@ -24,6 +24,9 @@ FilterState = tuple[Delays, Vec3]
 """Delays and last output."""
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
+SLOWEST_HIGHPASS_HZ: Final = 1e-6
+"""A time constant of 44 hours: no flight can tell a slower one from none, while rounding would put
+its pole on the unit circle, where it has no gain at rest any more."""
 
 
 def design_lowpass(
@@ -59,7 +62,7 @@ def design_lowpass(
 
 
 def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
-    """Design a first-order high-pass; a cutoff of 0 Hz gives a wire.
+    """Design a first-order high-pass; a cutoff of `SLOWEST_HIGHPASS_HZ` or less gives a wire.
 
     Parameters
     ----------
@@ -73,7 +76,7 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
     tuple of 5 floats
         Coefficients.
     """
-    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+    if not SLOWEST_HIGHPASS_HZ < cutoff_hz < 0.5 * rate_hz:
         return PASS_THROUGH
     b, a = signal.butter(1, cutoff_hz, "highpass", fs=rate_hz)
     return (float(b[0]), float(b[1]), 0.0, float(a[1]), 0.0)

@@ -2,9 +2,12 @@
 
 from typing import Annotated
 
+import msgspec
+
 from gateway.settings import Settings, setting
 
-GpsOutages = tuple[tuple[float, float], ...]
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+GpsOutages = tuple[tuple[_Seconds, _Seconds], ...]
 
 
 class SimulatorSettings(Settings, frozen=True):

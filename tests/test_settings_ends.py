@@ -1,0 +1,260 @@
+"""Every number that may be set, at both ends of its range, beside them, and at almost nothing."""
+
+import math
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.aircraft import Action, Aircraft, AircraftSettings
+from gateway.config import GatewaySettings
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    ImuRaw,
+    NodeId,
+    Outgoing,
+    RawRecord,
+)
+from gateway.sensing.calibration import NodeCalibration
+from gateway.settings import Field, Settings, fields_of
+from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured, SettingsChange
+
+ESTIMATORS = ("paper", "complementary", "eskf")
+IMU, GPS = NodeId(1, 0), NodeId(1, 1)
+DENORMAL = sys.float_info.min / 4.0
+SMALL = (0.0, 5e-324, DENORMAL, sys.float_info.min, 1e-300, 1e-15, 1e-9, 1e-6)
+
+
+def numbers(kind: type[Settings], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Field]]:
+    """List every setting that is a number or made of numbers."""
+    for field in fields_of(kind):
+        inner = (*path, field.name)
+        if field.section is not None:
+            yield from numbers(field.section, inner)
+        elif not field.choices and not isinstance(first_of(field.default), bool | str):
+            yield ".".join(inner), field
+
+
+def first_of(value: Any) -> Any:
+    while isinstance(value, tuple) and value:
+        value = value[0]
+    return value
+
+
+def ends(field: Field) -> list[float]:
+    """Both ends of a range, their neighbours inside it, and what is next to nothing."""
+    low, high = (float(bound) for bound in field.bounds if bound is not None)
+    if isinstance(field.default, int):
+        return [int(low), int(low) + 1, int(high) - 1, int(high)]
+    found = [low, math.nextafter(low, high), math.nextafter(high, low), high]
+    found += [sign * x for x in SMALL for sign in (1.0, -1.0) if low <= sign * x <= high]
+    return list(dict.fromkeys(found))
+
+
+def is_matrix(field: Field) -> bool:
+    return isinstance(field.default, tuple) and isinstance(field.default[0], tuple)
+
+
+FUSION = [
+    (path, field)
+    for path, field in numbers(AircraftSettings)
+    if not path.startswith("vehicle.") and not is_matrix(field)
+]
+
+
+def concerns(path: str, estimator: str) -> bool:
+    """Tell whether an estimator reads a setting."""
+    owner = path.split(".")[1]
+    return owner not in ESTIMATORS or owner == estimator
+
+
+def replaced(tree: Any, path: str, value: Any) -> Any:
+    key, _, rest = path.partition(".")
+    inner = replaced(getattr(tree, key), rest, value) if rest else value
+    return msgspec.structs.replace(tree, **{key: inner})
+
+
+def with_value(tree: AircraftSettings, path: str, field: Field, value: float) -> AircraftSettings:
+    whole = (value, -value, value) if isinstance(field.default, tuple) else value
+    return replaced(tree, path, msgspec.convert(whole, field.type))
+
+
+def with_estimator(name: str) -> AircraftSettings:
+    return replaced(AircraftSettings(), "estimation.estimator", name)
+
+
+def readings(begin_us: int, count: int = 60) -> Iterator[RawRecord]:
+    """Some time at rest, then turns and bumps, with a pause and fixes of the GPS."""
+    for n in range(count):
+        moving = 3 * n > count
+        time_us = begin_us + 33_333 * n + 700_000 * (4 * n > 3 * count)
+        yield ImuRaw(
+            time_us=time_us,
+            node=IMU,
+            node_time_us=time_us,
+            accel_raw=(700 * moving * (n % 3), -300 * moving, 4096 + 90 * (n % 5)),
+            gyro_raw=(3000 * moving, -2000 * moving * (n % 2), 90 * moving),
+            mag_raw=(218 + 20 * (n % 3), -4096 if n % 30 == 7 else 15, -436),
+            temperature_raw=0,
+            accel_range_g=8,
+            gyro_range_dps=1000,
+            mag_lsb_per_gauss=1090,
+            flags=ImuFlags.MAG_NEW if n % 2 else ImuFlags(0),
+        )
+        if n % 4 == 0:
+            yield BaroRaw(time_us, IMU, time_us, 100_000.0 - 30.0 * n, 20.0)
+        if n % 7 == 5:
+            yield fix(time_us, n)
+
+
+def fix(time_us: int, n: int) -> GpsFix:
+    return GpsFix(
+        time_us=time_us,
+        node=GPS,
+        node_time_us=time_us,
+        itow_ms=time_us // 1000,
+        fix_type=GpsFixType.FIX_3D,
+        fix_ok=True,
+        satellites=12,
+        lat_dege7=470_000_000 + 900 * n,
+        lon_dege7=80_000_000,
+        alt_amsl_m=500.0 + n,
+        vel_n_mps=(0.3 * n, 1.0, -0.5),
+        alt_ellipsoid_m=547.0 + n,
+        h_acc_m=0.9,
+        v_acc_m=1.5,
+        speed_acc_mps=0.2,
+        course_acc_deg=1.0,
+        pdop=1.5,
+        utc_us=1_780_000_000_000_000 + time_us,
+    )
+
+
+def fly(aircraft: Aircraft, begin_us: int = 1_000_000, count: int = 60) -> list[Any]:
+    """Take in readings; give the ATTITUDEs that come of them."""
+    actions: list[Action] = []
+    for record in readings(begin_us, count):
+        actions += aircraft.take(record, record.time_us)
+        actions += aircraft.perform(aircraft.vehicle.poll(record.time_us), record.time_us)
+    frames = (action.frame for action in actions if isinstance(action, Outgoing))
+    parser = mavlink.MAVLink(None)
+    return [parser.decode(bytearray(frame)) for frame in frames if frame[7:10] == b"\x1e\0\0"]
+
+
+def all_known(found: list[Any]) -> bool:
+    return bool(found) and all(math.isfinite(m.roll + m.pitch) for m in found)
+
+
+def test_every_number_has_two_ends() -> None:
+    everything = [*numbers(GatewaySettings), *numbers(AircraftSettings)]
+    assert [path for path, field in everything if None in field.bounds] == []
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_setting_takes_what_is_no_number(value: float) -> None:
+    for path, field in [*numbers(GatewaySettings), *numbers(AircraftSettings)]:
+        plain = msgspec.to_builtins(field.default)
+        if isinstance(plain, list | tuple):
+            plain = [value if isinstance(item, float) else [value] * 3 for item in plain]
+        wrong = value if not isinstance(plain, list) else plain
+        try:
+            msgspec.convert(wrong, field.type)
+        except msgspec.ValidationError:
+            continue
+        pytest.fail(f"{path} takes {value}")
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> None:
+    plain = with_estimator(name)
+    for path, field in FUSION:
+        if not concerns(path, name):
+            continue
+        aircraft = Aircraft(1, plain)
+        fly(aircraft)
+        for n, value in enumerate(ends(field), 1):
+            section = path.partition(".")[0]
+            wanted = getattr(with_value(plain, path, field, value), section)
+            aircraft.perform([SettingsChange(1, section, wanted, path)], 0)
+            assert all_known(fly(aircraft, 1_000_000 + 5_000_000 * n, 14)), (path, value)
+
+
+# Without shrinking, which takes minutes; the failing draws are told all the same.
+@settings(deadline=None, derandomize=True, max_examples=40, phases=[Phase.generate])
+@given(st.data())
+def test_any_ends_together_give_attitudes(data: st.DataObject) -> None:
+    wanted = with_estimator(data.draw(st.sampled_from(ESTIMATORS)))
+    for path, field in FUSION:
+        if data.draw(st.booleans()):
+            wanted = with_value(wanted, path, field, data.draw(st.sampled_from(ends(field))))
+    assert fly(Aircraft(1, wanted))
+
+
+@pytest.mark.parametrize("before", ESTIMATORS)
+@pytest.mark.parametrize("after", ESTIMATORS)
+def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after: str) -> None:
+    aircraft = Aircraft(1, with_estimator(before))
+    fly(aircraft)
+    wanted = with_estimator(after).estimation
+    aircraft.perform([SettingsChange(1, "estimation", wanted, "estimator")], 0)
+    assert aircraft.settings.estimation == wanted
+    assert all_known(fly(aircraft, 6_000_000)[5:])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
+    aircraft = Aircraft(1, with_estimator(name))
+    before = fly(aircraft)[-1]
+    wanted = replaced(with_estimator(name), "estimation.rest.bias_limit_degps", 3.0).estimation
+    aircraft.perform([SettingsChange(1, "estimation", wanted, "")], 0)
+    after = fly(aircraft, 3_700_000, 2)[0]
+    assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
+
+
+def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    aircraft = Aircraft(1, AircraftSettings())
+
+    def fail(_settings: object) -> None:
+        raise ArithmeticError
+
+    monkeypatch.setattr("gateway.aircraft.make_estimator", fail)
+    before = aircraft.settings
+    with pytest.raises(ArithmeticError):
+        aircraft.change(with_estimator("eskf"))
+    assert aircraft.settings == before
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("mounting", ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), "must be a rotation"),
+        ("mag_mounting", ((0.0,) * 3,) * 3, "must be a rotation"),
+        ("accel_matrix", ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "an inverse"),
+        ("mag_soft_iron", ((1.0, 0.0, 0.0),) * 3, "an inverse"),
+        ("accel_bias_mps2", (0.0, 51.0, 0.0), "<= 50"),
+        ("gyro_bias_radps", (0.0, 0.0, -1e300), ">= -10"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_refused(key: str, value: Any, words: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=words):
+        msgspec.convert({key: value}, NodeCalibration)
+
+
+def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
+    aircraft = Aircraft(1, AircraftSettings())
+    fly(aircraft)
+    measured = CalibrationMeasured(1, CalibrationKind.MAG, (5000.0, 0.0, 0.0))
+    told = aircraft.perform([measured], 0)
+    assert b"Calibration refused" in told[0].frame
+    assert all(isinstance(action, Outgoing) for action in told)
+    assert aircraft.settings.calibration == NodeCalibration()
