@@ -3,6 +3,9 @@
 The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
 SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
 definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
+
+GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. From one height to the
+next it cannot be told, for the height of a receiver that finds or loses its fix jumps by any amount.
 """
 
 import math
@@ -32,6 +35,8 @@ MAG_FIELDS: Final = 0b111 << 6
 """HIGHRES_IMU's bits of what is new."""
 UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
 """Later times are civil time, earlier ones count from the start of the autopilot."""
+VELOCITY_AGE_US: Final = US_PER_S // 2
+"""A velocity down that is older is another one by now."""
 
 Imported = ImuCalibrated | BaroRaw | GpsFix
 
@@ -61,12 +66,14 @@ class AutopilotReader:
         self._zero_us: int | None = None
         self._rank = 0
         self._newest_us = 0
-        self._last_height = (-US_PER_S * 10, NAN)
+        self._down_mps = NAN
+        self._down_us = 0
         self._handlers: dict[int, Callable[[Any, int], list[Imported]]] = {
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._milli_imu,
             mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._milli_imu,
             mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._pressure,
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._position,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps,
         }
 
@@ -159,11 +166,13 @@ class AutopilotReader:
         time_us, node = self._time(m, recorded_us), NodeId(self.system_id or 1, 0)
         return [BaroRaw(time_us, node, time_us, m.press_abs * PA_PER_HPA, m.temperature * CENTI)]
 
+    def _position(self, m: Any, recorded_us: int) -> list[Imported]:
+        self._down_mps, self._down_us = m.vz * CENTI, recorded_us
+        return []
+
     def _gps(self, m: Any, recorded_us: int) -> list[Imported]:
         time_us = self._time(m, recorded_us)
         fix_type = _FIX_TYPES.get(min(m.fix_type, 3), GpsFixType.NONE)
-        alt_m, speed = m.alt * MILLI, _known(m.vel, CENTI)
-        course_rad = math.radians(_known(m.cog, CENTI))
         return [
             GpsFix(
                 time_us=time_us,
@@ -175,12 +184,8 @@ class AutopilotReader:
                 satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
                 lat_dege7=m.lat,
                 lon_dege7=m.lon,
-                alt_amsl_m=alt_m,
-                vel_n_mps=(
-                    speed * math.cos(course_rad),
-                    speed * math.sin(course_rad),
-                    self._sink_rate(time_us, alt_m),
-                ),
+                alt_amsl_m=m.alt * MILLI,
+                vel_n_mps=self._velocity(m, fix_type, recorded_us),
                 alt_ellipsoid_m=m.alt_ellipsoid * MILLI if m.alt_ellipsoid else NAN,
                 h_acc_m=m.h_acc * MILLI or NAN,
                 v_acc_m=m.v_acc * MILLI or NAN,
@@ -191,11 +196,14 @@ class AutopilotReader:
             )
         ]
 
-    def _sink_rate(self, time_us: int, alt_m: float) -> float:
-        """Tell the velocity down, which the message has not, from two fixes' heights."""
-        last, self._last_height = self._last_height, (time_us, alt_m)
-        dt_us = time_us - last[0]
-        return (last[1] - alt_m) * US_PER_S / dt_us if 0 < dt_us <= 2 * US_PER_S else NAN
+    def _velocity(self, m: Any, fix_type: GpsFixType, recorded_us: int) -> Vec3:
+        """Join speed and course of a fix with the velocity down of just before."""
+        if fix_type is GpsFixType.NONE:
+            return (NAN, NAN, NAN)
+        speed, course_rad = _known(m.vel, CENTI), math.radians(_known(m.cog, CENTI))
+        fresh = abs(recorded_us - self._down_us) <= VELOCITY_AGE_US
+        down = self._down_mps if fresh and fix_type is GpsFixType.FIX_3D else NAN
+        return (speed * math.cos(course_rad), speed * math.sin(course_rad), down)
 
 
 def _known(value: int, scale: float) -> float:

@@ -30,6 +30,12 @@ def gps(time_us: int, alt_mm: int = 430_000, fix: int = 3) -> Message:
     )
 
 
+def position(time_ms: int, vz_cmps: int) -> Message:
+    return mavlink.MAVLink_global_position_int_message(
+        time_ms, 471_000_000, 85_000_000, 430_000, 0, 0, 1500, vz_cmps, 9000
+    )
+
+
 def read(
     messages: list[tuple[int, Message]], system_id: int = 1, component_id: int = 1
 ) -> list[Imported]:
@@ -82,8 +88,11 @@ def test_pressure_in_pascal() -> None:
     assert (baro.time_us, baro.pressure_pa, baro.temperature_degc) == (5_000, 95_025.0, 21.5)
 
 
-def test_a_fix_has_the_velocity_of_its_course_and_its_heights() -> None:
-    first, second = read([(0, raw(0)), (0, gps(1_000)), (200_000, gps(201_000, 431_000))])[1:]
+def test_a_fix_has_the_velocity_of_its_course_and_the_climb_of_the_position() -> None:
+    climb = (100_000, position(100, vz_cmps=-500))
+    first, second = read([(0, raw(0)), (0, gps(1_000)), climb, (200_000, gps(201_000, 431_000))])[
+        1:
+    ]
     assert isinstance(first, GpsFix)
     assert isinstance(second, GpsFix)
     assert (first.lat_dege7, first.lon_dege7) == (471_000_000, 85_000_000)
@@ -124,8 +133,31 @@ def test_damage_is_counted() -> None:
     assert reader.undecoded == 1
 
 
-@pytest.mark.parametrize(("dt_us", "is_told"), [(2_000_000, True), (2_000_001, False)])
-def test_climb_is_told_of_heights_close_in_time(dt_us: int, is_told: bool) -> None:
-    later = (dt_us, gps(1_000 + dt_us, 431_000))
-    fixes = [r for r in read([(0, raw(0)), (0, gps(1_000)), later]) if isinstance(r, GpsFix)]
-    assert math.isfinite(fixes[1].vel_n_mps[2]) == is_told
+def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
+    return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
+
+
+@pytest.mark.parametrize(("age_us", "is_told"), [(500_000, True), (500_001, False)])
+def test_a_climb_of_long_ago_is_unknown(age_us: int, is_told: bool) -> None:
+    (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
+    assert math.isfinite(fix.vel_n_mps[2]) == is_told
+
+
+def test_a_lost_fix_makes_no_climb() -> None:
+    """Without a fix the height may be zero: found again, 484 m would be a climb of 968 m/s."""
+    heights = [(484_000, 3), (0, 1), (484_000, 3), (484_500, 3)]
+    flight: list[tuple[int, Message]] = []
+    for n, (alt_mm, fix) in enumerate(heights):
+        flight += [(n * 500_000, gps(n * 500_000 + 1, alt_mm, fix))]
+    assert [math.isfinite(fix.vel_n_mps[2]) for fix in fixes_of(flight)] == [False] * 4
+    lost = fixes_of(flight)[1]
+    assert not any(map(math.isfinite, lost.vel_n_mps))
+    told = [(at_us, position(at_us // 1000, 20)) for at_us, _ in flight]
+    both = [message for pair in zip(told, flight, strict=True) for message in pair]
+    downs = [fix.vel_n_mps[2] for fix in fixes_of(both)]
+    assert downs == pytest.approx([0.2, math.nan, 0.2, 0.2], nan_ok=True)
+
+
+def test_a_flat_fix_has_no_climb() -> None:
+    (fix,) = fixes_of([(0, position(0, -150)), (0, gps(1, fix=2))])
+    assert math.isnan(fix.vel_n_mps[2])
