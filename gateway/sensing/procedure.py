@@ -5,6 +5,7 @@ calibration with its own part replaced. A log runs through the same steps.
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -15,21 +16,31 @@ from gateway.records import Vec3
 from gateway.sensing.calibration import Correction, NodeCalibration
 from gateway.sensing.recalibration import remove_tilt
 from gateway.sensing.solvers import (
+    CalibrationError,
     NodeSamples,
     distinct_poses,
     solve_accelerometer,
     solve_magnetometer,
     solve_mounting,
     solve_rest,
-    still_windows,
 )
+from gateway.sensing.stillness import NOT_STILL, gyro_at_rest, still_windows
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 FloatArray = NDArray[np.float64]
+
+SIDES: Final = (
+    *("x arrow up", "x arrow down", "y arrow up", "y arrow down"),
+    *("chips up", "chips down"),
+)
+"""How the board lies when +x, -x, +y, -y, +z, -z reads gravity."""
+SIDE_SHARE: Final = 0.8
+"""Share of gravity that one axis must carry: 37 deg of tilt."""
 
 
 def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
     """Take the mean rate at rest as the gyroscope's bias."""
-    fit = solve_rest(_still(samples, samples.gyro))
+    fit = solve_rest(gyro_at_rest(samples))
     return msgspec.structs.replace(
         calibration, gyro_bias_radps=fit.mean, gyro_residual_radps=fit.residual
     )
@@ -39,7 +50,7 @@ def calibrate_accelerometer(
     samples: Sequence[NodeSamples], calibration: NodeCalibration
 ) -> NodeCalibration:
     """Fit the accelerometer to the poses that the samples hold, each part one or more of them."""
-    poses = [distinct_poses(s.accel, _windows(s)) for s in samples]
+    poses = [distinct_poses(s.accel, still_windows(s)) for s in samples]
     fit = solve_accelerometer(_distinct(np.vstack([np.empty((0, 3)), *poses])))
     return msgspec.structs.replace(
         calibration,
@@ -81,24 +92,20 @@ def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeC
     return remove_tilt(calibration, (float(roll), float(pitch), 0.0))
 
 
-def seen_poses(samples: Sequence[NodeSamples]) -> int:
-    """Count the poses that were held so far, to tell the person what is still to do."""
-    means = [distinct_poses(s.accel, _windows(s)) for s in samples]
-    return len(_distinct(np.vstack([np.empty((0, 3)), *means])))
+def missing_sides(samples: Sequence[NodeSamples]) -> list[str]:
+    """Name the sides that the node was not laid on yet, to tell the person what is still to do."""
+    means = [distinct_poses(s.accel, still_windows(s)) for s in samples]
+    seen = set()
+    for mean in np.vstack([np.empty((0, 3)), *means]):
+        axis = int(np.abs(mean).argmax())
+        if abs(mean[axis]) > SIDE_SHARE * STANDARD_GRAVITY_MPS2:
+            seen.add(2 * axis + int(mean[axis] < 0.0))
+    return [name for number, name in enumerate(SIDES) if number not in seen]
 
 
 def is_still(samples: NodeSamples) -> bool:
     """Tell whether the node lay still for at least a moment."""
-    return bool(_windows(samples))
-
-
-def _windows(samples: NodeSamples) -> list[slice]:
-    return still_windows(samples.time_s, samples.accel, samples.gyro)
-
-
-def _still(samples: NodeSamples, values: FloatArray) -> FloatArray:
-    parts = [values[window] for window in _windows(samples)]
-    return np.vstack([np.empty((0, 3)), *parts])
+    return bool(still_windows(samples))
 
 
 def _distinct(poses: FloatArray) -> FloatArray:
@@ -107,7 +114,10 @@ def _distinct(poses: FloatArray) -> FloatArray:
 
 def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:
     """Mean specific force at rest, bias and scale taken out, in sensor axes."""
-    mean = solve_rest(_still(samples, samples.accel)).mean
+    parts = [samples.accel[window] for window in still_windows(samples)]
+    if not parts:
+        raise CalibrationError(NOT_STILL)
+    mean = solve_rest(np.vstack(parts)).mean
     identity: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return Correction(identity, calibration.accel_matrix, calibration.accel_bias_mps2).apply(mean)
 

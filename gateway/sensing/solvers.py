@@ -31,10 +31,6 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 
 FloatArray = NDArray[np.float64]
 
-STILL_S: Final = 1.0
-STILL_GYRO_RADPS: Final = 0.05
-STILL_ACCEL_MPS2: Final = 0.5
-"""Greatest standard deviation of an axis within a still window."""
 SAME_POSE_DEG: Final = 20.0
 MIN_POSES: Final = 6
 POSES_FOR_SKEW: Final = 9
@@ -43,6 +39,19 @@ MIN_TILT_DEG: Final = 15.0
 MIN_SPREAD: Final = 1.0
 """Least way along every axis, in radii, over which a magnetometer must have been turned."""
 MIN_MAG_SAMPLES: Final = 100
+
+# What is beyond these no sensor of the kind has when it is whole: the poses were wrong.
+MAX_ACCEL_BIAS_MPS2: Final = 2.0
+"""Twice what the MPU6050's data sheet allows, for what soldering adds."""
+MAX_ACCEL_SCALE_OFF: Final = 0.15
+MAX_ACCEL_RESIDUAL_MPS2: Final = 0.5
+FIELD_UT: Final = (15.0, 100.0)
+"""Strength of the field: the Earth's is 22 to 67 uT, the sensor's scale may be off by a third."""
+MAX_HARD_IRON_UT: Final = 200.0
+MAX_SOFT_IRON: Final = 2.0
+"""Longest axis of the ellipsoid over the shortest."""
+MAX_MAG_RESIDUAL: Final = 0.1
+"""Share of the field's strength."""
 
 
 class CalibrationError(ValueError):
@@ -80,62 +89,43 @@ class NodeSamples:
     """Shape (n, 3), m/s2."""
     gyro: FloatArray
     """Shape (n, 3), rad/s."""
+    mag_time_s: FloatArray
+    """Shape (m,), only what was sampled anew."""
     mag: FloatArray
-    """Shape (m, 3), uT, only what was sampled anew."""
+    """Shape (m, 3), uT."""
+    moving: NDArray[np.bool_]
+    """Shape (n,), where GPS tells that the node moves."""
 
 
-def node_samples(records: Sequence[ImuRaw]) -> NodeSamples:
+def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None) -> NodeSamples:
     """Scale raw records without correcting them.
 
     Parameters
     ----------
     records : sequence of ImuRaw
         Of one node, in their order.
+    moving : sequence of bool, optional
+        Of each record, whether GPS tells that the node moves; by default nothing is known of it.
 
     Returns
     -------
     NodeSamples
     """
     fields = [
-        mag_from_counts(r.mag_raw, r.mag_lsb_per_gauss)
+        (r.time_us * 1e-6, field)
         for r in records
-        if ImuFlags.MAG_NEW in r.flags and ImuFlags.MAG_ABSENT not in r.flags
+        if ImuFlags.MAG_NEW in r.flags
+        and ImuFlags.MAG_ABSENT not in r.flags
+        and (field := mag_from_counts(r.mag_raw, r.mag_lsb_per_gauss)) is not None
     ]
     return NodeSamples(
         time_s=np.array([r.time_us * 1e-6 for r in records]),
         accel=_rows([accel_from_counts(r.accel_raw, r.accel_range_g) for r in records]),
         gyro=_rows([gyro_from_counts(r.gyro_raw, r.gyro_range_dps) for r in records]),
-        mag=_rows([field for field in fields if field is not None]),
+        mag_time_s=np.array([time_s for time_s, _ in fields]),
+        mag=_rows([field for _, field in fields]),
+        moving=np.zeros(len(records), np.bool_) if moving is None else np.array(moving, np.bool_),
     )
-
-
-def still_windows(time_s: FloatArray, accel: FloatArray, gyro: FloatArray) -> list[slice]:
-    """Find the spans of a log in which the node lay still.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Growing.
-    accel, gyro : ndarray, shape (n, 3)
-        m/s2 and rad/s, any axes.
-
-    Returns
-    -------
-    list of slice
-        Windows of `STILL_S`, in order, not overlapping.
-    """
-    if len(time_s) == 0:
-        return []
-    edges = np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], STILL_S))
-    found = []
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        window = slice(begin, end)
-        if end - begin < 5:
-            continue
-        quiet = gyro[window].std(axis=0).max() < STILL_GYRO_RADPS
-        if quiet and accel[window].std(axis=0).max() < STILL_ACCEL_MPS2:
-            found.append(window)
-    return found
 
 
 def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
@@ -168,6 +158,8 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
 def solve_rest(samples: FloatArray) -> RestFit:
     """Average samples at rest: the bias of a gyroscope, the direction of gravity.
 
+    Whether they are at rest is told by `stillness`.
+
     Parameters
     ----------
     samples : ndarray, shape (n, 3)
@@ -176,13 +168,7 @@ def solve_rest(samples: FloatArray) -> RestFit:
     -------
     RestFit
 
-    Raises
-    ------
-    CalibrationError
-        If there are none.
     """
-    if len(samples) == 0:
-        raise CalibrationError("the node did not lie still: lay it down and do not touch it")
     return RestFit(_vec3(samples.mean(axis=0)), float(samples.std(axis=0).max()))
 
 
@@ -203,12 +189,18 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
     Raises
     ------
     CalibrationError
-        If poses are missing.
+        If poses are missing, or if what they tell can be no sensor's error.
     """
     if len(poses) < MIN_POSES:
         raise CalibrationError(f"{len(poses)} poses where {MIN_POSES} are needed, one on each side")
     _check_spread(poses, STANDARD_GRAVITY_MPS2, "lay the node on every one of its six sides")
-    return _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=len(poses) >= POSES_FOR_SKEW)
+    fit = _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=len(poses) >= POSES_FOR_SKEW)
+    scale_off = float(np.abs(np.linalg.eigvalsh(np.array(fit.matrix)) - 1.0).max())
+    advice = "hold every side still; a sensor that always does this is broken"
+    _check_bound("bias", _length(fit.bias), MAX_ACCEL_BIAS_MPS2, " m/s2", advice)
+    _check_bound("scale error", scale_off, MAX_ACCEL_SCALE_OFF, "", advice)
+    _check_bound("residual", fit.residual, MAX_ACCEL_RESIDUAL_MPS2, " m/s2", advice)
+    return fit
 
 
 def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> SphereFit:
@@ -229,14 +221,22 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
     Raises
     ------
     CalibrationError
-        If it was not turned enough.
+        If it was not turned enough, or if what was measured can be no field on this Earth.
     """
     if len(field) < MIN_MAG_SAMPLES:
         raise CalibrationError(f"{len(field)} samples where {MIN_MAG_SAMPLES} are needed")
     centre = _sphere_centre(field)
     radius = float(np.linalg.norm(field - centre, axis=1).mean())
     _check_spread(field, radius, "turn the aircraft about all its axes, upside down too")
-    return _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
+    advice = "keep away from iron and currents, and turn it further"
+    if not FIELD_UT[0] <= radius <= FIELD_UT[1]:
+        raise CalibrationError(f"a field of {radius:.0f} uT is not the Earth's: {advice}")
+    fit = _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
+    axes = np.abs(np.linalg.eigvalsh(np.array(fit.matrix)))
+    _check_bound("hard iron", _length(fit.bias), MAX_HARD_IRON_UT, " uT", advice)
+    _check_bound("soft iron", float(axes.max() / axes.min()), MAX_SOFT_IRON, "", advice)
+    _check_bound("residual", fit.residual, MAX_MAG_RESIDUAL * radius, " uT", advice)
+    return fit
 
 
 def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
@@ -314,6 +314,15 @@ def _sphere_centre(points: FloatArray) -> FloatArray:
 def _check_spread(points: FloatArray, radius: float, advice: str) -> None:
     if np.ptp(points, axis=0).min() < MIN_SPREAD * radius:
         raise CalibrationError(f"not all directions were seen: {advice}")
+
+
+def _check_bound(what: str, found: float, bound: float, unit: str, advice: str) -> None:
+    if not found <= bound:
+        raise CalibrationError(f"{what} {found:.2f}{unit}, where {bound:.2f} is the most: {advice}")
+
+
+def _length(v: Vec3) -> float:
+    return float(np.linalg.norm(v))
 
 
 def _rows(vectors: list[Vec3]) -> FloatArray:

@@ -136,7 +136,7 @@ class Vehicle:
         self._ftp = FtpService(
             {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
         )
-        self._calibrator = Calibrator(self.vehicle_id)
+        self._calibrator = Calibrator(self.vehicle_id, lambda: self.in_flight)
         self._recording = RecordingService(self._explain)
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(

@@ -4,6 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from gateway.records import ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import Correction, NodeCalibration
+from gateway.sensing.procedure import SIDES as SIDE_NAMES
 from gateway.sensing.procedure import (
     calibrate_accelerometer,
     calibrate_gyro,
@@ -11,7 +12,7 @@ from gateway.sensing.procedure import (
     calibrate_magnetometer,
     calibrate_mounting,
     is_still,
-    seen_poses,
+    missing_sides,
 )
 from gateway.sensing.solvers import CalibrationError, NodeSamples, node_samples
 
@@ -21,15 +22,17 @@ BIAS = np.array([0.2, -0.1, 0.3])
 
 
 def pose(force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0.02) -> NodeSamples:
-    """Three seconds in one pose, as a node would read them."""
+    """Five seconds in one pose, as a node would read them."""
     rng = np.random.default_rng(seed)
-    time_s = np.arange(0, 3, 0.01)
+    time_s = np.arange(0, 5, 0.01)
     n = len(time_s)
     return NodeSamples(
         time_s=time_s,
         accel=force + BIAS + rng.normal(0, shaking, (n, 3)),
         gyro=rate + rng.normal(0, 0.1 * shaking, (n, 3)),
+        mag_time_s=np.empty(0),
         mag=np.empty((0, 3)),
+        moving=np.zeros(n, np.bool_),
     )
 
 
@@ -46,8 +49,10 @@ def test_gyro_that_is_moved_is_refused() -> None:
 
 def test_six_poses_one_by_one() -> None:
     held = [pose(side, k) for k, side in enumerate(SIDES)]
-    assert [seen_poses(held[:k]) for k in (0, 1, 1 + 5)] == [0, 1, 6]
-    assert seen_poses([held[0], held[0]]) == 1
+    assert missing_sides([]) == list(SIDE_NAMES)
+    assert missing_sides([held[0], held[0]]) == list(SIDE_NAMES[1:])
+    assert missing_sides(held[1:]) == ["x arrow up"]
+    assert missing_sides(held) == []
     after = calibrate_accelerometer(held, NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
     assert after.accel_residual_mps2 < 0.01
@@ -56,19 +61,26 @@ def test_six_poses_one_by_one() -> None:
 def test_six_poses_in_one_log() -> None:
     parts = [pose(side, k) for k, side in enumerate(SIDES)]
     whole = NodeSamples(
-        time_s=np.arange(len(parts) * 300) * 0.01,
+        time_s=np.arange(len(parts) * 500) * 0.01,
         accel=np.vstack([p.accel for p in parts]),
         gyro=np.vstack([p.gyro for p in parts]),
+        mag_time_s=np.empty(0),
         mag=np.empty((0, 3)),
+        moving=np.zeros(len(parts) * 500, np.bool_),
     )
     after = calibrate_accelerometer([whole], NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
 
 
+def test_a_tilted_pose_is_no_side() -> None:
+    half = np.sin(np.pi / 4)
+    assert len(missing_sides([pose(G * np.array([half, half, 0.0]))])) == 6
+
+
 def test_a_pose_that_moved_does_not_count() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
     assert not is_still(shaken)
-    assert seen_poses([shaken, pose(SIDES[1])]) == 1
+    assert missing_sides([shaken, pose(SIDES[1])]) == [SIDE_NAMES[0], *SIDE_NAMES[2:]]
     with pytest.raises(CalibrationError, match="1 poses"):
         calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
 
@@ -115,6 +127,8 @@ def test_magnetometer_from_raw_records() -> None:
     ]
     samples = node_samples(raws)
     assert samples.mag.shape == (200, 3)
+    np.testing.assert_allclose(samples.mag_time_s[:3], [0.0, 0.02, 0.04])
+    assert not samples.moving.any()
     assert samples.accel[0] == pytest.approx((0, 0, G))
     after = calibrate_magnetometer(samples, NodeCalibration())
     assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)

@@ -5,13 +5,11 @@ from scipy.spatial.transform import Rotation
 from gateway.sensing.calibration import FACE_UP
 from gateway.sensing.solvers import (
     CalibrationError,
-    distinct_poses,
     level_residual_deg,
     solve_accelerometer,
     solve_magnetometer,
     solve_mounting,
     solve_rest,
-    still_windows,
 )
 
 G = 9.80665
@@ -102,23 +100,38 @@ def test_nose_that_was_not_raised_is_refused() -> None:
         solve_mounting((0, 0, G), (0.1, 0, G))
 
 
-def test_still_windows_and_poses_of_a_log() -> None:
-    rng = np.random.default_rng(3)
-    time_s = np.arange(0, 40, 0.01)
-    side = SIDES[(time_s // 6).astype(int) % 6]
-    turning = (time_s % 6) > 4
-    accel = side + rng.normal(0, np.where(turning, 3.0, 0.02)[:, None], (len(time_s), 3))
-    gyro = rng.normal(0, np.where(turning, 1.0, 0.002)[:, None], (len(time_s), 3))
-    windows = still_windows(time_s, accel, gyro)
-    assert 20 <= len(windows) <= 28
-    poses = distinct_poses(accel, windows)
-    assert len(poses) == 6
-    np.testing.assert_allclose(np.sort(poses[:, 0]), np.sort(SIDES[:, 0]), atol=0.05)
-
-
 def test_rest() -> None:
     fit = solve_rest(np.random.default_rng(2).normal((0.01, -0.02, 0.03), 0.001, (500, 3)))
     assert fit.mean == pytest.approx((0.01, -0.02, 0.03), abs=2e-4)
     assert fit.residual == pytest.approx(0.001, rel=0.2)
-    with pytest.raises(CalibrationError, match="still"):
-        solve_rest(np.empty((0, 3)))
+
+
+@pytest.mark.parametrize(
+    ("poses", "told"),
+    [
+        (SIDES + np.array([0.0, 2.1, 0.0]), "bias 2.10 m/s2"),
+        (1.2 * SIDES, "scale error"),
+        (SIDES * [[0.93], [1.0], [1.0], [1.0], [1.0], [1.0]] - [[0], [3], [0], [0], [0], [0]], ""),
+    ],
+)
+def test_an_accelerometer_that_no_sensor_can_be_is_refused(poses: np.ndarray, told: str) -> None:
+    with pytest.raises(CalibrationError, match=f"{told}.*still"):
+        solve_accelerometer(poses)
+
+
+@pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        (sphere(np.random.default_rng(1), 300, 45.0) + np.array([0, 0, 201]), "hard iron 201"),
+        (sphere(np.random.default_rng(1), 300, 45.0) * [1.0, 2.1, 1.0], "soft iron"),
+        (sphere(np.random.default_rng(1), 300, 120.0), "a field of 120 uT"),
+        (
+            sphere(np.random.default_rng(1), 300, 45.0)
+            * (1.0 + 0.2 * np.random.default_rng(2).normal(size=(300, 1))),
+            "residual",
+        ),
+    ],
+)
+def test_a_field_that_is_not_the_earths_is_refused(field: np.ndarray, told: str) -> None:
+    with pytest.raises(CalibrationError, match=f"{told}.*iron"):
+        solve_magnetometer(field)

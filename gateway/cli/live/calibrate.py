@@ -1,6 +1,7 @@
 """`mavgate calibrate`: guide a person through a node's calibration, live or from a recording."""
 
 import asyncio
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,6 +11,7 @@ from typing import Annotated, Final
 import msgspec
 import typer
 from rich import box
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from gateway.cli.live.run import ConfigOption, read_aircraft, read_settings
@@ -21,18 +23,19 @@ from gateway.edges.clock import GatewayClock
 from gateway.edges.receiver.serial_port import SerialPort, SerialSettings
 from gateway.flights.reading import ReadOptions, open_rows
 from gateway.pipeline import PipelineSettings
-from gateway.records import ImuRaw
+from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.procedure import (
+    SIDES,
     calibrate_accelerometer,
     calibrate_gyro,
     calibrate_level,
     calibrate_magnetometer,
     calibrate_mounting,
     is_still,
-    seen_poses,
+    missing_sides,
 )
-from gateway.sensing.solvers import MIN_POSES, CalibrationError, NodeSamples, node_samples
+from gateway.sensing.solvers import CalibrationError, NodeSamples, node_samples
 from gateway.units import US_PER_S
 from gateway.wire.link import Link
 
@@ -42,6 +45,10 @@ POSE_S: Final = 3.0
 REST_S: Final = 5.0
 MAG_S: Final = 45.0
 MAX_TRIES: Final = 24
+MOVING_MPS: Final = 1.0
+"""GPS speed of what is not at rest; a receiver that lies still tells up to 0.3 m/s."""
+MOVING_US: Final = 3 * US_PER_S
+"""For so long after its last word GPS is believed that it moves."""
 
 console = console_of()
 
@@ -58,6 +65,8 @@ class Step(StrEnum):
 
 Capture = Callable[[float], NodeSamples]
 """Waits for so many seconds of samples."""
+Solve = Callable[[Step, NodeCalibration], NodeCalibration]
+Save = Callable[[NodeCalibration], None]
 
 
 def register(app: typer.Typer) -> None:
@@ -87,40 +96,53 @@ def calibrate(
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
-    The gateway must not run meanwhile: the receiver's port is read by one program at a time.
+    Each step is saved when it is done. The gateway must not run meanwhile: the receiver's port is
+    read by one program at a time.
     """
     settings = read_settings(config)
     aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
     chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
     old = aircraft.calibration
+
+    def save(calibration: NodeCalibration) -> None:
+        if dry_run:
+            return
+        changed = msgspec.structs.replace(aircraft, calibration=calibration)
+        with refusing():
+            console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
+
     if log is not None:
         samples = _read_log(log, settings, vehicle)
-        new = _each(chosen, lambda step, known: _log_step(step, samples, known, field_ut), old)
+        solve: Solve = lambda step, known: _log_step(step, samples, known, field_ut)  # noqa: E731
     else:
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
         capture = _capture_from(serial, vehicle)
-        new = _each(chosen, lambda step, known: _live_step(step, capture, known, field_ut), old)
-    _show(old, new)
-    if new == old or dry_run:
-        return
-    changed = msgspec.structs.replace(aircraft, calibration=new)
-    with refusing():
-        console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
+        solve = lambda step, known: _live_step(step, capture, known, field_ut)  # noqa: E731
+    _show(old, _each(chosen, solve, old, save))
 
 
 def _each(
-    steps: list[Step],
-    solve: Callable[[Step, NodeCalibration], NodeCalibration],
-    calibration: NodeCalibration,
+    steps: list[Step], solve: Solve, calibration: NodeCalibration, save: Save
 ) -> NodeCalibration:
-    """Go through the steps; one that fails is said and the others go on."""
-    for step in steps:
+    """Go through the steps, each saved when it is done: whoever breaks off keeps the others.
+
+    One that fails is said, and the next begun.
+    """
+    for number, step in enumerate(steps):
+        if len(steps) > 1:
+            console.print(f"\nStep {number + 1} of {len(steps)}: {step}")
         try:
             calibration = solve(step, calibration)
-            console.print(f"[green]{step}: done[/]")
         except CalibrationError as error:
             console.print(f"[red]{step}: {error}[/]")
+        except (KeyboardInterrupt, typer.Abort):
+            left = ", ".join(steps[number:])
+            console.print(f"\n[yellow]Broken off. Not done: {left}.[/]")
+            break
+        else:
+            console.print(f"[green]{step}: done[/]")
+            save(calibration)
     return calibration
 
 
@@ -150,16 +172,22 @@ def _live_step(
 
 
 def _six_sides(capture: Capture) -> list[NodeSamples]:
-    """Collect poses until all six sides were held; more of them make a better fit."""
+    """Collect poses until the node was laid on all its sides."""
     held: list[NodeSamples] = []
     for _ in range(MAX_TRIES):
-        count = seen_poses(held)
-        if count >= MIN_POSES:
+        missing = missing_sides(held)
+        if not missing:
             break
-        _ask(f"Side {count + 1} of {MIN_POSES}: lay the node on another of its sides.")
+        done = len(SIDES) - len(missing)
+        _ask(
+            f"{done} of {len(SIDES)} sides are done. Lay the node on one of these and let it "
+            f"go: {', '.join(missing)}."
+        )
         samples = capture(POSE_S)
         if not is_still(samples):
             console.print("It moved; once more.")
+        elif missing_sides([*held, samples]) == missing:
+            console.print("That side was done before, or it is too far from upright; once more.")
         held.append(samples)
     return held
 
@@ -179,16 +207,31 @@ def _log_step(
 
 
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
+    raws, moving, fix = list[ImuRaw](), list[bool](), _Fix()
     with refusing():
         table = open_rows(path, ReadOptions(current=PipelineSettings(settings.default_aircraft)))
-        raws = [
-            row.raw
-            for row in table.plain_rows
-            if row.raw is not None and row.raw.node.vehicle_id == vehicle
-        ]
+        for row in table.plain_rows:
+            if row.gps is not None and row.gps.node.vehicle_id == vehicle:
+                fix = _Fix(row.gps.time_us, _speed_mps(row.gps) > MOVING_MPS)
+            if row.raw is not None and row.raw.node.vehicle_id == vehicle:
+                raws.append(row.raw)
+                moving.append(fix.moving and row.time_us - fix.time_us < MOVING_US)
     if not raws:
         refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")
-    return node_samples(raws)
+    return node_samples(raws, moving)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fix:
+    """What the newest fix tells."""
+
+    time_us: int = 0
+    moving: bool = False
+
+
+def _speed_mps(fix: GpsFix) -> float:
+    north, east, _ = fix.vel_n_mps
+    return math.hypot(north, east) if fix.fix_ok else 0.0
 
 
 def _capture_from(serial: SerialSettings, vehicle: int) -> Capture:
@@ -205,18 +248,26 @@ class _Listening:
     async def listen(self, seconds: float) -> list[ImuRaw]:
         clock, link, raws = GatewayClock(), Link(), list[ImuRaw]()
         done = asyncio.Event()
+        bar = Progress(
+            TextColumn("listening"), BarColumn(), TextColumn("{task.completed:.0f} s"),
+            console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
+        )  # fmt: skip
+        task = bar.add_task("", total=seconds)
 
         def on_bytes(data: bytes, now_us: int) -> None:
             for record in link.feed(data, now_us):
                 if isinstance(record, ImuRaw) and record.node.vehicle_id == self.vehicle:
                     raws.append(record)
-            if raws and raws[-1].time_us - raws[0].time_us > seconds * US_PER_S:
+            span_s = (raws[-1].time_us - raws[0].time_us) / US_PER_S if raws else 0.0
+            bar.update(task, completed=min(span_s, seconds), refresh=True)
+            if span_s > seconds:
                 done.set()
 
         port = SerialPort(self.serial, on_bytes, lambda _: None, lambda _: None, clock)
         port.start()
         try:
-            await asyncio.wait_for(done.wait(), seconds + PATIENCE_S)
+            with bar:
+                await asyncio.wait_for(done.wait(), seconds + PATIENCE_S)
         except TimeoutError:
             refuse(f"no samples of vehicle {self.vehicle}: is it on, and the port right?")
         finally:

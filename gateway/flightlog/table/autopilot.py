@@ -4,8 +4,8 @@ The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends 
 SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
 definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
 
-GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. From one height to the
-next it cannot be told, for the height of a receiver that finds or loses its fix jumps by any amount.
+GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. Heights do not tell it,
+for that of a receiver that finds or loses its fix jumps by any amount.
 """
 
 import math

@@ -8,11 +8,15 @@
 | param5 = 1, accel  | rest it on each of its six sides in turn | middle of the extremes, by axis |
 | param2 = 1, mag    | turn it about all axes, up to a minute   | centre of the sphere            |
 
+None is done in flight, where nothing is at rest. What is further off than any whole sensor of the
+kind is refused, for it was the aircraft that moved.
+
 Progress goes out as COMMAND_ACK (in progress) and as the `[cal]` texts that ground stations read;
 the result is an action, for the calibration belongs to another stage.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -20,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.records import ImuSample, Vec3
-from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.vehicle.actions import Answer, CalibrationKind, CalibrationMeasured, Reply
 from gateway.vehicle.services.commands import (
     ACCEPTED,
+    DENIED,
     FAILED,
     IN_PROGRESS,
     NOT_NOW,
@@ -43,6 +48,21 @@ SIX_SIDES_TIMEOUT_US: Final = 180 * US_PER_S
 MAX_REST_GYRO_RADPS: Final = 0.05
 """Standard deviation; hand-held trembling is above, an idling engine may be too."""
 MAX_REST_ACCEL_MPS2: Final = 0.5
+MAX_FIELD_DRIFT_UTPS: Final = 0.2
+"""A steady turn is as quiet as a rest, but the field turns: 0.6 deg/s at mid latitudes."""
+MIN_FIELD_SAMPLES: Final = 20
+MOST: Final = {
+    CalibrationKind.GYRO: (20.0 * RAD_PER_DEG, "it turned"),
+    CalibrationKind.ACCEL: (2.0, "it was moved or not level"),
+    CalibrationKind.LEVEL: (30.0 * RAD_PER_DEG, "it was not level"),
+    CalibrationKind.MAG: (200.0, "iron or a current is near"),
+}
+"""Greatest error along an axis, and what it comes of if it seems greater. The first two are what
+the MPU6050's data sheet allows, with twice as much for the accelerometer after soldering."""
+FIELD_UT: Final = (15.0, 100.0)
+"""Strength of the Earth's field, a scale that is off by a third included."""
+MAX_FIELD_RESIDUAL: Final = 0.1
+"""Deviation of the field's strength, as a share of it."""
 SIDE_SHARE: Final = 0.9
 """Share of gravity that one axis must carry for the aircraft to lie on that side."""
 MIN_SPREAD: Final = 1.2
@@ -65,6 +85,7 @@ class _Run:
     gyro: list[Vec3] = field(default_factory=list)
     accel: list[Vec3] = field(default_factory=list)
     mag: list[Vec3] = field(default_factory=list)
+    mag_times_us: list[int] = field(default_factory=list)
     sides: dict[int, Vec3] = field(default_factory=dict)
     progress: int = 0
 
@@ -74,10 +95,19 @@ class _Run:
 
 
 class Calibrator:
-    """At most one calibration at a time."""
+    """At most one calibration at a time.
 
-    def __init__(self, vehicle_id: int) -> None:
+    Parameters
+    ----------
+    vehicle_id : int
+        Whose sensors they are.
+    in_flight : callable
+        Tells whether it flies.
+    """
+
+    def __init__(self, vehicle_id: int, in_flight: Callable[[], bool]) -> None:
         self._vehicle_id = vehicle_id
+        self._in_flight = in_flight
         self._run: _Run | None = None
 
     @property
@@ -100,6 +130,8 @@ class Calibrator:
             values = (*command.params, *command.extra, command.height_m)
             nothing = not any(whole(value) for value in values)
             return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
+        if self._in_flight():
+            return DENIED, _text("calibration failed: it flies")
         kind, six_sides = asked
         if self._run is not None:
             again = (self._run.kind, self._run.six_sides) == asked
@@ -112,8 +144,13 @@ class Calibrator:
         run = self._run
         if run is None:
             return []
+        if self._in_flight():
+            return self._fail("it flies")
         if run.kind is CalibrationKind.MAG:
             return self._on_mag(run, sample)
+        if sample.mag_b_ut is not None and not run.six_sides:
+            run.mag.append(sample.mag_b_ut)
+            run.mag_times_us.append(sample.time_us)
         if run.window_us is None:
             run.window_us = sample.time_us
         run.gyro.append(sample.gyro_b_radps)
@@ -145,7 +182,7 @@ class Calibrator:
         )
         if run.six_sides:
             return self._on_side(run, accel.mean(axis=0)) if at_rest else []
-        if not at_rest:
+        if not at_rest or _field_turns(run):
             return self._fail("it was moved")
         if run.kind is CalibrationKind.GYRO:
             return self._done(run, _vector(gyro.mean(axis=0)))
@@ -183,7 +220,9 @@ class Calibrator:
         centre, radius = fit_sphere(points)
         if not math.isfinite(radius) or np.ptp(points, axis=0).min() < MIN_SPREAD * radius:
             return self._fail("turn it about all axes") if len(run.mag) >= MAG_SAMPLES else []
-        return self._done(run, centre)
+        residual = float(np.std(np.linalg.norm(points - centre, axis=1)))
+        is_earths = FIELD_UT[0] <= radius <= FIELD_UT[1] and residual <= MAX_FIELD_RESIDUAL * radius
+        return self._done(run, centre) if is_earths else self._fail(MOST[run.kind][1])
 
     def _announce(self, run: _Run, percent: int) -> list[Answer]:
         step = percent // 10 * 10
@@ -193,6 +232,9 @@ class Calibrator:
         return [run.command.ack(IN_PROGRESS, step), *_text(f"progress <{step}>")]
 
     def _done(self, run: _Run, error_b: Vec3) -> list[Answer]:
+        most, why = MOST[run.kind]
+        if max(map(abs, error_b)) > most:
+            return self._fail(why)
         self._run = None
         measured = CalibrationMeasured(self._vehicle_id, run.kind, error_b)
         return [measured, run.command.ack(ACCEPTED), *_text(f"calibration done: {run.kind}")]
@@ -226,6 +268,15 @@ def fit_sphere(points: NDArray[np.float64]) -> tuple[Vec3, float]:
     centre = solution[:3]
     square = float(solution[3] + centre @ centre)
     return _vector(centre), math.sqrt(square) if square > 0.0 else math.nan
+
+
+def _field_turns(run: _Run) -> bool:
+    """Tell whether the field turned while all was quiet; without a magnetometer nobody knows."""
+    if len(run.mag) < MIN_FIELD_SAMPLES:
+        return False
+    times_s = (np.array(run.mag_times_us) - run.mag_times_us[0]) / US_PER_S
+    slope = np.polyfit(times_s, np.array(run.mag), 1)[0]
+    return float(np.linalg.norm(slope)) > MAX_FIELD_DRIFT_UTPS
 
 
 def _tilt(mean_b_mps2: Vec3) -> Vec3:

@@ -9,7 +9,12 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import calibrate
 from gateway.config import load, load_aircraft
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import TableHeader, encode_head
+from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.solvers import NodeSamples
+from gateway.simulator.flight import fly
+from gateway.simulator.simulator_settings import SimulatorSettings
 
 G = 9.80665
 SIDES = G * np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.0]])
@@ -17,28 +22,37 @@ BIAS = np.array([0.2, -0.1, 0.3])
 
 
 class Link:
-    """Each capture lies on the next side; the first lies level."""
+    """Each capture lies on the next side; the first lies level. Turned is only the longest."""
 
     def __init__(self) -> None:
         self.captures = 0
+        self.breaks_at = 1000
 
     def __call__(self, seconds: float) -> NodeSamples:
         rng = np.random.default_rng(self.captures)
         side = SIDES[self.captures % 6]
         self.captures += 1
+        if self.captures > self.breaks_at:
+            raise KeyboardInterrupt
         n = round(seconds * 100)
-        field = rng.normal(size=(n, 3))
+        field = rng.normal(size=(n, 3)) if seconds > 30.0 else np.tile([0.3, 0.1, 0.9], (n, 1))
         return NodeSamples(
             time_s=np.arange(n) / 100,
             accel=side + BIAS + rng.normal(0, 0.02, (n, 3)),
             gyro=0.05 + rng.normal(0, 0.002, (n, 3)),
+            mag_time_s=np.arange(n) / 100,
             mag=45.0 * field / np.linalg.norm(field, axis=1)[:, None] + 10.0,
+            moving=np.zeros(n, np.bool_),
         )
 
 
 @pytest.fixture
-def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    link = Link()
+def link() -> Link:
+    return Link()
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Link) -> Path:
     monkeypatch.setattr(calibrate, "_capture_from", lambda serial, vehicle: link)
     path = tmp_path / "gateway.toml"
     path.write_text(f'aircraft_folder = "{tmp_path}"\n')
@@ -55,7 +69,8 @@ def run(config: Path, *arguments: str) -> str:
 @pytest.mark.io
 def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None:
     output = run(config, "gyro", "accel", "mag")
-    assert output.count("done") == 3
+    assert [f"{step}: done" in output for step in ("gyro", "accel", "mag")] == [True] * 3
+    assert "5 of 6 sides are done. Lay the node on one of these and let it go: chips up" in output
     saved = load_aircraft(load(config))[3].calibration
     assert saved.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
     assert saved.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.02)
@@ -74,9 +89,53 @@ def test_dry_run_saves_nothing(config: Path) -> None:
 def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def moving(seconds: float) -> NodeSamples:
         noise = np.random.default_rng(1).normal(0, 5.0, (300, 3))
-        return NodeSamples(np.arange(300) / 100, noise, noise, np.empty((0, 3)))
+        return NodeSamples(
+            np.arange(300) / 100,
+            noise,
+            noise,
+            np.empty(0),
+            np.empty((0, 3)),
+            np.zeros(300, np.bool_),
+        )
 
     monkeypatch.setattr(calibrate, "_capture_from", lambda serial, vehicle: moving)
     output = run(config, "gyro")
     assert "still" in output
     assert "nothing changed" in output
+
+
+@pytest.mark.io
+def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
+    link.breaks_at = 4
+    output = run(config, "gyro", "accel", "mag")
+    assert "Broken off. Not done: accel, mag." in output
+    saved = load_aircraft(load(config))[3].calibration
+    assert saved.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
+    assert saved.accel_bias_mps2 == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.io
+def test_leaving_at_a_question_keeps_what_is_done(config: Path) -> None:
+    command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
+    result = CliRunner().invoke(app, command, input="\n")
+    assert result.exit_code == 0, result.output
+    assert "Not done: mag" in result.output
+    assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
+
+
+@pytest.mark.io
+def test_the_gyroscope_from_a_flight(tmp_path: Path, config: Path) -> None:
+    """A flight with a rest before and steady turns: the bias is that of the rest."""
+    flight = fly(SimulatorSettings(imu_rate_hz=50))
+    lines = [encode_head(TableHeader(vehicle_id=3))]
+    for record in flight.records():
+        if isinstance(record, ImuRaw | GpsFix):
+            kind = "raw" if isinstance(record, ImuRaw) else "gps"
+            lines.append(row_to_line(TableRow(record.time_us, **{kind: record})))
+    log = tmp_path / "flight.csv"
+    log.write_text("".join(lines))
+    output = run(config, "gyro", "--log", str(log))
+    saved = load_aircraft(load(config))[3].calibration
+    assert "gyro: done" in output
+    off = np.subtract(saved.gyro_bias_radps, flight.errors.gyro_bias_radps)
+    assert np.degrees(np.abs(off)).max() < 0.2

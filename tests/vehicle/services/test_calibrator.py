@@ -15,7 +15,7 @@ from tests.vehicle.samples import sample_at, state_at
 
 G = 9.80665
 CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
-ACCEPTED, NOT_NOW, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 3, 4, 5
+ACCEPTED, NOT_NOW, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 2, 3, 4, 5
 GYRO, MAG = (1,), (0, 1)
 SIX_SIDES, LEVEL, SIMPLE = (0, 0, 0, 0, 1), (0, 0, 0, 0, 2), (0, 0, 0, 0, 4)
 
@@ -145,6 +145,66 @@ def test_trembling_of_a_hand_is_no_rest(
 ) -> None:
     station.command(CALIBRATE, *GYRO)
     assert acks(run(station, 4.0, rest(noise=noise_radps)))[-1] == result
+
+
+def fly(station: GroundStation, seconds: float) -> list[Any]:
+    found = []
+    for _ in range(round(seconds * 100)):
+        now_us = station.clock.advance(0.01)
+        state = state_at(now_us, vel_n_mps=(20.0, 0.0, 0.0))
+        found += station.receive(station.vehicle.on_state(state, sample_at(now_us), now_us))
+    return found
+
+
+@pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES, LEVEL, SIMPLE])
+def test_none_is_begun_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
+    fly(station, 3.0)
+    found = station.command(CALIBRATE, *params)
+    assert (acks(found), cal_texts(found)) == ([DENIED], ["calibration failed: it flies"])
+    assert acks(station.command(CALIBRATE)) == [ACCEPTED], "what runs may be cancelled"
+
+
+@pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES])
+def test_none_goes_on_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
+    station.command(CALIBRATE, *params)
+    found = fly(station, 3.0)
+    assert acks(found)[-1] == FAILED
+    assert cal_texts(found)[-1] == "calibration failed: it flies"
+    assert station.of(CalibrationMeasured) == []
+
+
+@pytest.mark.parametrize(
+    ("params", "motion"),
+    [
+        (GYRO, rest(gyro=(0.0, 0.0, 0.36))),
+        (SIMPLE, rest(accel=(2.1, 0.0, -9.5))),
+        (LEVEL, rest(accel=(5.2, 0.0, -8.3))),
+        (MAG, lambda t: tumble((0.0, 210.0, 0.0), 48.0)(t)),
+        (MAG, lambda t: tumble((0.0, 0.0, 0.0), 110.0)(t)),
+        (MAG, lambda t: tumble((0.0, 0.0, 0.0), 48.0 * (1.0 + 0.3 * math.sin(50.0 * t)))(t)),
+    ],
+)
+def test_what_no_sensor_shows_is_refused(
+    station: GroundStation, params: tuple[int, ...], motion: Motion
+) -> None:
+    station.command(CALIBRATE, *params)
+    assert acks(run(station, 60.0, motion))[-1] == FAILED
+    assert station.of(CalibrationMeasured) == []
+
+
+@pytest.mark.parametrize(("turn_degps", "result"), [(0.0, ACCEPTED), (2.8, FAILED)])
+def test_a_steady_turn_is_no_rest(station: GroundStation, turn_degps: float, result: int) -> None:
+    """The gyroscope is as quiet as on a table; the field tells."""
+    rate = math.radians(turn_degps)
+    lying = rest(gyro=(0.0, 0.0, rate))
+    noise = np.random.default_rng(5)
+
+    def turning(time_s: float) -> dict[str, Any]:
+        field = (20.0 * math.cos(rate * time_s), -20.0 * math.sin(rate * time_s), 40.0)
+        return {**lying(time_s), "mag_b_ut": tuple(field + noise.normal(0, 0.5, 3))}
+
+    station.command(CALIBRATE, *GYRO)
+    assert acks(run(station, 4.0, turning))[-1] == result
 
 
 def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
