@@ -36,11 +36,14 @@ SHORT: Final = {
     "beta": "estimation.paper.beta_velocity",
 }
 """The paper's own names."""
+ESTIMATOR_KEY: Final = "estimation.estimator"
 LARGEST_GRID: Final = 100_000
 SEED: Final = 1
 
 Value = float | int | str | bool
 Values = tuple[Value, ...]
+Trial = tuple[Values, Mapping[str, float]]
+"""What was tried, and its scores."""
 
 
 class SweepError(ValueError):
@@ -183,7 +186,7 @@ def make_contest(
     if len(named) > 1:
         raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
     if named:
-        fusion = with_value(fusion, "estimation.estimator", named.pop())
+        fusion = with_value(fusion, ESTIMATOR_KEY, named.pop())
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:
         # Not both: a comb through another comb leaves gaps, or nothing.
@@ -238,9 +241,7 @@ def grid(axes: Sequence[Axis]) -> list[Values]:
     return list(itertools.product(*(axis.values for axis in axes)))
 
 
-def tabulate(
-    keys: Sequence[str], trials: Sequence[tuple[Values, Mapping[str, float]]], metric: Metric
-) -> pd.DataFrame:
+def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
     """Lay trials out as a table, the best first.
 
     Raises
@@ -257,6 +258,44 @@ def tabulate(
         )
     table = table.dropna(axis="columns", how="all")
     return table.sort_values(column, kind="stable", ignore_index=True)
+
+
+def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
+    """Give the values of the trial with the least error, the first of equal ones.
+
+    Not from the table: there numbers are its own kind of numbers.
+    """
+    judged = COLUMN_OF[metric]
+    scored = [trial for trial in trials if not math.isnan(trial[1][judged])]
+    return min(scored, key=lambda trial: trial[1][judged])[0]
+
+
+def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
+    """Name the settings that change nothing, such as those that the estimator does not use.
+
+    Each is tried at its first, middle and last value, all others at their first, with every
+    estimator that is varied.
+    """
+    trials = Trials(contest)
+    estimators = next((axis.values for axis in axes if axis.key == ESTIMATOR_KEY), (None,))
+    bases = [
+        tuple(name if axis.key == ESTIMATOR_KEY and name else axis.values[0] for axis in axes)
+        for name in estimators
+    ]
+    found = []
+    for k, axis in enumerate(axes):
+        tried = {axis.values[0], axis.values[len(axis.values) // 2], axis.values[-1]}
+        runs = [
+            [trials.run((*base[:k], value, *base[k + 1 :])) for value in sorted(tried, key=str)]
+            for base in bases
+        ]
+        if len(tried) > 1 and all(_is_alike(run[0], other) for run in runs for other in run):
+            found.append(axis.key)
+    return found
+
+
+def _is_alike(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
+    return all(a[key] == b[key] or math.isnan(a[key] + b[key]) for key in a)
 
 
 _LACKING: Final[dict[Metric, str]] = {

@@ -19,7 +19,15 @@ from rich.table import Table
 
 from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.tuning import contest as sweeping
-from gateway.analysis.tuning.contest import COLUMN_OF, Axis, Contest, Metric, SweepError, Values
+from gateway.analysis.tuning.contest import (
+    COLUMN_OF,
+    Axis,
+    Contest,
+    Metric,
+    SweepError,
+    Trial,
+    Values,
+)
 from gateway.analysis.tuning.workers import Run, pool
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import Loading, load_flight
@@ -36,8 +44,6 @@ HEADINGS: Final = {
     "reference_m": "reference\nm",
     "attitude_deg": "attitude\ndeg",
 }
-
-Trial = tuple[Values, dict[str, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             hold_out=options.hold_out,
             interval_s=options.gps_interval_s,
         )
+        _tell_idle(contest, axes)
         with pool(contest, options.jobs) as run:
             if options.generations:
                 trials = _search(axes, run, options.generations, options.metric)
@@ -79,7 +86,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
     except SweepError as error:
         refuse(str(error))
     _show(results, contest, options.metric)
-    best = tuple(results.iloc[0][list(contest.keys)])
+    best = sweeping.best_of(trials, options.metric)
     with refusing():
         options.output.write_text(
             render(_merged(loading.settings, contest, best)), encoding="utf-8"
@@ -100,6 +107,20 @@ def _axes(options: SweepOptions) -> list[Axis]:
     if not wanted:
         raise SweepError("nothing to vary: give --alpha, --beta or --vary NAME=VALUES")
     return [sweeping.parse_axis(name, text) for name, text in wanted]
+
+
+def _tell_idle(contest: Contest, axes: Sequence[Axis]) -> None:
+    """Say before the work which settings change nothing."""
+    idle = sweeping.idle_axes(contest, axes)
+    if not idle:
+        return
+    estimator = contest.fusion.estimation.estimator
+    text = f"{', '.join(idle)}: changes nothing on this flight"
+    if not any(axis.key == sweeping.ESTIMATOR_KEY for axis in axes):
+        text += f" with the estimator {estimator}"
+    if len(idle) == len(axes):
+        raise SweepError(f"{text}; vary another setting, or choose the estimator that uses it")
+    console_of(stderr=True).print(f"[yellow]{text}[/]")
 
 
 def _progress() -> Progress:

@@ -54,6 +54,33 @@ def test_a_search_writes_its_best_too(recording: Path, tmp_path: Path) -> None:
     assert 0.5 < load(best).estimation.paper.beta_velocity < 0.9
 
 
+def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) -> None:
+    best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
+    arguments = ["--vary", "estimator=paper,complementary", "--vary", "gps_latency_s=0.0,0.2"]
+    arguments += ["-o", str(best), "--table", str(table), "--jobs", "1"]
+    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    assert result.exit_code == 0, result.output
+    winner = pd.read_csv(table).iloc[0]
+    estimation = load(best).estimation
+    assert estimation.estimator == winner["estimation.estimator"]
+    assert estimation.reference.gps_latency_s == winner["estimation.reference.gps_latency_s"]
+
+
+def test_a_setting_that_changes_nothing_is_told(recording: Path, tmp_path: Path) -> None:
+    idle = ["--vary", "dip_tolerance_deg=5.0,10.0"]
+    base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1"]
+    result = CliRunner().invoke(app, [*base, "--beta", "0.1,0.9", *idle])
+    assert result.exit_code == 0, result.output
+    assert "estimation.compass.dip_tolerance_deg: changes nothing" in result.output
+    assert "with the estimator paper" in result.output
+    assert "beta_velocity:" not in result.output
+    result = CliRunner().invoke(app, [*base, *idle])
+    assert result.exit_code == 2
+    assert "vary another setting" in result.output
+    both = ["--vary", "estimator=paper,complementary"]
+    assert "changes nothing" not in CliRunner().invoke(app, [*base, *both]).output
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
