@@ -7,7 +7,7 @@ the same annotations, so a range is written once.
 """
 
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -26,6 +26,7 @@ def setting(
     le: float | None = None,
     pattern: str | None = None,
     rotation: bool = False,
+    choices: Collection[str] = (),
 ) -> msgspec.Meta:
     """Describe one setting: meaning, unit and what is allowed.
 
@@ -41,13 +42,16 @@ def setting(
         Regular expression that a text must match.
     rotation : bool
         Whether the value is the matrix of a rotation, for which people rather give angles.
+    choices : collection of str, optional
+        The allowed texts where they are not known to the type: a registry that may grow. The
+        settings class checks them itself.
 
     Returns
     -------
     msgspec.Meta
         To be used as `Annotated[float, setting(...)]`.
     """
-    extra = {"unit": unit, "rotation": rotation}
+    extra = {"unit": unit, "rotation": rotation, "choices": choices}
     if pattern is not None:
         return msgspec.Meta(description=meaning, pattern=pattern, extra=extra)
     return msgspec.Meta(description=meaning, ge=_exact(ge), le=_exact(le), extra=extra)
@@ -95,12 +99,13 @@ def _field(name: str, kind: Any, default: Any) -> Field:
     meta = metas[0]
     bounded = next((m for m in metas if m.ge is not None or m.le is not None), meta)
     extra = meta.extra or {}
+    listed = get_args(plain) if get_origin(plain) is Literal else extra.get("choices", ())
     return Field(
         name=name,
         type=kind,
         default=default,
         section=plain if isinstance(plain, type) and issubclass(plain, Settings) else None,
-        choices=get_args(plain) if get_origin(plain) is Literal else (),
+        choices=tuple(listed),
         meaning=meta.description or "",
         unit=extra.get("unit", ""),
         is_rotation=extra.get("rotation", False),

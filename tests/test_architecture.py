@@ -35,10 +35,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "analysis": FOUNDATION | STAGES | JOINED | {"replay"},
     "config": FOUNDATION | STAGES | JOINED | {"edges"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
+    "extensions": set(),
     "cli": FOUNDATION
     | STAGES
     | JOINED
-    | {"replay", "status", "edges", "flights", "config", "daemon", "analysis"},
+    | {"replay", "status", "edges", "flights", "config", "daemon", "analysis", "extensions"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 

@@ -1,7 +1,7 @@
 """One flight fused with every estimator: what all sections of a report start from."""
 
 from dataclasses import dataclass
-from typing import Final, get_args
+from typing import Final
 
 import msgspec
 
@@ -13,10 +13,10 @@ from gateway.analysis.flight_arrays import (
     local_frame,
 )
 from gateway.analysis.fusion import Sensed, fuse, sense
-from gateway.estimation.select import EstimationSettings, EstimatorName
+from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
-    name for name in get_args(EstimatorName) if name in EstimationSettings.__struct_fields__
+    name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__
 )
 """Every estimator has a section of settings of its own name."""
 

@@ -11,6 +11,7 @@ from rich.logging import RichHandler
 from gateway import __version__
 from gateway.cli.live import calibrate, clients, demo, record, run, setup
 from gateway.cli.recorded import convert, fuse, info, play, report, sweep
+from gateway.extensions import ExtensionError, load_extensions
 
 app = typer.Typer(
     name="mavgate",
@@ -59,4 +60,8 @@ def _options(
 
 def main() -> None:
     """Run the command line."""
+    try:
+        load_extensions()
+    except ExtensionError as error:
+        sys.exit(f"mavgate: {error}")
     app()

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
-from gateway.estimation.select import EstimationSettings, EstimatorName
+from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId, Outgoing
 
@@ -32,7 +32,7 @@ LEVEL = ImuRaw(
 class Bench:
     """A pipeline with one aircraft on the table and one ground station."""
 
-    def __init__(self, estimator: EstimatorName = "paper") -> None:
+    def __init__(self, estimator: str = "paper") -> None:
         settings = AircraftSettings(estimation=EstimationSettings(estimator=estimator))
         self.pipeline = Pipeline(PipelineSettings(settings))
         self.mav = mavlink.MAVLink(None, 255, 190)

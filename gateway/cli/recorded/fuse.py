@@ -36,7 +36,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.estimation.select import EstimatorName
+from gateway.estimation.select import ESTIMATORS
 from gateway.flights.reading import (
     FlightError,
     ReadOptions,
@@ -79,12 +79,19 @@ def register(app: typer.Typer) -> None:
     app.command("fuse", rich_help_panel=PANEL)(fuse_log)
 
 
+def _known_estimator(name: str | None) -> str | None:
+    if name is not None and name not in ESTIMATORS:
+        raise typer.BadParameter(f"{name!r} is none of {', '.join(ESTIMATORS)}")
+    return name
+
+
 def fuse_log(
     file: Annotated[Path, typer.Argument(help="Recording or log, gzipped or not.")],
     *,
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write; it is overwritten.")],
     estimator: Annotated[
-        EstimatorName | None, typer.Option("--estimator", help="In place of the settings'.")
+        str | None,
+        typer.Option("--estimator", help="In place of the settings'.", callback=_known_estimator),
     ] = None,
     columns: ColumnsOption = None,
     gps_latency_s: Annotated[
@@ -206,7 +213,7 @@ def _facts_of(path: Path) -> dict[str, float]:
 
 def _adjusted(
     aircraft: AircraftSettings,
-    estimator: EstimatorName | None,
+    estimator: str | None,
     gps_latency_s: float | None,
     facts: dict[str, float],
 ) -> AircraftSettings:

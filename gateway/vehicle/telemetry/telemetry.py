@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState
 from gateway.vehicle.home import Home, is_good_enough, place_of
 from gateway.vehicle.telemetry import messages
+from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.motion import IN_AIR, Motion
 from gateway.vehicle.telemetry.streams import Stream, interval_us
@@ -84,10 +85,23 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
         }
+        self._timed = [*TIMED_MESSAGES]
+        self._take_added()
 
     def add(self, message_id: int, builder: Builder) -> None:
         """Let another service build a message that is sent by time."""
         self._builders[message_id] = builder
+
+    def _take_added(self) -> None:
+        for added in ADDED_MESSAGES.values():
+            if added.message_id in self.streams:
+                raise ValueError(f"message {added.message_id} is sent by every vehicle already")
+            self._timed.append(added.message_id)
+            self.streams[added.message_id] = Stream(interval_us(added.rate_hz))
+            self.add(added.message_id, lambda _, build=added.build: build(self._newest()))  # type: ignore[misc]
+
+    def _newest(self) -> NewestRecords:
+        return NewestRecords(self.state, self._sample, self._baro, self._fix)
 
     def knows(self, message_id: int) -> bool:
         """Tell whether the vehicle ever sends a message."""
@@ -158,7 +172,7 @@ class Telemetry:
 
     def poll(self, now_us: int) -> list[Any]:
         """Tell what is due by time."""
-        due = [m for m in TIMED_MESSAGES if self.streams[m].tick(now_us)]
+        due = [m for m in self._timed if self.streams[m].tick(now_us)]
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
@@ -169,7 +183,7 @@ class Telemetry:
 
     def next_due_us(self) -> int:
         """Tell when `poll` has something to tell; the heartbeat never stops."""
-        due = (self.streams[m].due_us for m in TIMED_MESSAGES if self.streams[m].interval_us > 0)
+        due = (self.streams[m].due_us for m in self._timed if self.streams[m].interval_us > 0)
         return min(0 if time_us is None else time_us for time_us in due)
 
     def build(self, message_id: int, now_us: int) -> Any:

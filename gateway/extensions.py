@@ -1,0 +1,46 @@
+"""Extensions: what other installed packages add to the gateway.
+
+A package names a function in its `pyproject.toml`:
+
+    [project.entry-points."mavgate.extensions"]
+    my-extension = "my_package:extend"
+
+It is called once, without arguments, when a `mavgate` command starts, and adds what it brings;
+docs/extend.md shows how.
+"""
+
+import logging
+from importlib.metadata import entry_points
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+GROUP: Final = "mavgate.extensions"
+
+
+class ExtensionError(Exception):
+    """An extension that cannot be used; the text says which and why."""
+
+
+def load_extensions() -> tuple[str, ...]:
+    """Let every installed extension add what it brings.
+
+    Returns
+    -------
+    tuple of str
+        Their names.
+
+    Raises
+    ------
+    ExtensionError
+        If one cannot be imported, or what it adds is not taken.
+    """
+    found = []
+    for entry in entry_points(group=GROUP):
+        try:
+            entry.load()()
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            raise ExtensionError(f"extension {entry.name} ({entry.value}): {error}") from error
+        log.debug("extension %s", entry.name)
+        found.append(entry.name)
+    return tuple(found)

@@ -1,0 +1,132 @@
+"""docs/extend.md: each example as it stands there, added from outside the package."""
+
+import importlib
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway import Outgoing, Pipeline, PipelineSettings
+from gateway.aircraft import AircraftSettings
+from gateway.estimation.select import ESTIMATORS, EstimationSettings
+from gateway.extensions import ExtensionError, load_extensions
+from gateway.records import NavState
+from gateway.simulator.flight import fly
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES
+from gateway.wire.mavlink_splitter import message_id_of
+
+DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"
+REGISTRIES = (ADDED_MESSAGES, ESTIMATORS)
+
+Install = Callable[[str, str], ModuleType]
+
+
+def example(heading: str) -> str:
+    """Return the Python below a heading of the document."""
+    found = re.search(rf"^## {heading}$.*?```python\n(.*?)```", DOCUMENT.read_text(), re.M | re.S)
+    assert found is not None
+    return found[1]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Put a module where an installed package would stand, with its entry point."""
+    before = [dict(registry) for registry in REGISTRIES]
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names: list[str] = []
+
+    def write(name: str, source: str) -> ModuleType:
+        names.append(name)
+        (tmp_path / f"{name}.py").write_text(source)
+        facts = tmp_path / f"{name}-1.0.dist-info"
+        facts.mkdir()
+        (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (facts / "entry_points.txt").write_text(f"[mavgate.extensions]\n{name} = {name}:extend\n")
+        importlib.invalidate_caches()
+        return importlib.import_module(name)
+
+    yield write
+    for registry, kept in zip(REGISTRIES, before, strict=True):
+        registry.clear()
+        registry.update(kept)
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
+    pipeline = Pipeline(PipelineSettings(settings))
+    frames = []
+    for record in fly(SimulatorSettings(), duration_s=seconds).records():
+        now_us = record.time_us
+        actions = [*pipeline.take(record, now_us), *pipeline.poll(now_us)]
+        frames += [action.frame for action in actions if isinstance(action, Outgoing)]
+    return frames
+
+
+def test_a_message_is_sent_at_its_rate(install: Install) -> None:
+    install("load_factor", example("A message"))
+    assert load_extensions() == ("load_factor",)
+    wanted = mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
+    frames = [f for f in fly_with(AircraftSettings(), 4.0) if message_id_of(f) == wanted]
+    assert 19 <= len(frames) <= 21
+    message = mavlink.MAVLink(None).parse_char(frames[-1])
+    assert message.name == "load"
+    assert message.value == pytest.approx(1.0, abs=0.1)
+
+
+def test_an_estimator_is_chosen_by_name(install: Install) -> None:
+    install("gyro_only", example("An estimator"))
+    load_extensions()
+    settings = AircraftSettings(estimation=EstimationSettings(estimator="gyro_only"))
+    wanted = mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+    frames = [f for f in fly_with(settings, 2.0) if message_id_of(f) == wanted]
+    first = mavlink.MAVLink(None).parse_char(frames[0])
+    assert (first.q1, first.q2, first.q3, first.q4) == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_an_unknown_estimator_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="'gyro_only', which is none of paper, complementary"):
+        EstimationSettings(estimator="gyro_only")
+
+
+def test_the_stages_run_from_python(install: Install) -> None:
+    library = install("library", example("The stages from Python"))
+    records = fly(SimulatorSettings(), duration_s=2.0).records()
+    found = list(library.run(records))
+    assert any(isinstance(item, NavState) for item in found)
+    assert any(isinstance(item, bytes) and message_id_of(item) == 0 for item in found)
+
+
+TAKEN = """
+from gateway.estimation.select import add_estimator
+
+def extend():
+    add_estimator("eskf", None)
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import no_such_package", "no_such_package"),
+        ("", "extend"),
+        (TAKEN, "already"),
+    ],
+)
+def test_a_broken_extension_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, reason: str
+) -> None:
+    (tmp_path / "broken_one.py").write_text(source)
+    facts = tmp_path / "broken_one-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-one\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[mavgate.extensions]\nmine = broken_one:extend\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken_one", raising=False)
+    with pytest.raises(ExtensionError, match=f"mine .*{reason}"):
+        load_extensions()
