@@ -18,6 +18,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.edges.receiver.serial_port import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.session import RecordingSettings
+from gateway.panel.panel_settings import PanelSettings
 from gateway.routing.hub_settings import HubSettings
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
@@ -37,6 +38,7 @@ class GatewaySettings(Settings, frozen=True):
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
     recording: RecordingSettings = RecordingSettings()
+    panel: PanelSettings = PanelSettings()
     simulator: SimulatorSettings = SimulatorSettings()
     aircraft_folder: Annotated[
         str,
@@ -279,7 +281,18 @@ def _render_key(field: Field, value: Any) -> Iterator[str]:
         yield f"# {field.name} ="
     else:
         plain = msgspec.to_builtins(value)
-        yield f"{field.name} = {tomlkit.item(plain).as_string()}"
+        yield f"{field.name} = {_in_toml(plain)}"
+
+
+def _in_toml(value: Any) -> str:
+    """Write a value; tables of a list stay in its brackets, one a line."""
+    if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
+        tables = []
+        for entry in value:
+            tables.append(tomlkit.inline_table())
+            tables[-1].update(entry)
+        return "[\n" + "".join(f"  {table.as_string()},\n" for table in tables) + "]"
+    return str(tomlkit.item(value).as_string())
 
 
 def _allowed(field: Field) -> str:

@@ -58,7 +58,16 @@ def through_sockets(file: Path) -> Iterator[mavlink.MAVLink_message]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         endpoint = f"udp:127.0.0.1:{sock.getsockname()[1]}"
-        command = ["-m", "gateway.cli", "demo", "--plain", "--endpoint", endpoint, "--flight"]
+        command = [
+            "-m",
+            "gateway.cli",
+            "demo",
+            "--plain",
+            "--no-panel",
+            "--endpoint",
+            endpoint,
+            "--flight",
+        ]
         process = subprocess.Popen([sys.executable, *command, str(file)])
         silent = 0
         try:

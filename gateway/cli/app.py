@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli.live import calibrate, clients, demo, record, run, setup
+from gateway.cli.live import calibrate, clients, demo, panel, record, run, setup
 from gateway.cli.recorded import convert, fuse, info, play, report, sweep
 from gateway.extensions import ExtensionError, load_extensions
 
@@ -24,6 +24,7 @@ app = typer.Typer(
 )
 run.register(app)
 demo.register(app)
+panel.register(app)
 record.register(app)
 play.register(app)
 convert.register(app)

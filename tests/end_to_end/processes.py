@@ -46,6 +46,8 @@ class Gateway:
         self.log = folder / "mavgate.log"
         file = folder / "gateway.toml"
         file.write_text(config.format(port=self.port, listen=self.listen_port))
+        if command == "demo" and "--panel" not in options:
+            options = ("--no-panel", *options)
         arguments = ["-m", "gateway.cli", command, "--plain", "--config", str(file), *options]
         with self.log.open("w") as log:
             self.process = subprocess.Popen(

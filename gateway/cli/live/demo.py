@@ -23,6 +23,7 @@ from gateway.cli.live.run import (
 )
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.firmware_bench import BenchError, firmware_line
+from gateway.cli.support.panel_process import PanelProcess, is_installed
 from gateway.cli.support.warm_up import compile_everything
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
@@ -52,6 +53,9 @@ def demo(
     firmware: Annotated[
         bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
     ] = False,
+    panel: Annotated[
+        bool, typer.Option("--panel/--no-panel", help="Show it in a browser too.")
+    ] = True,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
@@ -83,7 +87,8 @@ def demo(
             return replace(settings, aircraft_folder=folder, recording=recording)
 
         daemon = partial(Daemon, apart(settings), aircraft, lambda: apart(read()), line)
-        asyncio.run(serve(daemon, plain=plain))
+        page = PanelProcess(config) if panel and is_installed() else None
+        asyncio.run(serve(daemon, plain=plain, panel=page))
 
 
 def recorded_line(

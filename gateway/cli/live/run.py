@@ -14,6 +14,7 @@ from rich.live import Live
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.support.errors import refuse
+from gateway.cli.support.panel_process import PanelProcess
 from gateway.cli.support.warm_up import compile_everything
 from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
 from gateway.daemon import Daemon
@@ -53,6 +54,9 @@ def run_gateway(
     ] = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
+    panel: Annotated[
+        bool, typer.Option("--panel", help="Show it in a browser too, whatever the settings say.")
+    ] = False,
 ) -> None:
     """Run the gateway on the receiver's serial port until interrupted."""
 
@@ -66,7 +70,8 @@ def run_gateway(
     settings = or_refuse(read)
     compile_everything()
     aircraft = read_aircraft(settings)
-    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain))
+    page = PanelProcess(config) if panel or settings.panel.enabled else None
+    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
 
 
 def load_settings(file: Path | None) -> GatewaySettings:
@@ -115,7 +120,9 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
     return msgspec.structs.replace(settings, hub=hub)
 
 
-async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
+async def serve(
+    daemon_of: Callable[[], Daemon], *, plain: bool, panel: PanelProcess | None = None
+) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing what it does; SIGHUP reloads the settings.
 
     Parameters
@@ -124,6 +131,8 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
         Builds the daemon; called inside the event loop.
     plain : bool
         Log lines even on a terminal.
+    panel : PanelProcess, optional
+        The page in a browser, to be started and ended with the daemon.
     """
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -134,12 +143,16 @@ async def serve(daemon_of: Callable[[], Daemon], *, plain: bool) -> None:
     daemon = daemon_of()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
     daemon.start()
+    if panel is not None:
+        panel.start()
     try:
         if view is None:
             await _log_lines(daemon, stopped)
         else:
-            await _live_view(daemon, view, stopped)
+            await _live_view(daemon, view, stopped, panel)
     finally:
+        if panel is not None:
+            panel.close()
         daemon.close()
 
 
@@ -150,10 +163,13 @@ def _reload(daemon: Daemon) -> None:
         log.warning("settings not reloaded: %s", error)
 
 
-async def _live_view(daemon: Daemon, view: LiveView, stopped: asyncio.Event) -> None:
+async def _live_view(
+    daemon: Daemon, view: LiveView, stopped: asyncio.Event, panel: PanelProcess | None
+) -> None:
     # No thread of rich's own: it draws when it is told to, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
         while not await _is_set_within(stopped, VIEW_INTERVAL_S):
+            view.link = "" if panel is None else panel.link
             live.update(view.draw(daemon.snapshot()), refresh=True)
 
 

@@ -61,6 +61,8 @@ class LiveView:
 
     def __init__(self) -> None:
         self.log = RecentLog()
+        self.link = ""
+        """Address of the panel; empty without one."""
         self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
@@ -78,7 +80,10 @@ class LiveView:
         """
         self._snapshots.append(snapshot)
         previous = self._snapshots[0]
-        parts: list[RenderableType] = [_link_line(snapshot), Text()]
+        parts: list[RenderableType] = [_link_line(snapshot)]
+        if self.link:
+            parts.append(Text.assemble("panel  ", (self.link, "bold cyan")))
+        parts.append(Text())
         if snapshot.report.nodes:
             parts.append(_nodes(snapshot.report))
         for vehicle_id, state in snapshot.states:

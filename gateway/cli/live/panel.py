@@ -1,0 +1,63 @@
+"""`mavgate panel`: the page in a browser."""
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from msgspec.structs import replace
+
+from gateway.cli.live.run import ConfigOption, read_settings
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.panel_process import HOW_TO_ADD, LINK
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command("panel")(panel)
+
+
+def panel(
+    *,
+    connect: Annotated[
+        str | None,
+        typer.Option(
+            "--connect",
+            help="A vehicle's MAVLink, such as tcp:HOST:5760 or udp-listen:0.0.0.0:14550.",
+        ),
+    ] = None,
+    port: Annotated[int | None, typer.Option("--port", "-p", min=0, max=65535)] = None,
+    config: ConfigOption = None,
+    hash_password: Annotated[
+        bool, typer.Option("--hash-password", help="Ask for a password and print its hash.")
+    ] = False,
+    attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
+) -> None:
+    """Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.
+
+    Without --connect it shows the gateway that runs on this machine, and finds it again whenever
+    that is started anew.
+    """
+    try:
+        from gateway.panel.panel_server import PanelError, run_panel
+    except ModuleNotFoundError as error:
+        refuse(f"{HOW_TO_ADD} ({error.name} is missing)")
+    if hash_password:
+        from gateway.panel.page_lock import hash_password as hashed
+
+        print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
+        return
+    if attached:
+        # What is worth a line there comes into the gateway's own log.
+        logging.getLogger().setLevel(logging.WARNING)
+    settings = read_settings(config)
+    wanted = settings.panel if port is None else replace(settings.panel, port=port)
+    folder = Path(settings.recording.folder).expanduser()
+    try:
+        run_panel(wanted, folder, connect, _show_link, attached=attached)
+    except (PanelError, ValueError) as error:
+        refuse(str(error))
+
+
+def _show_link(link: str) -> None:
+    print(f"{LINK}{link}", flush=True)

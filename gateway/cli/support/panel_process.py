@@ -1,0 +1,82 @@
+"""The panel as a child of the gateway: what it does, or that it dies, delays no frame."""
+
+import asyncio
+import logging
+import sys
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+HOW_TO_ADD: Final = "the panel is an extra: pip install 'mavgate[panel]'"
+LINK: Final = "panel: "
+"""What the line with the page's address begins with."""
+RESTART_S: Final = 5.0
+LONGEST_RESTART_S: Final = 300.0
+"""What cannot even begin is not tried for ever at a pace that fills the log."""
+
+
+def is_installed() -> bool:
+    """Tell whether the extra is there."""
+    return find_spec("nicegui") is not None
+
+
+class PanelProcess:
+    """The panel as a child of the gateway; when it dies it is started anew.
+
+    Parameters
+    ----------
+    config : Path or None
+        Settings file, as the gateway was given it.
+    """
+
+    def __init__(self, config: Path | None) -> None:
+        self.link = ""
+        """The page's address; empty while there is none."""
+        self._arguments = ["-m", "gateway.cli", "panel", "--attached"]
+        if config is not None:
+            self._arguments += ["--config", str(config)]
+        self._task: asyncio.Task[None] | None = None
+        self._child: asyncio.subprocess.Process | None = None
+
+    def start(self) -> None:
+        """Start it; needs a running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._keep())
+
+    def close(self) -> None:
+        """End it."""
+        if self._task is not None:
+            self._task.cancel()
+        if self._child is not None and self._child.returncode is None:
+            with suppress(ProcessLookupError):
+                self._child.terminate()
+
+    async def _keep(self) -> None:
+        wait_s = RESTART_S
+        while True:
+            self._child = await asyncio.create_subprocess_exec(
+                sys.executable,
+                *self._arguments,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.STDOUT,
+            )
+            await self._read(self._child)
+            code = await self._child.wait()
+            wait_s = RESTART_S if self.link else min(2 * wait_s, LONGEST_RESTART_S)
+            self.link = ""
+            log.warning("the panel has ended (%d); starting it again in %.0f s", code, wait_s)
+            await asyncio.sleep(wait_s)
+
+    async def _read(self, child: asyncio.subprocess.Process) -> None:
+        if child.stdout is None:
+            return
+        async for line in child.stdout:
+            text = line.decode(errors="replace").rstrip()
+            if text.startswith(LINK):
+                self.link = text.removeprefix(LINK)
+                log.info("panel: %s", self.link)
+            elif text:
+                log.warning("panel: %s", text)

@@ -1,0 +1,77 @@
+"""The page's telemetry: the newest `Instant` of every aircraft, over a WebSocket of its own.
+
+The browser grants frames, and each one costs a grant: so a slow browser, or one on a slow network,
+gets fewer frames and never old ones, and nothing can queue up here.
+"""
+
+import asyncio
+from contextlib import suppress
+from typing import Final
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from gateway.edges.clock import GatewayClock
+from gateway.panel.state.fleet_picture import FleetPicture
+
+PATH: Final = "/telemetry"
+INTERVAL_S: Final = 0.04
+"""25 frames a second; the browser draws between them."""
+IDLE_S: Final = 0.5
+"""Without news the page is told so at this pace: ages go on."""
+GRANTS: Final = 2
+"""Frames that may be on their way at once."""
+
+
+class TelemetryFeed:
+    """Serves all open pages.
+
+    Parameters
+    ----------
+    fleet : FleetPicture
+        What is told.
+    clock : GatewayClock
+        The panel's clock.
+    """
+
+    def __init__(self, fleet: FleetPicture, clock: GatewayClock) -> None:
+        self._fleet = fleet
+        self._clock = clock
+        self._made = (-1, -1, b"")
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Serve one browser until it leaves."""
+        await socket.accept()
+        grants = asyncio.Semaphore(GRANTS)
+        sending = asyncio.create_task(self._send(socket, grants))
+        with suppress(WebSocketDisconnect, asyncio.CancelledError):
+            while True:
+                await socket.receive_text()
+                if grants._value < GRANTS:  # noqa: SLF001 -- a browser may not save up
+                    grants.release()
+        sending.cancel()
+
+    async def _send(self, socket: WebSocket, grants: asyncio.Semaphore) -> None:
+        version, told_s = -1, 0.0
+        with suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                await grants.acquire()
+                while version == self._fleet.version and told_s < IDLE_S:
+                    await asyncio.sleep(INTERVAL_S)
+                    told_s += INTERVAL_S
+                version, told_s = self._fleet.version, 0.0
+                await socket.send_text(self._frame().decode())
+                await asyncio.sleep(INTERVAL_S)
+
+    def _frame(self) -> bytes:
+        """Encode this moment once for all browsers."""
+        now_us = self._clock()
+        version, made_us, frame = self._made
+        if version != self._fleet.version or now_us - made_us > INTERVAL_S * 1e6:
+            instants = {
+                str(system_id): vehicle.instant(now_us)
+                for system_id, vehicle in self._fleet.vehicles.items()
+            }
+            frame = msgspec.json.encode({"time_us": now_us, "vehicles": instants})
+            self._made = (self._fleet.version, now_us, frame)
+        return frame

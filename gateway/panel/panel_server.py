@@ -1,0 +1,189 @@
+"""The panel's process: builds the parts, serves the page, ends them in order."""
+
+import asyncio
+import hashlib
+import logging
+import os
+import socket
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import ui
+from starlette.requests import Request
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
+
+from gateway.edges.clock import GatewayClock
+from gateway.edges.operator.control_socket import socket_path
+from gateway.panel import feed
+from gateway.panel.control_client import ControlClient
+from gateway.panel.feed import TelemetryFeed
+from gateway.panel.page_guard import ROLE, PageGuard
+from gateway.panel.page_lock import PageLock
+from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.shell import build_page
+from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.uplink import Uplink
+from gateway.panel.view_context import WEB, PanelParts
+
+log = logging.getLogger(__name__)
+
+NICENESS: Final = 5
+"""The gateway goes before its picture."""
+MAX_CONNECTIONS: Final = 256
+
+
+class PanelError(Exception):
+    """The panel cannot be opened; the text says why."""
+
+
+def run_panel(
+    settings: PanelSettings,
+    recordings: Path,
+    connect: str | None,
+    on_link: Callable[[str], None],
+    *,
+    attached: bool = False,
+) -> None:
+    """Serve the page until interrupted.
+
+    Parameters
+    ----------
+    settings : PanelSettings
+        Where and for whom.
+    recordings : Path
+        Folder of the recordings.
+    connect : str or None
+        A MAVLink endpoint; None for the gateway on this machine.
+    on_link : callable
+        Given the page's address once it can be opened.
+    attached : bool
+        Whether to end when the standard input does: the gateway that started us was killed.
+
+    Raises
+    ------
+    PanelError
+        If the port or the certificate cannot be used.
+    """
+    os.nice(NICENESS)
+    sock = _bound(settings)
+    clock, fleet = GatewayClock(), FleetPicture()
+    control = ControlClient(socket_path("run"))
+    uplink = Uplink(connect, fleet, control, clock)
+    parts = PanelParts(settings, recordings, clock, fleet, control, uplink)
+    app = make_app(parts)
+    lock = PageLock(settings.password, settings.viewer_password)
+    config = uvicorn.Config(
+        PageGuard(app, settings, lock),
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=MAX_CONNECTIONS,
+        ws_max_size=1 << 20,
+        timeout_graceful_shutdown=1,
+        ssl_certfile=settings.certificate or None,
+        ssl_keyfile=settings.certificate_key or None,
+    )
+    try:
+        config.load()
+    except OSError as error:
+        raise PanelError(f"certificate {settings.certificate}: {error.strerror}") from error
+    on_open = partial(on_link, _link(settings, sock))
+    asyncio.run(_serve(config, sock, uplink, on_open, attached=attached))
+
+
+def make_app(parts: PanelParts) -> FastAPI:
+    """Build the page and what it fetches."""
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    telemetry = TelemetryFeed(parts.fleet, parts.clock)
+
+    @app.websocket(feed.PATH)
+    async def _telemetry(websocket: WebSocket) -> None:
+        await telemetry.serve(websocket)
+
+    app.mount("/web", StaticFiles(directory=WEB))
+    version = _version_of(WEB)
+
+    @ui.page("/")
+    def _page(request: Request) -> None:
+        build_page(parts, request.scope[ROLE], version)
+
+    ui.run_with(
+        app,
+        title="mavgate",
+        dark=None,
+        favicon=WEB / "icon.svg",
+        show_welcome_message=False,
+        binding_refresh_interval=None,
+        reconnect_timeout=5.0,
+        tailwind=False,
+    )
+    return app
+
+
+async def _serve(
+    config: uvicorn.Config,
+    sock: socket.socket,
+    uplink: Uplink,
+    on_open: Callable[[], None],
+    *,
+    attached: bool,
+) -> None:
+    server = uvicorn.Server(config)
+    if attached:
+        _end_with_input(server)
+    uplink.start()
+    serving = asyncio.create_task(server.serve(sockets=[sock]))
+    while not server.started and not serving.done():
+        await asyncio.sleep(0.01)
+    if server.started:
+        on_open()
+    try:
+        await serving
+    finally:
+        uplink.close()
+
+
+def _end_with_input(server: uvicorn.Server) -> None:
+    loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
+
+    def on_input() -> None:
+        if not os.read(source, 1024):
+            loop.remove_reader(source)
+            server.should_exit = True
+
+    loop.add_reader(source, on_input)
+
+
+def _bound(settings: PanelSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.address else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind((settings.address, settings.port))
+    except OSError as error:
+        sock.close()
+        place = f"{settings.address}:{settings.port}"
+        raise PanelError(f"panel on {place}: {error.strerror}; --port takes another") from error
+    return sock
+
+
+def _link(settings: PanelSettings, sock: socket.socket) -> str:
+    host, port = sock.getsockname()[:2]
+    scheme = "https" if settings.certificate else "http"
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname()
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def _version_of(folder: Path) -> str:
+    """Sum up what browsers may keep, so that they fetch it anew when it has changed."""
+    digest = hashlib.sha256()
+    for file in sorted(folder.iterdir()):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]

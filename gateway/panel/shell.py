@@ -1,0 +1,176 @@
+"""The page itself: its head with aircraft and state, its views, its keys.
+
+A view is one entry of `VIEWS`; see `view_context.py` for what its file must have.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from nicegui import ui
+from nicegui.events import KeyEventArguments
+
+from gateway.panel.state.shown_units import ShownUnits
+from gateway.panel.view_context import PanelParts, Role, ViewContext
+from gateway.panel.views import flight_view
+
+STATE_S: Final = 0.5
+SILENT_S: Final = 3.0
+UNITS: Final = {"metric": "m", "imperial": "mi", "aviation": "kt"}
+THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One view of the page."""
+
+    key: str
+    """Its part of the page's address, behind the hash."""
+    title: str
+    icon: str
+    """Name of a Material icon, which NiceGUI brings along."""
+    build: Callable[[ViewContext], None]
+
+
+VIEWS: Final = (View("flight", "Flight", "flight", flight_view.build),)
+"""In the order of the rail, and of the keys 1 to 9."""
+
+
+def build_page(parts: PanelParts, role: Role, version: str) -> None:
+    """Build the page for one browser.
+
+    Parameters
+    ----------
+    parts : PanelParts
+        What all pages share.
+    role : Role
+        What its user may do.
+    version : str
+        Of the files that the browser keeps.
+    """
+    context = ViewContext(parts, role, ShownUnits(parts.settings.units))
+    ui.add_head_html(f'<link rel="stylesheet" href="/web/panel.css?{version}">')
+    ui.add_head_html(f'<script src="/web/telemetry_bus.js?{version}"></script>')
+    _Page(context).build()
+
+
+class _Page:
+    """The elements of one browser's page."""
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._built: set[str] = set()
+        self._panels: dict[str, ui.element] = {}
+        self._buttons: dict[str, ui.button] = {}
+        self._dark = ui.dark_mode(None)
+        self._shown_ids: list[int] = []
+
+    def build(self) -> None:
+        """Make everything; a view is made when it is shown first."""
+        with ui.element("div").classes("shell"):
+            self._build_head()
+            with ui.element("nav").classes("rail").props('aria-label="Views"'):
+                for number, view in enumerate(VIEWS, 1):
+                    self._build_button(view, number)
+            with ui.element("main").classes("stage"):
+                for view in VIEWS:
+                    panel = ui.element("section").classes("view").props(f"data-view={view.key}")
+                    panel.set_visibility(False)
+                    self._panels[view.key] = panel
+        ui.keyboard(on_key=self._on_key)
+        ui.timer(STATE_S, self._refresh)
+        self._refresh()
+        self.show(VIEWS[0].key)
+        ui.on("view", lambda event: self.show(event.args))
+
+    def show(self, key: str) -> None:
+        """Show one view."""
+        views = {view.key: view for view in VIEWS}
+        if key not in views:
+            return
+        for other, panel in self._panels.items():
+            panel.set_visibility(other == key)
+            self._buttons[other].props(f"aria-current={'page' if other == key else 'false'}")
+        self._context.show(key)
+        if key not in self._built:
+            self._built.add(key)
+            self._context.building(key)
+            with self._panels[key]:
+                views[key].build(self._context)
+
+    def _build_head(self) -> None:
+        with ui.element("header").classes("head"):
+            ui.html('<span class="brand">mavgate</span>', sanitize=False)
+            self._choice = ui.select({}, on_change=self._on_choice).classes("choice")
+            self._choice.props('dense options-dense borderless aria-label="Aircraft"')
+            self._state = ui.element("div").classes("chips").props("role=status")
+            ui.element("div").classes("spring")
+            if self._context.role is Role.VIEWER:
+                ui.label("viewer").classes("chip warn")
+            units = ui.select(
+                {"metric": "metric", "imperial": "imperial", "aviation": "aviation"},
+                value=self._context.units.system,
+                on_change=self._on_units,
+            ).classes("choice")
+            units.props('dense options-dense borderless aria-label="Units"')
+            self._theme = ui.button(icon=THEMES[None], on_click=self._next_theme)
+            self._theme.props('flat round dense aria-label="Light or dark"')
+
+    def _build_button(self, view: View, number: int) -> None:
+        button = ui.button(on_click=partial(self.show, view.key)).props("flat no-caps stack")
+        button.props(f'aria-label="{view.title}" aria-keyshortcuts="{number}"')
+        with button:
+            ui.icon(view.icon)
+            ui.label(view.title)
+        self._buttons[view.key] = button
+
+    def _on_key(self, event: KeyEventArguments) -> None:
+        if not event.action.keydown or event.action.repeat or event.modifiers.ctrl:
+            return
+        key = event.key.name
+        if key.isdecimal() and 0 < int(key) <= len(VIEWS):
+            self.show(VIEWS[int(key) - 1].key)
+        elif key == "t":
+            self._next_theme()
+
+    def _next_theme(self) -> None:
+        order = list(THEMES)
+        self._dark.value = order[(order.index(self._dark.value) + 1) % len(order)]
+        self._theme.props(f"icon={THEMES[self._dark.value]}")
+
+    def _on_units(self, event: Any) -> None:
+        self._context.units.system = event.value
+        ui.run_javascript(f"mavgate.units = {event.value!r}")
+
+    def _on_choice(self, event: Any) -> None:
+        self._context.select(event.value)
+        ui.run_javascript(f"mavgate.select({event.value})")
+
+    def _refresh(self) -> None:
+        fleet, context = self._context.fleet, self._context
+        ids = sorted(fleet.vehicles)
+        if ids != self._shown_ids:
+            self._shown_ids = ids
+            names = {key: f"{fleet.vehicles[key].model.capitalize()} {key}" for key in ids}
+            self._choice.set_options(names)
+            if context.system_id is None and ids:
+                self._choice.value = ids[0]
+        self._state.clear()
+        with self._state:
+            for text, kind in _state_of(context):
+                ui.label(text).classes(f"chip {kind}")
+
+
+def _state_of(context: ViewContext) -> list[tuple[str, str]]:
+    """Sum up the selected aircraft: words and how grave they are."""
+    vehicle = context.vehicle
+    if vehicle is None:
+        return [("waiting for an aircraft", "warn")]
+    now = vehicle.instant(context.now_us)
+    if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
+        return [(f"silent for {now.silent_s:.0f} s", "bad")]
+    has_fix = now.fix_type >= 3
+    fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
+    return [("link", "good"), (fix, "good" if has_fix else "bad")]

@@ -1,0 +1,59 @@
+"""All aircraft that were heard, and who listens to their messages."""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from gateway.panel.state.vehicle_picture import VehiclePicture
+
+AUTOPILOT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: what a camera of the same system says is not of its flight."""
+FIRST_GROUND_STATION: Final = 250
+MAX_VEHICLES: Final = 32
+"""More are forged; each may take some MB."""
+
+Listener = Callable[[int, Any, int], None]
+"""Given system id, decoded message and time in µs on the panel's clock."""
+
+
+class FleetPicture:
+    """What came over MAVLink, by system id."""
+
+    def __init__(self) -> None:
+        self.vehicles: dict[int, VehiclePicture] = {}
+        self.version = 0
+        """Counts the messages, so that a reader knows whether there is anything new."""
+        self._listeners: list[Listener] = []
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Have every message of every aircraft handed on, until the returned function is called."""
+        self._listeners.append(listener)
+
+        def leave() -> None:
+            if listener in self._listeners:
+                self._listeners.remove(listener)
+
+        return leave
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one decoded message of anybody.
+
+        Parameters
+        ----------
+        message : MAVLink_message
+            As pymavlink decodes it; those of ground stations and of other components are left
+            aside.
+        now_us : int
+            The panel's clock.
+        """
+        system_id = message.get_srcSystem()
+        if message.get_srcComponent() != AUTOPILOT or not 0 < system_id < FIRST_GROUND_STATION:
+            return
+        vehicle = self.vehicles.get(system_id)
+        if vehicle is None:
+            if len(self.vehicles) >= MAX_VEHICLES:
+                return
+            vehicle = self.vehicles[system_id] = VehiclePicture(system_id)
+        vehicle.take(message, now_us)
+        self.version += 1
+        for listener in self._listeners:
+            listener(system_id, message, now_us)

@@ -1,0 +1,61 @@
+"""One moment of one aircraft, in SI units: what the browser draws, 25 times a second."""
+
+import msgspec
+
+from gateway.records import NAN
+
+
+class Spot(msgspec.Struct, frozen=True):
+    """A place on earth; NaN where its height is not known."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float = NAN
+
+
+class Instant(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of an aircraft at one moment.
+
+    Everything is the newest that came over MAVLink, whoever sent it; NaN (null in the browser) is
+    not known.
+    """
+
+    system_id: int
+    time_us: int
+    """When the newest attitude or position came, on the panel's clock."""
+    model: str
+    """`plane`, `copter`, `heli`, `rover`, `boat` or `none`; see `VehiclePicture`."""
+    silent_s: float
+    """Since the newest heartbeat."""
+    q_nb: tuple[float, float, float, float]
+    """Attitude, scalar first, body FRD to NED."""
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    rate_b_radps: tuple[float, float, float]
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    alt_home_m: float
+    """Above home."""
+    vel_n_mps: tuple[float, float, float]
+    groundspeed_mps: float
+    airspeed_mps: float
+    climb_mps: float
+    heading_deg: float
+    pos_std_m: float
+    """Horizontal standard deviation of the position, root of the sum of both axes."""
+    fix_type: int
+    """GPS_FIX_TYPE; 0 without a GPS."""
+    satellites: int
+    fix: Spot | None
+    """Newest GPS fix of two dimensions or more."""
+    home: Spot | None
+    mark: Spot | None
+    mark_distance_m: float
+    mark_bearing_deg: float
+    armed: bool
+    mode: int
+    """`custom_mode` of the heartbeat."""
+    battery_v: float
+    battery_percent: float

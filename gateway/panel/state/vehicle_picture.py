@@ -1,0 +1,232 @@
+"""What one aircraft told over MAVLink: the newest of each message, its path, its texts."""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import pymap3d.vincenty as vincenty
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.geometry.quaternion import from_euler, to_euler
+from gateway.panel.state.instant import Instant, Spot
+from gateway.panel.state.status_texts import StatusTexts
+from gateway.records import NAN, UNKNOWN_VEC3
+from gateway.units import US_PER_S
+
+DEGE7: Final = 1e7
+MM: Final = 1e3
+CM: Final = 1e2
+UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
+
+MAX_TRACK: Final = 20_000
+"""Points of a path: more than an hour at 5 Hz; the oldest go."""
+TRACK_INTERVAL_US: Final = 200_000
+ATTITUDE_FRESH_US: Final = US_PER_S
+"""The quaternion is taken before the angles unless it is older than this."""
+
+PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
+COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
+OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat", 12: "boat"}
+
+
+@dataclass(frozen=True, slots=True)
+class PathPoint:
+    """One point of a path."""
+
+    time_us: int
+    """On the panel's clock."""
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+
+
+class VehiclePicture:
+    """Everything that the page knows of one system.
+
+    Parameters
+    ----------
+    system_id : int
+        MAVLink system.
+    """
+
+    def __init__(self, system_id: int) -> None:
+        self.system_id = system_id
+        self.newest: dict[str, Any] = {}
+        """The newest message of its autopilot by name, as pymavlink decodes it."""
+        self.heard_us: dict[str, int] = {}
+        """When that came, on the panel's clock in µs."""
+        self.track: deque[PathPoint] = deque(maxlen=MAX_TRACK)
+        """Fused positions, a few a second."""
+        self.fixes: deque[PathPoint] = deque(maxlen=MAX_TRACK)
+        """GPS fixes."""
+        self.texts = StatusTexts()
+        """STATUSTEXT, the newest last."""
+        self.told_mark: Spot | None = None
+        """The mark as the gateway's control socket tells it, exact where MAVLink is rounded."""
+        self._moved_us = 0
+        self._takers: dict[str, Callable[[Any, int], None]] = {
+            "STATUSTEXT": self.texts.take,
+            "GLOBAL_POSITION_INT": self._take_position,
+            "GPS_RAW_INT": self._take_fix,
+            "ATTITUDE": self._note_motion,
+            "ATTITUDE_QUATERNION": self._note_motion,
+        }
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one decoded message of this system's autopilot.
+
+        Parameters
+        ----------
+        message : MAVLink_message
+            As pymavlink decodes it.
+        now_us : int
+            The panel's clock.
+        """
+        name = message.get_type()
+        self.newest[name] = message
+        self.heard_us[name] = now_us
+        if taker := self._takers.get(name):
+            taker(message, now_us)
+
+    def silent_s(self, now_us: int) -> float:
+        """Tell how long no heartbeat came; infinite if none ever did."""
+        heard_us = self.heard_us.get("HEARTBEAT")
+        return math.inf if heard_us is None else (now_us - heard_us) / US_PER_S
+
+    @property
+    def model(self) -> str:
+        """What it looks like: `plane`, `copter`, `heli`, `rover`, `boat`, `balloon`, `none`."""
+        heartbeat = self.newest.get("HEARTBEAT")
+        kind = -1 if heartbeat is None else heartbeat.type
+        if kind in PLANES:
+            return "plane"
+        return "copter" if kind in COPTERS else OTHERS.get(kind, "none")
+
+    @property
+    def home(self) -> Spot | None:
+        """Home, if it was told."""
+        message = self.newest.get("HOME_POSITION")
+        if message is None:
+            return None
+        return Spot(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
+
+    def instant(self, now_us: int) -> Instant:
+        """Put together what is known at this moment."""
+        get, roll_pitch_yaw, q_nb, rates = self.newest.get, *self._attitude()
+        place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
+        heartbeat, fix, status = get("HEARTBEAT"), get("GPS_RAW_INT"), get("SYS_STATUS")
+        mark, distance_m, bearing_deg = self._mark()
+        return Instant(
+            system_id=self.system_id,
+            time_us=self._moved_us,
+            model=self.model,
+            silent_s=self.silent_s(now_us),
+            q_nb=q_nb,
+            roll_rad=roll_pitch_yaw[0],
+            pitch_rad=roll_pitch_yaw[1],
+            yaw_rad=roll_pitch_yaw[2],
+            rate_b_radps=rates,
+            lat_deg=place.lat / DEGE7 if place else NAN,
+            lon_deg=place.lon / DEGE7 if place else NAN,
+            alt_amsl_m=place.alt / MM if place else (hud.alt if hud else NAN),
+            alt_home_m=place.relative_alt / MM if place else NAN,
+            vel_n_mps=(place.vx / CM, place.vy / CM, place.vz / CM) if place else UNKNOWN_VEC3,
+            groundspeed_mps=hud.groundspeed if hud else NAN,
+            airspeed_mps=hud.airspeed if hud else NAN,
+            climb_mps=hud.climb if hud else NAN,
+            heading_deg=_heading_deg(place, hud),
+            pos_std_m=self._pos_std_m(),
+            fix_type=fix.fix_type if fix else 0,
+            satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else 0,
+            fix=_spot_of_fix(fix),
+            home=self.home,
+            mark=mark,
+            mark_distance_m=distance_m,
+            mark_bearing_deg=bearing_deg,
+            armed=bool(heartbeat and heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+            mode=heartbeat.custom_mode if heartbeat else 0,
+            battery_v=_known(status and status.voltage_battery, 65535) / 1000,
+            battery_percent=_known(status and status.battery_remaining, -1),
+        )
+
+    def _attitude(
+        self,
+    ) -> tuple[
+        tuple[float, float, float],
+        tuple[float, float, float, float],
+        tuple[float, float, float],
+    ]:
+        quaternion, angles = self.newest.get("ATTITUDE_QUATERNION"), self.newest.get("ATTITUDE")
+        age_us = self.heard_us.get("ATTITUDE", 0) - self.heard_us.get("ATTITUDE_QUATERNION", 0)
+        if quaternion is not None and age_us < ATTITUDE_FRESH_US:
+            q_nb = (quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4)
+            return to_euler(q_nb), q_nb, _rates(quaternion)
+        if angles is None:
+            return UNKNOWN_VEC3, UNKNOWN_QUAT, UNKNOWN_VEC3
+        euler = (angles.roll, angles.pitch, angles.yaw)
+        return euler, from_euler(*euler), _rates(angles)
+
+    def _pos_std_m(self) -> float:
+        """Tell the position's standard deviation: the estimator's, or what the GPS claims."""
+        estimator, fix = self.newest.get("ESTIMATOR_STATUS"), self.newest.get("GPS_RAW_INT")
+        if estimator and math.isfinite(estimator.pos_horiz_accuracy):
+            return float(estimator.pos_horiz_accuracy)
+        return fix.h_acc / MM if fix and fix.h_acc else NAN
+
+    def _mark(self) -> tuple[Spot | None, float, float]:
+        """Tell the mark, and the way to it as the aircraft itself measures it."""
+        way, place = (
+            self.newest.get("NAV_CONTROLLER_OUTPUT"),
+            self.newest.get("GLOBAL_POSITION_INT"),
+        )
+        if way is None or place is None or not way.wp_dist:
+            return self.told_mark, NAN, NAN
+        bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
+        if self.told_mark is not None:
+            return self.told_mark, distance_m, bearing_deg
+        lat_deg, lon_deg = vincenty.vreckon(
+            place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
+        )
+        lon_deg = (float(lon_deg) + 180.0) % 360.0 - 180.0
+        return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
+
+    def _note_motion(self, _message: Any, now_us: int) -> None:
+        self._moved_us = now_us
+
+    def _take_position(self, message: Any, now_us: int) -> None:
+        self._moved_us = now_us
+        if self.track and now_us - self.track[-1].time_us < TRACK_INTERVAL_US:
+            return
+        self.track.append(
+            PathPoint(now_us, message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
+        )
+
+    def _take_fix(self, message: Any, now_us: int) -> None:
+        spot = _spot_of_fix(message)
+        if spot is None:
+            return
+        last = self.fixes[-1] if self.fixes else None
+        if last is None or (last.lat_deg, last.lon_deg) != (spot.lat_deg, spot.lon_deg):
+            self.fixes.append(PathPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
+
+
+def _rates(message: Any) -> tuple[float, float, float]:
+    return (message.rollspeed, message.pitchspeed, message.yawspeed)
+
+
+def _known(value: float | None, unknown: int) -> float:
+    return NAN if value is None or value == unknown else float(value)
+
+
+def _heading_deg(place: Any, hud: Any) -> float:
+    if place is not None and place.hdg != 65535:
+        return float(place.hdg / CM)
+    return float(hud.heading % 360) if hud is not None else NAN
+
+
+def _spot_of_fix(message: Any) -> Spot | None:
+    if message is None or message.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
+        return None
+    return Spot(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)

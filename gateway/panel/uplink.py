@@ -1,0 +1,236 @@
+"""The panel's MAVLink connection: one more client of the gateway, or of any other vehicle.
+
+It stands on the hub, which knows every transport and opens again what breaks. With a URL it
+connects there. Without one it asks the gateway on this machine, over the control socket, for a
+listening port of the panel's own on loopback, and again whenever that falls silent: so a gateway
+that was started anew is found anew.
+"""
+
+import asyncio
+import logging
+import os
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub.hub import Hub
+from gateway.edges.operator.control_socket import ControlError
+from gateway.panel.control_client import ControlClient
+from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.records import Incoming, Outgoing
+from gateway.routing.hub_settings import HubSettings
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import message_id_of
+
+log = logging.getLogger(__name__)
+
+SYSTEM_ID: Final = 253
+FIRST_COMPONENT: Final = 25
+USER_COMPONENTS: Final = 75
+"""MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
+AUTOPILOT: Final = 1
+HEARTBEAT_S: Final = 1.0
+SILENT_US: Final = 3 * US_PER_S
+ACK_TIMEOUT_S: Final = 1.5
+ATTEMPTS: Final = 3
+
+LOCAL_NAME: Final = "panel"
+LOCAL_URL: Final = f"udp-listen:127.0.0.1:0?name={LOCAL_NAME}"
+PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
+"""Where a player that the panel starts sends its frames."""
+
+
+class CommandFailedError(Exception):
+    """A command was refused, or not answered; the text says which."""
+
+
+class Uplink:
+    """Frames in, requests out.
+
+    Parameters
+    ----------
+    url : str or None
+        An endpoint as the settings write it; None for the gateway on this machine.
+    fleet : FleetPicture
+        Given every message.
+    control : ControlClient
+        Tells where the gateway on this machine listens.
+    clock : GatewayClock
+        The panel's clock.
+    """
+
+    def __init__(
+        self, url: str | None, fleet: FleetPicture, control: ControlClient, clock: GatewayClock
+    ) -> None:
+        endpoints = (PLAYBACK_URL,) if url is None else (_trusting(url), PLAYBACK_URL)
+        self.is_local = url is None
+        self._fleet = fleet
+        self._control = control
+        self._clock = clock
+        self._mav: Any = mavlink.MAVLink(
+            None, SYSTEM_ID, FIRST_COMPONENT + os.getpid() % USER_COMPONENTS
+        )
+        self._hub = Hub(
+            HubSettings(endpoints=endpoints), self._on_frame, clock, on_foreign=self._on_foreign
+        )
+        self._heard: bytes | None = None
+        self._heard_us = -SILENT_US
+        self._local = ""
+        self._acks: dict[tuple[int, int], asyncio.Future[int]] = {}
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Connect; needs a running event loop. What is not there yet is tried again."""
+        self._hub.start()
+        self._task = asyncio.get_running_loop().create_task(self._keep_alive())
+
+    def close(self) -> None:
+        """End the connection."""
+        if self._task is not None:
+            self._task.cancel()
+        self._hub.close()
+
+    @property
+    def playback_port(self) -> int:
+        """Loopback port that takes the frames of a player; 0 while it is not open."""
+        return self._hub.listening_ports()[-1] if self._hub.listening_ports() else 0
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether anything was heard in the last seconds."""
+        return self._clock() - self._heard_us < SILENT_US
+
+    def send(self, message: Any) -> None:
+        """Send one message; whoever it is for is in its own fields."""
+        frame = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        self._hub.send(Outgoing(frame, message.get_msgId()))
+
+    async def command(self, system_id: int, number: int, *params: float) -> None:
+        """Have a command carried out, and wait until it is acknowledged.
+
+        Parameters
+        ----------
+        system_id : int
+            The aircraft.
+        number : int
+            MAV_CMD.
+        *params : float
+            Up to seven; the others are 0.
+
+        Raises
+        ------
+        CommandFailedError
+            If it is refused, or nobody answers.
+        """
+        filled = (*params, *(0.0,) * (7 - len(params)))
+        message = mavlink.MAVLink_command_long_message(
+            system_id, AUTOPILOT, number, 0, *(float(value) for value in filled)
+        )
+        await self._until_acknowledged(system_id, number, message)
+
+    async def command_at(
+        self, system_id: int, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
+    ) -> None:
+        """Have a command carried out that is about a place; raises as `command`."""
+        message = mavlink.MAVLink_command_int_message(
+            system_id,
+            AUTOPILOT,
+            mavlink.MAV_FRAME_GLOBAL,
+            number,
+            *(0, 0, 0.0, 0.0, 0.0, 0.0),
+            round(lat_deg * 1e7),
+            round(lon_deg * 1e7),
+            alt_amsl_m,
+        )
+        await self._until_acknowledged(system_id, number, message)
+
+    async def _until_acknowledged(self, system_id: int, number: int, message: Any) -> None:
+        name = mavlink.enums["MAV_CMD"][number].name if number in mavlink.enums["MAV_CMD"] else ""
+        answer = asyncio.get_running_loop().create_future()
+        self._acks[system_id, number] = answer
+        try:
+            for _ in range(ATTEMPTS):
+                self.send(message)
+                try:
+                    async with asyncio.timeout(ACK_TIMEOUT_S):
+                        result = await asyncio.shield(answer)
+                except TimeoutError:
+                    continue
+                if result != mavlink.MAV_RESULT_ACCEPTED:
+                    word = mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")
+                    raise CommandFailedError(f"{name or number}: {word.lower().replace('_', ' ')}")
+                return
+        finally:
+            self._acks.pop((system_id, number), None)
+        raise CommandFailedError(f"{name or number}: aircraft {system_id} does not answer")
+
+    def _on_foreign(self, frame: bytes) -> None:
+        # A broadcast comes both to us and past us.
+        if frame is not self._heard:
+            self._take(frame)
+
+    def _on_frame(self, incoming: Incoming) -> None:
+        self._heard = incoming.frame
+        self._take(incoming.frame)
+
+    def _take(self, frame: bytes) -> None:
+        try:
+            message = self._mav.decode(bytearray(frame))
+        except mavlink.MAVError:
+            log.debug("message %d cannot be decoded", message_id_of(frame))
+            return
+        now_us = self._clock()
+        if message.get_srcSystem() != SYSTEM_ID:
+            self._heard_us = now_us
+        if message.get_type() == "COMMAND_ACK":
+            self._note_ack(message)
+        self._fleet.take(message, now_us)
+
+    def _note_ack(self, message: Any) -> None:
+        waiting = self._acks.get((message.get_srcSystem(), message.command))
+        in_progress = message.result == mavlink.MAV_RESULT_IN_PROGRESS
+        if waiting is not None and not waiting.done() and not in_progress:
+            waiting.set_result(message.result)
+
+    async def _keep_alive(self) -> None:
+        beat = mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+        )
+        while True:
+            if self.is_local and not self.is_alive:
+                await self._find_gateway()
+            self.send(beat)
+            await asyncio.sleep(HEARTBEAT_S)
+
+    async def _find_gateway(self) -> None:
+        """Ask the gateway on this machine for a port of the panel's own, and speak to it."""
+        try:
+            port = await self._local_port()
+        except ControlError as error:
+            log.debug("no gateway yet: %s", error)
+            return
+        url = f"udp:127.0.0.1:{port}?name=gateway"
+        if not port or url == self._local:
+            return
+        if self._local:
+            self._hub.remove(self._local)
+        self._hub.add(url)
+        self._local = url
+
+    async def _local_port(self) -> int:
+        for _ in range(2):
+            status = await self._control.ask("status")
+            for listener in status["listeners"]:
+                if listener["name"] == LOCAL_NAME:
+                    return int(listener["port"])
+            await self._control.ask("clients.add", url=LOCAL_URL)
+        return 0
+
+
+def _trusting(url: str) -> str:
+    """Listen to whoever speaks there: the operator has named the place."""
+    if "trusted=" in url:
+        return url
+    return f"{url}{'&' if '?' in url else '?'}trusted=yes"

@@ -1,0 +1,179 @@
+"""What every view of the page is given: the aircraft, a way to ask for things, units, the role.
+
+A view is a file in `gateway/panel/views/` with a function `build(context: ViewContext) -> None`
+that makes its NiceGUI elements where it is called, inside the tab's panel; `shell.py` lists them.
+One `ViewContext` belongs to one open page (browser tab).
+
+Two ways lead from the aircraft to the screen:
+
+*What moves* is drawn in the browser. The page opens one WebSocket (`feed.py`), over which the
+`Instant` of every aircraft comes up to 25 times a second, and hands it to `window.mavgate`:
+
+    const stop = mavgate.subscribe((state) => { ... });   // state: newest Instant, by its names
+    mavgate.state          the selected aircraft's newest, or null
+    mavgate.vehicles       all, by system id
+    mavgate.units          "metric" | "imperial" | "aviation"
+    mavgate.show(quantity, value)   -> [text, unit]   quantity: "speed", "length", "climb", …
+
+so a Vue component (a JavaScript file in `gateway/panel/web/`, a Python class beside the view with
+`class Horizon(Element, component=WEB / "horizon.js")`) subscribes in `mounted()`, stops in
+`unmounted()`, and draws in `requestAnimationFrame`; nothing of it passes through NiceGUI.
+
+*What stands still* (tables, texts, buttons) is NiceGUI: read `context.vehicle` in a callback of
+`context.every(seconds, callback)`, which runs only while the view's tab is the one shown.
+
+Colours and sizes are the CSS variables of `web/panel.css` (`--ink`, `--paper`, `--accent`, `--sky`,
+…), which light and dark set; use no others.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+from nicegui import ui
+
+from gateway.edges.clock import GatewayClock
+from gateway.panel.control_client import READING, ControlClient
+from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.shown_units import ShownUnits
+from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.panel.uplink import Uplink
+
+WEB: Final = Path(__file__).parent / "web"
+"""The components' JavaScript and the style sheet."""
+
+
+class Role(StrEnum):
+    """What a page's user may do."""
+
+    OPERATOR = "operator"
+    VIEWER = "viewer"
+
+
+class NotAllowedError(Exception):
+    """A viewer asked for a change."""
+
+
+@dataclass(frozen=True)
+class PanelParts:
+    """What all pages share."""
+
+    settings: PanelSettings
+    recordings: Path
+    """Folder of the recordings, of a gateway that runs on this machine."""
+    clock: GatewayClock
+    fleet: FleetPicture
+    control: ControlClient
+    uplink: Uplink
+
+
+@dataclass(eq=False)
+class ViewContext:
+    """One open page."""
+
+    parts: PanelParts
+    role: Role
+    units: ShownUnits
+    shown: str = ""
+    """Key of the view that is shown."""
+    system_id: int | None = None
+    """The selected aircraft."""
+    _building: str = ""
+    _on_select: list[Callable[[], None]] = field(default_factory=list)
+    _on_show: dict[str, list[Callable[[], None]]] = field(default_factory=dict)
+
+    @property
+    def fleet(self) -> FleetPicture:
+        """All aircraft."""
+        return self.parts.fleet
+
+    @property
+    def vehicle(self) -> VehiclePicture | None:
+        """The selected aircraft; None before any was heard."""
+        return None if self.system_id is None else self.fleet.vehicles.get(self.system_id)
+
+    @property
+    def now_us(self) -> int:
+        """The panel's clock, which all times of the pictures are on."""
+        return self.parts.clock()
+
+    @property
+    def may_change(self) -> bool:
+        """Whether buttons that change something are of use here."""
+        return self.role is Role.OPERATOR
+
+    def send(self, message: Any) -> None:
+        """Send one MAVLink message; raises NotAllowedError for a viewer."""
+        self.check_may_change()
+        self.parts.uplink.send(message)
+
+    async def command(self, number: int, *params: float) -> None:
+        """Have the selected aircraft carry out a MAV_CMD.
+
+        Raises
+        ------
+        CommandFailedError
+            If it is refused, or nobody answers.
+        NotAllowedError
+            For a viewer.
+        """
+        self.check_may_change()
+        await self.parts.uplink.command(self.system_id or 0, number, *params)
+
+    async def command_at(
+        self, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
+    ) -> None:
+        """Have the selected aircraft carry out a MAV_CMD about a place; raises as `command`."""
+        self.check_may_change()
+        uplink = self.parts.uplink
+        await uplink.command_at(self.system_id or 0, number, lat_deg, lon_deg, alt_amsl_m)
+
+    async def ask(self, verb: str, **params: Any) -> Any:
+        """Ask the gateway over its control socket; see docs/control.md.
+
+        Raises
+        ------
+        ControlError
+            If there is none, or it refuses.
+        NotAllowedError
+            For a viewer who asks for a change.
+        """
+        if verb not in READING:
+            self.check_may_change()
+        return await self.parts.control.ask(verb, **params)
+
+    def check_may_change(self) -> None:
+        """Raise NotAllowedError for a viewer: buttons may be hidden, requests can be forged."""
+        if not self.may_change:
+            raise NotAllowedError("you are logged in as a viewer, who may look and not touch")
+
+    def every(self, seconds: float, callback: Callable[[], Any]) -> None:
+        """Call something again and again while the view that is being built is shown."""
+        key = self._building
+
+        def tick() -> Any:
+            return callback() if key in ("", self.shown) else None
+
+        ui.timer(seconds, tick)
+        self._on_show.setdefault(key, []).append(callback)
+
+    def on_select(self, callback: Callable[[], None]) -> None:
+        """Call something whenever another aircraft is selected."""
+        self._on_select.append(callback)
+
+    def building(self, key: str) -> None:
+        """Note which view is being built."""
+        self._building = key
+
+    def show(self, key: str) -> None:
+        """Note which view is shown now."""
+        self.shown = key
+
+    def select(self, system_id: int | None) -> None:
+        """Select another aircraft."""
+        self.system_id = system_id
+        for callback in self._on_select:
+            callback()
