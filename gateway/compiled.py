@@ -36,13 +36,13 @@ def _files(dispatcher: object) -> Any:
 
 
 def is_kept(function: Callable[..., object]) -> bool:
-    """Tell whether machine code of the present source is kept; also where none is ever made."""
+    """Return whether machine code of the present source is kept; also where none is ever made."""
     files = _files(function)
     return files is None or bool(files._load_index())  # noqa: SLF001
 
 
 def _borrowed(names: dict[str, Any]) -> Iterator[tuple[str, object]]:
-    """Tell what machine code may hold of other files: their constants, and what they compile."""
+    """Return what machine code may hold of other files: their constants, and what they compile."""
     for name, value in names.items():
         if isinstance(value, ModuleType):
             yield from ((n, v) for n, v in vars(value).items() if isinstance(v, int | float))
@@ -119,6 +119,6 @@ if record_at is _record_at:
 
 
 def address_of(record: object) -> int:
-    """Tell where a record lies in memory; it stays there as long as the record lives."""
+    """Return where a record lies in memory; it stays there as long as the record lives."""
     address: int = cast(Any, record).__array_interface__["data"][0]
     return address

@@ -229,6 +229,6 @@ class Pipeline:
         return actions
 
     def next_due_us(self) -> int:
-        """Tell when `poll` is to be called next, at the latest."""
+        """Return when `poll` is to be called next, at the latest."""
         due = [aircraft.vehicle.next_due_us() for aircraft in self.aircraft.values()]
         return min([self._report_due_us, *due])

@@ -102,7 +102,7 @@ def records_of(row: TableRow) -> list[BaroRaw | GpsFix | ImuRaw | ImuCalibrated]
 
 
 def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
-    """Tell what a table must say of the settings so that it can be fused again.
+    """Return what a table must say of the settings so that it can be fused again.
 
     Parameters
     ----------

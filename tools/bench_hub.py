@@ -154,14 +154,14 @@ def udp_socket() -> socket.socket:
 
 
 def cpu_ns(pid: int) -> int:
-    """Tell how long a process has been on a processor."""
+    """Return how long a process has been on a processor."""
     return sum(
         int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")
     )
 
 
 def resident_kib(pid: int) -> int:
-    """Tell how much memory a process has in use."""
+    """Return how much memory a process has in use."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0])
 

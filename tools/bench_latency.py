@@ -77,13 +77,13 @@ def frames(rate_hz: int) -> Iterator[bytes]:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Tell how much CPU time a process has used."""
+    """Return how much CPU time a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
 
 
 def is_answer(datagram: bytes) -> bool:
-    """Tell whether a datagram is what one IMU frame becomes."""
+    """Return whether a datagram is what one IMU frame becomes."""
     if len(datagram) == QUATERNION_SIZE and datagram[0] == 0:
         return True
     message_id = int.from_bytes(datagram[7:10], "little")

@@ -235,7 +235,7 @@ def score(flight: Flight, name: str, run: Run) -> Scores:
 
 
 def targets_for(flight: str, name: str, board: dict[str, Scores]) -> Scores:
-    """Tell what a row is to reach."""
+    """Return what a row is to reach."""
     found = dict(TARGETS.get((flight, name), {}))
     if flight.startswith("broad") and name in ("complementary", "eskf") and "vqf" in board:
         found |= {key: board["vqf"][key] for key in ("total",)}

@@ -73,7 +73,7 @@ def corrupt(frame: bytes, share: float, burst: int, rng: np.random.Generator) ->
 
 
 def resident_kib() -> int:
-    """Tell how much memory this process holds."""
+    """Return how much memory this process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") // 1024
 

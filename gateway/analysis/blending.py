@@ -157,7 +157,7 @@ def with_weights(fusion: FusionSettings, alpha: float, beta: float) -> FusionSet
 
 
 def grows(table: pd.DataFrame, column: str) -> bool:
-    """Tell whether an error grows with alpha and with beta, row by row and column by column."""
+    """Return whether an error grows with alpha and with beta, row by row and column by column."""
     grid = table.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
     return bool(np.all(np.diff(grid, axis=0) > 0.0) and np.all(np.diff(grid, axis=1) > 0.0))
 

@@ -81,7 +81,7 @@ def _received(settings: SimulatorSettings, duration_s: float) -> Iterator[RawRec
 
 
 def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
-    """Tell the calibration that undoes the simulated sensors' constant errors."""
+    """Return the calibration that undoes the simulated sensors' constant errors."""
     return msgspec.convert(errors, NodeCalibration, from_attributes=True)
 
 

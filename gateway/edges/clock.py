@@ -10,10 +10,10 @@ class GatewayClock:
         self._start_ns = time.monotonic_ns()
 
     def __call__(self) -> int:
-        """Tell the gateway time in µs."""
+        """Return the gateway time in µs."""
         return (time.monotonic_ns() - self._start_ns) // 1000
 
 
 def unix_time_us() -> int:
-    """Tell the machine's civil time in µs since 1970; it may jump when the machine learns it."""
+    """Return the machine's civil time in µs since 1970; it may jump when the machine learns it."""
     return time.time_ns() // 1000

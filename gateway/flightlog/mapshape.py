@@ -17,7 +17,7 @@ class TrackPoint:
     """One point of a track."""
 
     time_us: int
-    """µs since 1970, or since the begin where civil time is not known."""
+    """µs since 1970, or since the start where civil time is not known."""
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float

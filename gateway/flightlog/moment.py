@@ -15,7 +15,7 @@ class Moment:
     """A moment of a recording; exactly one of the two is set."""
 
     offset_s: float | None = None
-    """From the begin, or from here if `relative`."""
+    """From the start, or from here if `relative`."""
     relative: bool = False
     time_us: int | None = None
     """Civil time in µs since 1970."""
@@ -27,7 +27,7 @@ def parse_moment(text: str) -> Moment:
     Parameters
     ----------
     text : str
-        Seconds, `minutes:seconds` or `hours:minutes:seconds` from the begin; with a sign, from
+        Seconds, `minutes:seconds` or `hours:minutes:seconds` from the start; with a sign, from
         here; or a date and time as ISO 8601 has it, in UTC where it names no zone.
 
     Returns

@@ -12,7 +12,7 @@ tracks. At infinite speed everything is due at once and the owner's batch size s
 | ------- | --------------------------------------- | ----------------------------------- |
 | playing | takes effect from here                  | loop: seek to its begin; else ended |
 | paused  | resume: playing; step: so many frames   | stays paused                        |
-| ended   | seek: playing; resume: from the begin   |                                     |
+| ended   | seek: playing; resume: from the start   |                                     |
 """
 
 import math
@@ -123,7 +123,7 @@ class Player:
             self.state = PlayState.PAUSED
 
     def resume(self, now_us: int) -> None:
-        """Go on from where it was held; from the begin after the end."""
+        """Go on from where it was held; from the start after the end."""
         if self.state is PlayState.ENDED:
             self.seek(self.begin_us, now_us)
         elif self.state is PlayState.PAUSED:
@@ -169,7 +169,7 @@ class Player:
             self.state = PlayState.PLAYING
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` is to be called next; None while nothing will be due by itself."""
+        """Return when `poll` is to be called next; None while nothing will be due by itself."""
         if self._context:
             return self._anchor[0]
         if self.state is not PlayState.PLAYING:
@@ -233,7 +233,7 @@ class Player:
             self.state = PlayState.ENDED
 
     def _time_at(self, now_us: int) -> int:
-        """Tell the recorded time of a moment while playing, never beyond the next frame."""
+        """Return the recorded time of a moment while playing, never beyond the next frame."""
         anchor_now_us, anchor_time_us = self._anchor
         if self.state is not PlayState.PLAYING:
             return anchor_time_us

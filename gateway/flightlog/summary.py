@@ -147,7 +147,7 @@ class TlogSummary:
             self._add_position(batch, i)
 
     def result(self, size: int) -> FileInfo:
-        """Tell what was found in a file of that size."""
+        """Return what was found in a file of that size."""
         index = self._index
         duration_s = ((index.last_us or 0) - (index.first_us or 0)) / US_PER_S
         return FileInfo(
@@ -217,7 +217,7 @@ class TableSummary:
                     self._damaged_bytes += event.size
 
     def result(self, size: int) -> FileInfo:
-        """Tell what was found in a file of that size."""
+        """Return what was found in a file of that size."""
         duration_s = ((self._last_us or 0) - (self._first_us or 0)) / US_PER_S
         vehicle = VehicleInfo(
             system_id=self._header.vehicle_id if self._header else 1,

@@ -64,7 +64,7 @@ def determinant(matrix: Matrix3) -> float:
 
 
 def is_rotation(matrix: Matrix3, tolerance: float = 1e-3) -> bool:
-    """Tell whether the rows are of length one, at right angles and right-handed.
+    """Return whether the rows are of length one, at right angles and right-handed.
 
     Parameters
     ----------

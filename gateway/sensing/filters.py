@@ -83,7 +83,7 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
 
 
 def gain_at_rest(c: Coefficients) -> float:
-    """Tell the gain at 0 Hz."""
+    """Return the gain at 0 Hz."""
     return (c[0] + c[1] + c[2]) / (1.0 + c[3] + c[4])
 
 

@@ -104,7 +104,7 @@ def missing_sides(samples: Sequence[NodeSamples]) -> list[str]:
 
 
 def is_still(samples: NodeSamples) -> bool:
-    """Tell whether the node lay still for at least a moment."""
+    """Return whether the node lay still for at least a moment."""
     return bool(still_windows(samples))
 
 

@@ -271,7 +271,7 @@ def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
 
 
 def level_residual_deg(mounting: Matrix3, level: Vec3) -> float:
-    """Tell by what angle a level pose seems tilted under a mounting."""
+    """Return by what angle a level pose seems tilted under a mounting."""
     force_b = np.array(mounting) @ np.array(level)
     return _angle_deg(force_b, np.array([0.0, 0.0, -1.0]))
 

@@ -130,7 +130,7 @@ def _runs(windows: list[slice]) -> list[list[slice]]:
 
 
 def _turns(samples: NodeSamples, span: slice) -> bool:
-    """Tell whether the field turned; without a magnetometer nobody knows."""
+    """Return whether the field turned; without a magnetometer nobody knows."""
     begin_s, end_s = samples.time_s[span.start], samples.time_s[span.stop - 1]
     within: NDArray[np.bool_] = (samples.mag_time_s >= begin_s) & (samples.mag_time_s <= end_s)
     if int(within.sum()) < MIN_FIELD_SAMPLES:

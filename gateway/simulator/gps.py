@@ -187,7 +187,7 @@ def _sees_sky(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) ->
 
 
 def _settling(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) -> FloatArray:
-    """Tell by what factor the accuracies are worse since the fix came back."""
+    """Return by what factor the accuracies are worse since the fix came back."""
     factor = 1.0 + SETTLING_FACTOR * _decay(valid_s - first_fix_s)
     for start_s, length_s in outages_s:
         factor += SETTLING_FACTOR * _decay(valid_s % FLIGHT_S - start_s - length_s)

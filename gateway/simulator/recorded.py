@@ -327,7 +327,7 @@ def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
 
 
 def _complete(vectors: FloatArray) -> BoolArray:
-    """Tell which rows have no NaN."""
+    """Return which rows have no NaN."""
     return np.asarray(np.isfinite(vectors).all(axis=1))
 
 

@@ -66,11 +66,11 @@ class DeviceClock:
     skew_ppm: float
 
     def at(self, time_s: float) -> int:
-        """Tell what the clock shows at a true time, in whole µs, not wrapped."""
+        """Return what the clock shows at a true time, in whole µs, not wrapped."""
         return self.boot_us + math.floor(time_s * 1e6 * (1.0 + self.skew_ppm * 1e-6))
 
     def true_s(self, clock_us: IntArray) -> FloatArray:
-        """Tell the true times at which it shows the given times."""
+        """Return the true times at which it shows the given times."""
         return (clock_us - self.boot_us) / (1e6 * (1.0 + self.skew_ppm * 1e-6))
 
 

@@ -197,7 +197,7 @@ class Bmp180:
 
 
 def errors_of(imu: Mpu6050, mag: Hmc5883l) -> SensorErrors:
-    """Tell the ideal calibration of two sensors."""
+    """Return the ideal calibration of two sensors."""
     return SensorErrors(
         accel_bias_mps2=_vec3(imu.accel_bias_mps2),
         accel_matrix=_inverse(imu.accel_matrix),

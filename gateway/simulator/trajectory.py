@@ -161,7 +161,7 @@ class Trajectory:
         self._airspeed = _spline(self._grid_s, airspeed)
 
     def truth_at(self, time_s: FloatArray) -> Truth:
-        """Tell the true state at any times.
+        """Return the true state at any times.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class Trajectory:
         )
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
-        """Tell `q_nb` alone, shape (N, 4), at times as in `truth_at`."""
+        """Return `q_nb` alone, shape (N, 4), at times as in `truth_at`."""
         return _quaternions(self._angles(time_s % FLIGHT_S))
 
     def _close(self, gusts: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
 
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
-    """Tell whether a latitude and a longitude can be."""
+    """Return whether a latitude and a longitude can be."""
     return abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0
 
 

@@ -59,12 +59,12 @@ HAS_PLACE = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
 
 
 def is_3d(fix: GpsFix) -> bool:
-    """Tell whether the receiver vouches for a three-dimensional fix."""
+    """Return whether the receiver vouches for a three-dimensional fix."""
     return fix.fix_ok and fix.fix_type in HAS_PLACE
 
 
 def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
-    """Tell whether a fix may set home; an accuracy that is not known does not forbid it."""
+    """Return whether a fix may set home; an accuracy that is not known does not forbid it."""
     # Some receivers vouch for latitude 0, longitude 0 before they know better.
     somewhere = (fix.lat_dege7, fix.lon_dege7) != (0, 0) and math.isfinite(fix.alt_amsl_m)
     accurate = fix.satellites >= satellites and not fix.h_acc_m > accuracy_m

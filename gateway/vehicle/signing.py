@@ -44,7 +44,7 @@ class SigningClock:
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
     def stamp(self, now_us: int) -> int:
-        """Tell the time in signing ticks."""
+        """Return the time in signing ticks."""
         return max(0, self._offset_us + now_us) // TICK_US
 
 
@@ -59,7 +59,7 @@ class Verifier:
         self._newest: dict[tuple[int, int, int], int] = {}
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
-        """Tell whether a whole frame is signed by a holder of the key, and not a replay.
+        """Return whether a whole frame is signed by a holder of the key, and not a replay.
 
         Parameters
         ----------

@@ -59,7 +59,7 @@ class Service(Protocol):
         ...
 
     def changes_state(self, request: Request) -> bool:
-        """Tell whether only an allowed client may ask this."""
+        """Return whether only an allowed client may ask this."""
         ...
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
@@ -261,7 +261,7 @@ class Vehicle:
         return self._finish(found)
 
     def next_due_us(self) -> int:
-        """Tell when `poll` is to be called next, at the latest."""
+        """Return when `poll` is to be called next, at the latest."""
         due = [self.telemetry.next_due_us(), self._announcements.next_due_us()]
         due += [service.next_due_us() for service in self._timed]
         return min(time_us for time_us in due if time_us is not None)

@@ -103,7 +103,7 @@ def split_datagram(data: bytes) -> list[bytes | SplitFault]:
 
 
 def is_frame(data: bytes) -> bool:
-    """Tell whether bytes are exactly one unsigned version 2 frame of a known message.
+    """Return whether bytes are exactly one unsigned version 2 frame of a known message.
 
     That is what nearly every datagram holds; this is the short way to know it.
     """
@@ -139,13 +139,13 @@ def message_id_of(frame: bytes) -> int:
 
 
 def is_station_heartbeat(frame: bytes) -> bool:
-    """Tell whether a HEARTBEAT says that its sender is a ground station."""
+    """Return whether a HEARTBEAT says that its sender is a ground station."""
     at = (10 if frame[0] == START_V2 else 6) + HEARTBEAT_TYPE_OFFSET
     return frame[at] == MAV_TYPE_GCS
 
 
 def is_signed(frame: bytes) -> bool:
-    """Tell whether a frame carries a MAVLink 2 signature."""
+    """Return whether a frame carries a MAVLink 2 signature."""
     return frame[0] == START_V2 and bool(frame[2] & SIGNED)
 
 

@@ -220,7 +220,7 @@ class Trials:
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
-    """Judge by the trial's own idea of when the fixes were valid, lest it be given the answer."""
+    """Judge by the trial's own latency, for another one would give it the answer."""
     if settings.estimation.reference == judge.fused.fusion.estimation.reference:
         return judge
     fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))

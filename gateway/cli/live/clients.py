@@ -31,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 
 def status(*, json: JsonOption = False) -> None:
-    """Tell how the gateway fares: receiver, nodes, aircraft, clients."""
+    """Show how the gateway fares: receiver, nodes, aircraft, clients."""
     snapshot = ask("status")
     if json:
         print(msgspec.json.encode(snapshot).decode())

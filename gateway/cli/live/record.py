@@ -45,7 +45,7 @@ def stop() -> None:
 
 @group.command()
 def status(*, json: JsonOption = False) -> None:
-    """Tell what the recorder does."""
+    """Show what the recorder does."""
     found = ask("record.status")
     if json:
         print(msgspec.json.encode(found).decode())

@@ -34,7 +34,7 @@ class DiskState:
 
 
 def free_bytes_near(folder: Path) -> int:
-    """Tell the free space where a folder is, or would be made."""
+    """Return the free space where a folder is, or would be made."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     disk = os.statvfs(folder)
@@ -145,7 +145,7 @@ class PartFiles:
             while view:
                 view = view[os.write(file, view) :]
         except OSError:
-            # A full disk takes the begin of what is written: no half record may stay.
+            # A full disk takes the start of what is written: no half record may stay.
             with contextlib.suppress(OSError):
                 os.ftruncate(file, size)
             raise

@@ -33,7 +33,7 @@ class RecordingError(Exception):
 
 
 def part_of(path: Path) -> int:
-    """Tell which part of its recording a file is; raises ValueError if it is none."""
+    """Return which part of its recording a file is; raises ValueError if it is none."""
     match = _FILE_NAME.fullmatch(path.name)
     if match is None:
         raise ValueError(f"{path} is no part of a recording")

@@ -168,7 +168,7 @@ class ControlServer:
 
 
 def socket_path(name: str) -> Path:
-    """Tell where the socket of a kind of gateway is.
+    """Return where the socket of a kind of gateway is.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class Part:
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
 
     def has_table(self, vehicle_id: int) -> bool:
-        """Tell whether the table of an aircraft was prepared."""
+        """Return whether the table of an aircraft was prepared."""
         return vehicle_id in self._tables
 
     def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:

@@ -77,6 +77,6 @@ class Stamper:
         return self._last_us
 
     def has_jumped(self, clock: CivilClock) -> bool:
-        """Tell whether the clock now knows a time that differs too much for this file."""
+        """Return whether the clock now knows a time that differs too much for this file."""
         offset_us = clock.offset_us
         return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US

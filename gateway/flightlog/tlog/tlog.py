@@ -233,14 +233,14 @@ class TlogIndex:
         self.size = max(self.size, batch.offset + end)
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
-        """Tell where to begin reading to find the first record that is not before a time.
+        """Return where to begin reading to find the first record that is not before a time.
 
         Parameters
         ----------
         time_us : int
             µs since 1970.
         records : int
-            Begin at least so many records earlier, or at the begin of the file.
+            Begin at least so many records earlier, or at the start of the file.
 
         Returns
         -------

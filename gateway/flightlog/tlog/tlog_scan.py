@@ -63,7 +63,7 @@ def _is_header(data: ByteArray, at: int, final: bool) -> int:
 
 @compiled
 def _frame_size(data: ByteArray, at: int) -> int:
-    """Tell a frame's size from its first three bytes; 0 for flags nobody knows."""
+    """Return a frame's size from its first three bytes; 0 for flags nobody knows."""
     if data[at] == 0xFE:
         return int(data[at + 1]) + 8
     flags = data[at + 2]
@@ -89,7 +89,7 @@ def _crc_step(crc: int, byte: int) -> int:
 
 @compiled
 def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
-    """Tell whether a complete frame's checksum holds: yes, no, or an unknown message."""
+    """Return whether a complete frame's checksum holds: yes, no, or an unknown message."""
     message_id = _message_id(data, at)
     seed = int(extra[message_id]) if message_id < extra.size else -1
     if seed < 0:

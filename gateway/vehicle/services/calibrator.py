@@ -168,7 +168,7 @@ class Calibrator:
         return self._fail("timed out")
 
     def next_due_us(self) -> int | None:
-        """Tell when to give up."""
+        """Return when to give up."""
         return self._run.deadline_us if self._run else None
 
     def _on_window(self, run: _Run) -> list[Answer]:
@@ -271,7 +271,7 @@ def fit_sphere(points: NDArray[np.float64]) -> tuple[Vec3, float]:
 
 
 def _field_turns(run: _Run) -> bool:
-    """Tell whether the field turned while all was quiet; without a magnetometer nobody knows."""
+    """Return whether the field turned while all was quiet; without a magnetometer nobody knows."""
     if len(run.mag) < MIN_FIELD_SAMPLES:
         return False
     times_s = (np.array(run.mag_times_us) - run.mag_times_us[0]) / US_PER_S

@@ -145,7 +145,7 @@ class CommandService:
         self._changing.add(number)
 
     def changes_state(self, request: Request) -> bool:
-        """Tell whether the command would change anything."""
+        """Return whether the command would change anything."""
         message = request.message
         return message.get_type() == "SET_MODE" or message.command in self._changing
 

@@ -192,7 +192,7 @@ class FtpService:
         return answers
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to send."""
+        """Return when `poll` has something to send."""
         return self._due_us
 
     def forget_client(self, client_id: int) -> None:

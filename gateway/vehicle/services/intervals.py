@@ -129,7 +129,7 @@ class IntervalService:
         return self._take(request.client_id, message_id, wish)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
-        """Tell how often a client gets a message, as MESSAGE_INTERVAL says it.
+        """Return how often a client gets a message, as MESSAGE_INTERVAL says it.
 
         Returns
         -------
@@ -159,7 +159,7 @@ class IntervalService:
         return self._due(timed, now_us, Stream.tick)
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to send."""
+        """Return when `poll` has something to send."""
         due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in STATE_MESSAGES]
         return min(due, default=None)
 

@@ -87,7 +87,7 @@ class RecordingService:
         return self._end(FAILED) + self._explain("Cannot record: no answer of the disk", now_us)
 
     def next_due_us(self) -> int | None:
-        """Tell when to give up."""
+        """Return when to give up."""
         return self._due_us
 
     def forget_client(self, client_id: int) -> None:

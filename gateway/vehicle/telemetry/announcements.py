@@ -56,7 +56,7 @@ class Announcements:
         self._restarts: dict[int, int] = {}
 
     def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
-        """Tell the estimator's changes."""
+        """Announce the estimator's changes."""
         if flags == self._flags:
             return []
         changed, self._flags = flags ^ self._flags, flags
@@ -70,13 +70,13 @@ class Announcements:
         return found
 
     def on_fix(self, now_us: int) -> list[Any]:
-        """Tell whether GPS fixes come."""
+        """Return whether GPS fixes come."""
         fixed = self._health.has_fix(now_us)
         text = StatusText(NOTICE, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
-        """Tell the receiver's and the nodes' coming and going."""
+        """Announce the receiver's and the nodes' coming and going."""
         text = StatusText(CRITICAL, f"Receiver lost: {report.port}")
         if report.connected:
             text = StatusText(NOTICE, f"Receiver connected: {report.port}")
@@ -100,11 +100,11 @@ class Announcements:
         return self._announcer.say(text, now_us)
 
     def poll(self, now_us: int) -> list[Any]:
-        """Tell what changed while its topic was held."""
+        """Announce what changed while its topic was held."""
         return self.on_fix(now_us) + self._announcer.poll(now_us)
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to tell."""
+        """Return when `poll` has something to send."""
         return self._announcer.next_due_us()
 
     def _on_restarts(self, now_us: int) -> list[Any]:

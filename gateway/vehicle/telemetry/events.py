@@ -80,7 +80,7 @@ class Announcer:
         return self._announce(known, now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Any]:
-        """Tell a single event, unless there were too many of late."""
+        """Tell a single event, unless there were too many recently."""
         self._refill(now_us)
         if self._tokens == 0:
             return []
@@ -88,13 +88,13 @@ class Announcer:
         return chunks(text, self._number())
 
     def poll(self, now_us: int) -> list[Any]:
-        """Tell the states that changed while their topics were held."""
+        """Return the states that changed while their topics were held."""
         return [
             message for topic in self._topics.values() for message in self._announce(topic, now_us)
         ]
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to tell."""
+        """Return when `poll` has something to tell."""
         pending = (t.held_until_us for t in self._topics.values() if t.state != t.announced)
         return min(pending, default=None)
 

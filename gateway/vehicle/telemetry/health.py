@@ -112,12 +112,12 @@ class Health:
         self._noise_percent = report.receiver.noise_percent if report.receiver else None
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
-        """Tell whether a sensor was heard of lately."""
+        """Return whether a sensor was heard of lately."""
         seen = self._seen_us.get(sensor)
         return seen is not None and now_us - seen <= self.silent_us
 
     def has_fix(self, now_us: int) -> bool:
-        """Tell whether the newest fix is three-dimensional and not old."""
+        """Return whether the newest fix is three-dimensional and not old."""
         return self._fix is not None and is_3d(self._fix) and self.is_alive(GPS, now_us)
 
     def sensors(self, now_us: int) -> tuple[int, int, int]:
@@ -205,7 +205,7 @@ class Health:
         return f"{self._roles.get(node_id, 'Node')} {node_id}"
 
     def restarts(self) -> dict[int, int]:
-        """Tell how often each node has started anew."""
+        """Return how often each node has started anew."""
         return {link.node.node_id: link.restarts for link in self._nodes}
 
     def known_nodes(self) -> frozenset[int]:

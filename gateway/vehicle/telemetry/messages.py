@@ -91,7 +91,7 @@ def attitude(state: NavState) -> Any:
 
 
 def has_position(state: NavState) -> bool:
-    """Tell whether there is a place to report, be it dead-reckoned and old."""
+    """Return whether there is a place to report, be it dead-reckoned and old."""
     return math.isfinite(state.lat_deg + state.lon_deg + state.alt_amsl_m)
 
 

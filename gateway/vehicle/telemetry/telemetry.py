@@ -104,7 +104,7 @@ class Telemetry:
         return NewestRecords(self.state, self._sample, self._baro, self._fix)
 
     def knows(self, message_id: int) -> bool:
-        """Tell whether the vehicle ever sends a message."""
+        """Return whether the vehicle ever sends a message."""
         return message_id in self._builders
 
     def reconfigure(self, settings: VehicleSettings) -> None:
@@ -171,7 +171,7 @@ class Telemetry:
         self.home = None
 
     def poll(self, now_us: int) -> list[Any]:
-        """Tell what is due by time."""
+        """Return what is due by time."""
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)
@@ -182,7 +182,7 @@ class Telemetry:
         return found
 
     def next_due_us(self) -> int:
-        """Tell when `poll` has something to tell; the heartbeat never stops."""
+        """Return when `poll` has something to tell; the heartbeat never stops."""
         due = (self.streams[m].due_us for m in self._timed if self.streams[m].interval_us > 0)
         return min(0 if time_us is None else time_us for time_us in due)
 

@@ -95,7 +95,7 @@ class MissionService:
         }
 
     def changes_state(self, request: Request) -> bool:
-        """Tell whether the request would store, clear or move on."""
+        """Return whether the request would store, clear or move on."""
         return request.message.get_type() in CHANGING
 
     def refuse(self, request: Request) -> list[Answer]:
@@ -123,7 +123,7 @@ class MissionService:
         return self._ask(upload, now_us)
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to do."""
+        """Return when `poll` has something to do."""
         return self._upload.due_us if self._upload else None
 
     def forget_client(self, client_id: int) -> None:

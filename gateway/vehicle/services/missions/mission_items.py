@@ -66,7 +66,7 @@ class Item:
     z: float
 
     def place(self, home_alt_m: float) -> Place | None:
-        """Tell where it is, if it is anywhere: 0, 0 means "here" to autopilots, not the gulf."""
+        """Return where it is, if it is anywhere: 0, 0 means "here" to autopilots, not the gulf."""
         placed = self.command in PLACED_COMMANDS and self.frame in GLOBAL_FRAMES
         if not placed or (self.x, self.y) == (0, 0):
             return None

@@ -69,11 +69,11 @@ class ParameterService:
         self._due_us: int | None = None
 
     def changes_state(self, request: Request) -> bool:
-        """Tell whether the request is to set one."""
+        """Return whether the request is to set one."""
         return bool(request.message.get_type() == "PARAM_SET")
 
     def refuse(self, request: Request) -> list[Answer]:
-        """Tell the value that stays."""
+        """Return the value that stays."""
         parameter = self._named(request.message.param_id)
         if parameter is None:
             return [self._error(request, UNKNOWN)]
@@ -106,7 +106,7 @@ class ParameterService:
         return answers
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to send."""
+        """Return when `poll` has something to send."""
         return self._due_us
 
     def forget_client(self, client_id: int) -> None:
