@@ -26,8 +26,9 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.clock import GatewayClock, unix_time_us
-from gateway.edges.disk.player import PlayerEdge, TlogFile
+from gateway.edges.disk.player_edge import PlayerEdge
 from gateway.edges.disk.recorder import Recorder
+from gateway.edges.disk.tlog_file import TlogFile
 from gateway.edges.hub.hub import Hub
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
 from gateway.flightlog.session import RecordingSettings

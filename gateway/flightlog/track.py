@@ -8,6 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from gateway.flightlog.tlog.readdress import readdress
+from gateway.flightlog.tlog.recorded_commands import telemetry_of
 from gateway.flightlog.tlog.tlog import (
     SEEK_BYTES,
     STRIDE,
@@ -16,6 +17,7 @@ from gateway.flightlog.tlog.tlog import (
     TlogRecord,
     TlogScanner,
 )
+from gateway.flightlog.tlog.tlog_scan import IntArray
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 BLOCK_BYTES: Final = 1 << 18
@@ -64,6 +66,8 @@ class Track:
         Added to every time, to lay several recordings over one another.
     system_ids : mapping of int to int
         Senders to put in place of recorded ones; others keep theirs.
+    with_commands : bool
+        Play too what stations said and what else asks something of a vehicle.
     """
 
     def __init__(
@@ -72,11 +76,13 @@ class Track:
         *,
         shift_us: int = 0,
         system_ids: Mapping[int, int] = MappingProxyType({}),
+        with_commands: bool = False,
     ) -> None:
         self._source = source
         self._shift_us = shift_us
         self._system_ids = system_ids
-        self._records = _records_of(self._read_from(0))
+        self._with_commands = with_commands
+        self._records = self._records_of(self._read_from(0))
         self._next = next(self._records, None)
 
     @property
@@ -88,13 +94,6 @@ class Track:
     def last_us(self) -> int:
         """Time of the last record."""
         return self._source.last_us + self._shift_us
-
-    @property
-    def systems(self) -> set[int]:
-        """Ids of all that send, as they are played."""
-        return {
-            self._system_ids.get(system_id, system_id) for system_id in self._source.index.systems
-        }
 
     def prepare(self, time_us: int) -> bool:
         """Do a little of what a seek to a time needs; tells whether it can be made at once."""
@@ -139,17 +138,28 @@ class Track:
         for batch in batches:
             reached = np.flatnonzero(batch.time_us >= wanted_us)
             begin = int(reached[0]) if len(reached) else len(batch)
-            for i in np.flatnonzero(np.isin(batch.message_ids[:begin], CONTEXT_IDS)).tolist():
+            known = self._wanted(batch, 0)
+            known = known[(known < begin) & np.isin(batch.message_ids[known], CONTEXT_IDS)]
+            for i in known.tolist():
                 frame = batch.frame(i)
                 key = _key_of(frame)
                 # Taken out first, so that the newest come last.
                 newest.pop(key, None)
                 newest[key] = frame
             if len(reached):
-                self._records = chain(batch.records(begin), _records_of(batches))
+                here = batch.records(self._wanted(batch, begin))
+                self._records = chain(here, self._records_of(batches))
                 break
         self._next = next(self._records, None)
         return [self._addressed(frame) for frame in newest.values()]
+
+    def _wanted(self, batch: Batch, begin: int) -> IntArray:
+        if self._with_commands:
+            return np.arange(begin, len(batch))
+        return telemetry_of(batch, begin, self._source.index.stations)
+
+    def _records_of(self, batches: Iterator[Batch]) -> Iterator[TlogRecord]:
+        return chain.from_iterable(batch.records(self._wanted(batch, 0)) for batch in batches)
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])
@@ -163,10 +173,6 @@ class Track:
             offset += len(data)
             size = BLOCK_BYTES
         yield scanner.feed(b"", final=True)
-
-
-def _records_of(batches: Iterator[Batch]) -> Iterator[TlogRecord]:
-    return chain.from_iterable(batch.records() for batch in batches)
 
 
 def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:

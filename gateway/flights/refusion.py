@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 
 from gateway import __version__
+from gateway.aircraft import Aircraft
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_ends
 from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
@@ -61,6 +62,13 @@ class Refusion:
     def remarks(self) -> list[str]:
         """What the user should know of the states, as far as it was seen by now."""
         return [SETTLES.format(reason) for reason in self._replay.refused]
+
+    def introduction(self) -> Iterator[bytes]:
+        """Yield the frames that tell who flies here, and by which parameters it is fused."""
+        vehicle = Aircraft(self._table.header.vehicle_id, self._aircraft).vehicle
+        for action in vehicle.introduction():
+            if isinstance(action, Outgoing):
+                yield action.frame
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink that the gateway would have sent, at civil times."""

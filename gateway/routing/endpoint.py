@@ -54,6 +54,12 @@ OPEN_TO_ALL: Final = frozenset(
 """Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
 
 
+HOSTED: Final = frozenset(
+    {EndpointKind.UDP, EndpointKind.UDP_LISTEN, EndpointKind.TCP, EndpointKind.TCP_LISTEN}
+)
+"""Kinds whose frames go to hosts by their addresses, one by one."""
+
+
 @dataclass(frozen=True, slots=True)
 class Endpoint:
     """One parsed endpoint URL."""
@@ -182,6 +188,22 @@ def is_numeric(host: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether an address is one of this machine alone; a name is none but `localhost`."""
+    if host == "localhost":
+        return True
+    if not is_numeric(host):
+        return False
+    address = ipaddress.ip_address(host.partition("%")[0])
+    mapped = getattr(address, "ipv4_mapped", None)
+    return (mapped or address).is_loopback
+
+
+def stays_here(endpoint: Endpoint) -> bool:
+    """Tell whether nothing that goes to an endpoint can leave this machine."""
+    return endpoint.kind in HOSTED and is_loopback(endpoint.host)
 
 
 def _options(url: str, query: str) -> dict[str, str]:

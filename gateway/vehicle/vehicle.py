@@ -251,6 +251,11 @@ class Vehicle:
         answers += self._replies(self._refusal_texts.say(status, now_us))
         return self._finish(answers)
 
+    def introduction(self) -> list[Action]:
+        """Encode what a ground station's start asks for, whoever asks: version and parameters."""
+        known = [identity.autopilot_version(self.system_id), identity.protocol_version()]
+        return self._finish([*self._replies(known), *self._parameters.values()])
+
     def poll(self, now_us: int) -> list[Action]:
         """Do what is due by time."""
         self.telemetry.calibrating = self._calibrator.busy

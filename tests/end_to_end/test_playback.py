@@ -137,8 +137,13 @@ def test_a_recorded_vehicle_answers_a_ground_station(
     play(str(tlog), port=port)
     _, address = client.sock.recvfrom(2048)
     client.send(mavlink.MAVLink_param_request_list_message(3, 1), address[1])
-    seen = client.until(lambda seen: "PARAM_VALUE" in seen)
-    assert seen["PARAM_VALUE"].get_srcSystem() == 3
+    seen = client.until(lambda seen: "PARAM_ERROR" in seen)
+    assert seen["PARAM_ERROR"].get_srcSystem() == 3
+    number = mavlink.MAV_CMD_GET_HOME_POSITION
+    home = mavlink.MAVLink_command_long_message(3, 1, number, 0, 0, 0, 0, 0, 0, 0, 0)
+    client.send(home, address[1])
+    seen = client.until(lambda seen: {"COMMAND_ACK", "HOME_POSITION"} <= seen.keys())
+    assert seen["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_mavlogdump_reads_a_live_recording_and_it_fuses_to_the_last_bit(

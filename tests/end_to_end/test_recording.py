@@ -12,8 +12,8 @@ from gateway.aircraft import Action
 from gateway.cli.app import app
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
-from gateway.edges.disk.player import TlogFile
 from gateway.edges.disk.recorder import Recorder
+from gateway.edges.disk.tlog_file import TlogFile
 from gateway.flightlog.playback import Player
 from gateway.flightlog.session import RecordingSettings
 from gateway.flightlog.table.row import TableRow

@@ -1,12 +1,10 @@
 """`mavgate play` and the orders to a player that runs."""
 
 import asyncio
-import contextlib
 import signal
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Annotated, Any, Final
 
 import typer
@@ -37,44 +35,20 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
-from gateway.edges.clock import GatewayClock
-from gateway.edges.disk.fused_tlog import FusedTlog
-from gateway.edges.disk.player import PlayerEdge, PlayerStatus, TlogFile
-from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.edges.disk.recordings import parts_together
-from gateway.edges.hub.hub import Hub
-from gateway.edges.operator.control_socket import ControlError, ControlServer, socket_path
-from gateway.edges.operator.control_verbs import PlayerVerbs
-from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, check_speed
-from gateway.flightlog.track import Source, Track
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions
-from gateway.flights.refusion import Refusion, end_of
-from gateway.records import Incoming, Outgoing
-from gateway.units import US_PER_S
-from gateway.vehicle.vehicle import Vehicle
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.edges.disk.player_edge import PlayerStatus
+from gateway.edges.operator.control_socket import ControlError
+from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, check_speed
+from gateway.flights.opening import lay_out, open_flights
+from gateway.flights.reading import FlightError, ReadOptions
+from gateway.player import (
+    PlayerDaemon,
+    PlayPlan,
+    endpoints_beyond,
+    prepare,
+)
 
 VIEW_INTERVAL_S: Final = 0.25
-READY_S: Final = 3.0
-"""A name that takes longer to be resolved is not waited for."""
-READY_STEP_S: Final = 0.01
-RESOLVING: Final = "resolving"
-FIRST_GROUND_STATION: Final = 250
-"""System ids from here on are by custom ground stations, which keep their id."""
 FASTEST: Final = "max"
-
-
-@dataclass(frozen=True, slots=True)
-class PlayPlan:
-    """How to play: range, speed, silences."""
-
-    begin: Moment | None
-    end: Moment | None
-    speed: float
-    max_gap_s: float | None
-    loop: bool
-    paused: bool
 
 
 def register(app: typer.Typer) -> None:
@@ -102,30 +76,56 @@ def play(
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
     columns: ColumnsOption = None,
+    with_commands: Annotated[
+        bool,
+        typer.Option(
+            "--with-commands", help="Send what ground stations said, too: live vehicles obey it."
+        ),
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask before commands leave this machine.")
+    ] = False,
     endpoint: EndpointOption = None,
     config: ConfigOption = None,
 ) -> None:
     """Play recordings to the ground stations, several at once if you like.
 
-    A tlog is sent byte for byte. A table is fused again while it plays, so the recorded flight and
-    its re-fused twin can fly on one map; the parts of a recording are one flight. `mavgate seek`
-    and `mavgate player` steer it meanwhile.
+    What the vehicles of a tlog told is sent byte for byte, and they answer what is asked of them as
+    they did on that day. A table is fused again while it plays, so the recorded flight and its
+    re-fused twin can fly on one map; the parts of a recording are one flight. `mavgate seek` and
+    `mavgate player` steer it meanwhile.
     """
     gateway = with_endpoints(read_settings(config), endpoint)
+    if with_commands and not yes:
+        _ask_for_commands(gateway)
     with ExitStack() as opened, refusing():
         plan = PlayPlan(
-            read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused
-        )
+            read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused,
+            with_commands, commands_anywhere=with_commands,
+        )  # fmt: skip
         today = pipeline_settings(read_settings(config))
         options = ReadOptions(today, settings, position, read_column_map(columns))
         with progress_of(files) as advance:
-            flights = _open_all(files, replace(options, progress=advance), opened)
-            tracks = _lay_out(flights, system or [])
-            _prepare(tracks, plan)
+            recorded = open_flights(files, replace(options, progress=advance), opened)
+            flights = lay_out(recorded, system or [], with_commands=with_commands)
+            prepare(flights, plan)
+        for remark in (remark for flight in recorded for remark in flight.remarks):
+            console_of(stderr=True).print(remark, markup=False)
+        names = [file.name for file in files]
         try:
-            asyncio.run(_serve(gateway, tracks, plan, [file.name for file in files]))
+            asyncio.run(_serve(lambda: PlayerDaemon(gateway, flights, plan, names)))
         except ControlError as error:
             refuse(str(error))
+
+
+def _ask_for_commands(settings: GatewaySettings) -> None:
+    """Ask before recorded commands leave this machine; the command ends without a yes."""
+    if away := endpoints_beyond(settings.hub):
+        typer.confirm(
+            "Recorded commands (arming, steering, parameters, missions) would go to "
+            f"{', '.join(away)}, and a vehicle there may obey them. Send them?",
+            abort=True,
+        )
 
 
 group = typer.Typer(help="Steer the player that runs.", no_args_is_help=True)
@@ -181,100 +181,12 @@ def status() -> None:
     _show(ask("play.status", of="play"))
 
 
-class PlayerDaemon:
-    """A player with its clients: frames of recordings out, answers to what clients ask.
-
-    Parameters
-    ----------
-    settings : GatewaySettings
-        The hub's and the vehicles'.
-    player : Player
-        What is due when.
-    systems : iterable of int
-        Ids of all that send in the recordings.
-    files : sequence of str
-        Names to show.
-    now_us : GatewayClock
-        The clock that the player was built on.
-    """
-
-    def __init__(
-        self,
-        settings: GatewaySettings,
-        player: Player,
-        systems: Iterable[int],
-        files: Sequence[str],
-        now_us: GatewayClock,
-    ) -> None:
-        self._now_us = now_us
-        self._hub = Hub(settings.hub, self._on_frame, now_us)
-        # A recording answers nothing, and ground stations wait for answers: parameters, mission.
-        self._vehicles = [
-            Vehicle(settings.vehicle, system_id)
-            for system_id in systems
-            if system_id < FIRST_GROUND_STATION
-        ]
-        self.ended = asyncio.Event()
-        self.edge = PlayerEdge(player, self._send, now_us, files=files, on_end=self.ended.set)
-        self._control = ControlServer(socket_path("play"))
-        PlayerVerbs(self.edge).register(self._control)
-
-    async def start(self) -> None:
-        """Open everything; raises ControlError if another player runs."""
-        await self._control.start()
-        self._hub.start()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(READY_S):
-                while any(client.state == RESOLVING for client in self._hub.clients()):
-                    await asyncio.sleep(READY_STEP_S)
-        self.edge.start()
-
-    def close(self) -> None:
-        """End everything."""
-        self.edge.close()
-        self._control.close()
-        self._hub.close()
-
-    def _send(self, frames: Iterable[bytes]) -> None:
-        for frame in frames:
-            self._hub.send(Outgoing(frame, message_id_of(frame)))
-
-    def _on_frame(self, incoming: Incoming) -> None:
-        # What is over cannot be changed, whoever asks.
-        harmless = replace(incoming, trusted=False)
-        for vehicle in self._vehicles:
-            for action in vehicle.handle(harmless, self._now_us()):
-                if isinstance(action, Outgoing):
-                    self._hub.send(action)
-
-
-async def _serve(
-    settings: GatewaySettings,
-    tracks: Sequence[Track],
-    plan: PlayPlan,
-    files: Sequence[str],
-) -> None:
-    now_us = GatewayClock()
-    first_us = min(track.first_us for track in tracks)
-    player = Player(
-        tracks,
-        now_us(),
-        speed=plan.speed,
-        begin_us=None if plan.begin is None else place_in(plan.begin, first_us),
-        end_us=None if plan.end is None else place_in(plan.end, first_us),
-        max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
-        loop=plan.loop,
-    )
-    # It waits for the network, and then if the user wants it to.
-    player.pause(now_us())
-    systems = sorted({system_id for track in tracks for system_id in track.systems})
-    daemon = PlayerDaemon(settings, player, systems, files, now_us)
+async def _serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
+    daemon = daemon_of()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
     try:
         await daemon.start()
-        if not plan.paused:
-            daemon.edge.resume()
         await _watch(daemon)
     finally:
         daemon.close()
@@ -305,66 +217,6 @@ async def _watch(daemon: PlayerDaemon) -> None:
             except TimeoutError:
                 continue
     console.print(f"ended: {_place(daemon.edge.status())}")
-
-
-def _open_all(files: Sequence[Path], options: ReadOptions, opened: ExitStack) -> list[list[Source]]:
-    """Index the tlogs, and begin to fuse what is none; the parts of a recording together."""
-    flights: list[list[Source]] = []
-    for parts in parts_together(files):
-        sources: list[TlogFile | FusedTlog] = []
-        if kind_of(parts[0]) is FileKind.TLOG:
-            for file in parts:
-                sources.append(TlogFile(file, options.progress))
-                opened.callback(sources[-1].close)
-        else:
-            refusion = Refusion(parts, options)
-            sources.append(FusedTlog(refusion.frames(), end_of(parts[-1], options)))
-            opened.callback(sources[-1].close)
-            for remark in refusion.remarks:
-                console_of(stderr=True).print(f"{parts[0]}: {remark}", markup=False)
-        for source, file in zip(sources, parts, strict=False):
-            if not source.index.count:
-                raise FlightError(f"{file}: {NO_RECORDING}")
-        flights.append([*sources])
-    return flights
-
-
-def _prepare(tracks: Sequence[Track], plan: PlayPlan) -> None:
-    """Fuse tables up to the begin that the user wants."""
-    if plan.begin is not None:
-        begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
-        while not all(track.prepare(begin_us) for track in tracks):
-            pass
-
-
-def _lay_out(flights: Sequence[Sequence[Source]], wished: Sequence[int]) -> list[Track]:
-    """Give each vehicle its own system id, and recordings of other days the same begin."""
-    begin_us, end_us = _span(flights[0])
-    used: set[int] = set()
-    tracks = []
-    for number, sources in enumerate(flights):
-        first_us, last_us = _span(sources)
-        shift_us = 0 if first_us <= end_us and begin_us <= last_us else begin_us - first_us
-        senders = {sender for source in sources for sender in source.index.systems}
-        vehicles = sorted(sender for sender in senders if sender < FIRST_GROUND_STATION)
-        system_ids: dict[int, int] = {}
-        for place, system_id in enumerate(vehicles):
-            wanted = wished[number] if place == 0 and number < len(wished) else system_id
-            while wanted in used:
-                wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
-            used.add(wanted)
-            if wanted != system_id:
-                system_ids[system_id] = wanted
-        tracks += [Track(s, shift_us=shift_us, system_ids=system_ids) for s in sources]
-    return tracks
-
-
-def _span(sources: Sequence[Source]) -> tuple[int, int]:
-    """Tell begin and end of a recording of several parts."""
-    return (
-        min(source.index.first_us or 0 for source in sources),
-        max(source.last_us for source in sources),
-    )
 
 
 def _speed(text: str) -> float:

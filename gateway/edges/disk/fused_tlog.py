@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Final
 
+from gateway.flightlog.answers import LogAnswers
 from gateway.flightlog.tlog.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
 
 log = logging.getLogger(__name__)
@@ -24,6 +25,8 @@ class FusedTlog:
         What is played, in the order of its time.
     last_us : int, optional
         Time of its end, as far as that is known beforehand.
+    answers : LogAnswers, optional
+        Takes in what the frames tell of the vehicle.
 
     Raises
     ------
@@ -31,9 +34,15 @@ class FusedTlog:
         If there is no room for temporary files.
     """
 
-    def __init__(self, frames: Iterator[TlogRecord], last_us: int | None = None) -> None:
+    def __init__(
+        self,
+        frames: Iterator[TlogRecord],
+        last_us: int | None = None,
+        answers: LogAnswers | None = None,
+    ) -> None:
         self._frames = frames
         self._last_us = last_us
+        self._answers = answers
         self._file = tempfile.TemporaryFile(prefix="mavgate-play-")  # noqa: SIM115
         self._scanner = TlogScanner()
         self._size = 0
@@ -74,6 +83,9 @@ class FusedTlog:
         except OSError as error:
             log.warning("The rest cannot be played: %s: %s", tempfile.gettempdir(), error.strerror)
             self._ended = True
-        self.index.add(self._scanner.feed(made, final=self._ended))
+        batch = self._scanner.feed(made, final=self._ended)
+        self.index.add(batch)
+        if self._answers is not None:
+            self._answers.note(batch, self.index.stations)
         self._size += len(made)
         return not self._ended

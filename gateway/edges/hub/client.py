@@ -1,7 +1,6 @@
 """What all transports to a client share: identity, counters, and how received bytes go on."""
 
 import asyncio
-import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -9,7 +8,7 @@ from typing import Protocol
 from gateway.edges.hub.express import ClientCounters, Express
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ClientStats
-from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_numeric
+from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_loopback
 from gateway.routing.hub_settings import HubSettings
 from gateway.routing.routing_table import Origin
 from gateway.wire.mavlink_signing import Seal
@@ -168,13 +167,5 @@ def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:
-        return _is_loopback(remote.rpartition(":")[0].strip("[]"))
+        return is_loopback(remote.rpartition(":")[0].strip("[]"))
     return True
-
-
-def _is_loopback(host: str) -> bool:
-    if not is_numeric(host):
-        return False
-    address = ipaddress.ip_address(host.partition("%")[0])
-    mapped = getattr(address, "ipv4_mapped", None)
-    return (mapped or address).is_loopback

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from gateway.edges.disk.player import PlayerEdge, PlayerStatus
+from gateway.edges.disk.player_edge import PlayerEdge, PlayerStatus
 from gateway.edges.disk.recorder import Recorder, RecorderStatus
 from gateway.edges.disk.recordings import (
     Recording,

@@ -18,6 +18,7 @@ from gateway.flightlog.tlog.tlog_scan import (
     scan,
 )
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import is_station_heartbeat
 
 DAY_US: Final = 86_400 * US_PER_S
 STRIDE: Final = 256
@@ -25,6 +26,8 @@ STRIDE: Final = 256
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
 MAX_DAMAGE_RUNS: Final = 1000
 """Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+
+HEARTBEAT_ID: Final = 0
 
 _EXTRA: Final = crc_extra_table()
 
@@ -100,12 +103,14 @@ class Batch:
         shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
         return shifted.tobytes()
 
-    def records(self, begin: int = 0) -> Iterator[TlogRecord]:
-        """Go through the records from one of them on."""
+    def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
+        """Go through the records, or through some of them by their numbers."""
         data = self.data
         times, starts, sizes = self.time_us, self.starts, self.sizes
+        if wanted is not None:
+            times, starts, sizes = times[wanted], starts[wanted], sizes[wanted]
         for time_us, start, size in zip(
-            times[begin:].tolist(), starts[begin:].tolist(), sizes[begin:].tolist(), strict=True
+            times.tolist(), starts.tolist(), sizes.tolist(), strict=True
         ):
             yield TlogRecord(time_us, data[start + TIME_SIZE : start + TIME_SIZE + size])
 
@@ -206,8 +211,10 @@ class TlogIndex:
         self.first_us: int | None = None
         self.last_us: int | None = None
         """Greatest time."""
-        self.systems: set[int] = set()
-        """Ids of all that sent."""
+        self.origins: set[int] = set()
+        """All that sent: system << 8 | component."""
+        self.stations: set[int] = set()
+        """Those among them whose heartbeats say that they are ground stations."""
         self.damage: list[Damage] = []
         """The first `MAX_DAMAGE_RUNS` runs."""
         self.damaged_bytes = 0
@@ -220,7 +227,8 @@ class TlogIndex:
             self._add_damage(run)
         if not len(batch):
             return
-        self.systems |= set(np.flatnonzero(np.bincount(batch.origins >> 8)).tolist())
+        self.origins |= set(np.unique(batch.origins).tolist())
+        self._add_stations(batch)
         if self.first_us is None or self.last_us is None:
             self.first_us = self.last_us = int(batch.time_us[0])
         greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))
@@ -231,6 +239,12 @@ class TlogIndex:
         self.last_us = int(greatest[-1])
         end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
         self.size = max(self.size, batch.offset + end)
+
+    def _add_stations(self, batch: Batch) -> None:
+        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
+            origin = int(batch.origins[i])
+            if origin not in self.stations and is_station_heartbeat(batch.frame(i)):
+                self.stations.add(origin)
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
         """Return where to begin reading to find the first record that is not before a time.

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 import pytest
 
 from gateway.edges.disk.fused_tlog import PIECE, FusedTlog
-from gateway.edges.disk.player import PlayerEdge
+from gateway.edges.disk.player_edge import PlayerEdge
 from gateway.flightlog.playback import Player
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flightlog.track import Track
@@ -53,7 +53,7 @@ def play_all(track: Track) -> list[TlogRecord]:
 def test_it_is_made_as_it_is_wanted(making: Making, tlog: FusedTlog) -> None:
     assert making.made <= 2 * PIECE
     track = Track(tlog)
-    assert (track.first_us, track.last_us, track.systems) == (START_US, END_US, {1})
+    assert (track.first_us, track.last_us, tlog.index.origins) == (START_US, END_US, {0x101})
     for record in RECORDS[:100]:
         assert track.peek_us() == record.time_us
         assert track.take() == record.frame

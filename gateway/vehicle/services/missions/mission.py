@@ -102,13 +102,13 @@ class MissionService:
         """Deny by MISSION_ACK; MISSION_SET_CURRENT has no negative answer of its own."""
         if request.message.get_type() == "MISSION_SET_CURRENT":
             return []
-        return [_ack(request, mavlink.MAV_MISSION_DENIED)]
+        return [mission_ack(request, mavlink.MAV_MISSION_DENIED)]
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one message."""
         handler = self._handlers.get(request.message.get_type())
         if handler is None:
-            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         return handler(request, now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
@@ -118,7 +118,7 @@ class MissionService:
             return []
         if upload.retries >= MAX_RETRIES:
             self._upload = None
-            return [_ack(upload.request, mavlink.MAV_MISSION_OPERATION_CANCELLED)]
+            return [mission_ack(upload.request, mavlink.MAV_MISSION_OPERATION_CANCELLED)]
         upload.retries += 1
         return self._ask(upload, now_us)
 
@@ -149,7 +149,7 @@ class MissionService:
     def _list(self, request: Request, _now_us: int) -> list[Answer]:
         kind = request.message.mission_type
         if kind not in KINDS:
-            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         count = mavlink.MAVLink_mission_count_message(
             request.system_id, request.component_id, len(self.items[kind]), kind
         )
@@ -158,9 +158,9 @@ class MissionService:
     def _send_item(self, request: Request, _now_us: int) -> list[Answer]:
         kind, sequence = request.message.mission_type, request.message.seq
         if kind not in KINDS:
-            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if sequence >= len(self.items[kind]):
-            return [_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
+            return [mission_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
         target = (request.system_id, request.component_id)
         current = kind == MISSION and sequence == self.current
         item = write_item(self.items[kind][sequence], sequence, kind, target, current)
@@ -170,14 +170,14 @@ class MissionService:
         kind, count = request.message.mission_type, request.message.count
         busy = self._upload is not None and self._upload.request.client_id != request.client_id
         if busy:
-            return [_ack(request, mavlink.MAV_MISSION_DENIED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_DENIED)]
         if kind not in KINDS:
-            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if count > MAX_ITEMS[kind]:
-            return [_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
+            return [mission_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
         self._upload = self._finished = None
         if count == 0:
-            return [_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
+            return [mission_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
         self._upload = _Upload(request, kind, count, now_us)
         return self._ask(self._upload, now_us)
 
@@ -200,14 +200,14 @@ class MissionService:
         result = check_item(item, upload.kind)
         if result != ACCEPTED:
             self._upload = None
-            return [_ack(request, result)]
+            return [mission_ack(request, result)]
         upload.items.append(item)
         upload.retries = 0
         if len(upload.items) < upload.count:
             return self._ask(upload, now_us)
         self._upload, self._finished = None, upload
         stored = self._store(upload.kind, tuple(upload.items), now_us)
-        return [_ack(request, ACCEPTED), *stored]
+        return [mission_ack(request, ACCEPTED), *stored]
 
     def _stray_item(self, request: Request) -> list[Answer]:
         """Acknowledge a last item that comes again because the ACK was lost; deny any other."""
@@ -218,8 +218,8 @@ class MissionService:
             and done.request.client_id == request.client_id
             and (message.seq, message.mission_type) == (done.count - 1, done.kind)
         ):
-            return [_ack(request, ACCEPTED)]
-        return [_ack(request, mavlink.MAV_MISSION_ERROR)]
+            return [mission_ack(request, ACCEPTED)]
+        return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
 
     def _store(self, kind: int, items: tuple[Item, ...], now_us: int) -> list[Answer]:
         self.items[kind] = items
@@ -230,9 +230,9 @@ class MissionService:
     def _clear(self, request: Request, now_us: int) -> list[Answer]:
         kind = request.message.mission_type
         if kind not in (*KINDS, ALL):
-            return [_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
+            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         self._upload = self._finished = None
-        answers: list[Answer] = [_ack(request, ACCEPTED)]
+        answers: list[Answer] = [mission_ack(request, ACCEPTED)]
         for each in KINDS if kind == ALL else (kind,):
             answers += self._store(each, (), now_us)
         return answers
@@ -251,7 +251,8 @@ class MissionService:
         return []
 
 
-def _ack(request: Request, result: int) -> Reply:
+def mission_ack(request: Request, result: int) -> Reply:
+    """Answer a request about a mission by MISSION_ACK."""
     kind = getattr(request.message, "mission_type", MISSION)
     return request.reply(
         mavlink.MAVLink_mission_ack_message(request.system_id, request.component_id, result, kind)

@@ -137,6 +137,10 @@ class ParameterService:
         """Tell all the present value of a parameter."""
         return Reply(self._value(parameter))
 
+    def values(self) -> list[Answer]:
+        """Tell all of them."""
+        return [self.param_value(parameter) for parameter in self.table.parameters]
+
     def take(self, section: str, settings: Any) -> list[Answer]:
         """Take over a section that was changed elsewhere, and tell what differs."""
         before = self._numbers()

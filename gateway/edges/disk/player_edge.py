@@ -1,77 +1,17 @@
-"""The player's edge: reads recordings, and hands their frames on when they are due."""
+"""The player's edge: hands the frames of recordings on when they are due."""
 
 import asyncio
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, PlayState, check_speed
-from gateway.flightlog.tlog.tlog import TlogIndex, TlogScanner
 from gateway.units import US_PER_S
 
-READ_SIZE: Final = 1 << 20
 BATCH: Final = 200
 """Frames in one go: about a millisecond, after which others get their turn."""
 LONGEST_WAIT_S: Final = 0.5
 SEEKING: Final = "seeking"
-
-Progress = Callable[[int], None]
-"""Called with how many more bytes were read."""
-
-
-class TlogFile:
-    """A tlog on the disk: its index, and reading at any place.
-
-    It is read, not mapped into memory: a file that shrinks, or a stick that is pulled out, would
-    kill a process that had mapped it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    progress : callable, optional
-        Called with how many more bytes were indexed.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    """
-
-    def __init__(self, path: Path, progress: Progress | None = None) -> None:
-        self.path = path
-        self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        self.index = TlogIndex()
-        scanner = TlogScanner()
-        offset = 0
-        while data := self.read(offset, READ_SIZE):
-            self.index.add(scanner.feed(data))
-            offset += len(data)
-            if progress is not None:
-                progress(len(data))
-        self.index.add(scanner.feed(b"", final=True))
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Read up to so many bytes; nothing at the end, or where the medium fails."""
-        try:
-            return os.pread(self._file, size, offset)
-        except OSError:
-            return b""
-
-    @property
-    def last_us(self) -> int:
-        """Greatest time; 0 in an empty file."""
-        return self.index.last_us or 0
-
-    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
-        """Tell that everything is there."""
-        return True
-
-    def close(self) -> None:
-        """Close the file; its tracks end."""
-        os.close(self._file)
 
 
 @dataclass(frozen=True, slots=True)

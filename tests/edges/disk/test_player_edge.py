@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from gateway.edges.clock import GatewayClock
-from gateway.edges.disk.player import BATCH, PlayerEdge, TlogFile
+from gateway.edges.disk.player_edge import BATCH, PlayerEdge
+from gateway.edges.disk.tlog_file import TlogFile
 from gateway.flightlog.playback import Player
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flightlog.track import Track

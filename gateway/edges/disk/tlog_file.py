@@ -1,0 +1,72 @@
+"""A tlog on the disk, as a player reads it: indexed once, then read at any place."""
+
+import os
+from pathlib import Path
+from typing import Final
+
+from gateway.edges.disk.recording_streams import Progress
+from gateway.flightlog.answers import LogAnswers
+from gateway.flightlog.tlog.tlog import TlogIndex, TlogScanner
+
+READ_SIZE: Final = 1 << 20
+
+
+class TlogFile:
+    """A tlog on the disk: its index, and reading at any place.
+
+    It is read, not mapped into memory: a file that shrinks, or a stick that is pulled out, would
+    kill a process that had mapped it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    progress : callable, optional
+        Called with how many more bytes were indexed.
+    answers : LogAnswers, optional
+        Takes in what the file tells of its vehicles.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+
+    def __init__(
+        self, path: Path, progress: Progress | None = None, answers: LogAnswers | None = None
+    ) -> None:
+        self.path = path
+        self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self.index = TlogIndex()
+        scanner = TlogScanner()
+        offset = 0
+        data = b" "
+        while data:
+            data = self.read(offset, READ_SIZE)
+            batch = scanner.feed(data, final=not data)
+            self.index.add(batch)
+            if answers is not None:
+                answers.note(batch, self.index.stations)
+            offset += len(data)
+            if progress is not None:
+                progress(len(data))
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to so many bytes; nothing at the end, or where the medium fails."""
+        try:
+            return os.pread(self._file, size, offset)
+        except OSError:
+            return b""
+
+    @property
+    def last_us(self) -> int:
+        """Greatest time; 0 in an empty file."""
+        return self.index.last_us or 0
+
+    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
+        """Tell that everything is there."""
+        return True
+
+    def close(self) -> None:
+        """Close the file; its tracks end."""
+        os.close(self._file)

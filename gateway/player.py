@@ -1,0 +1,216 @@
+"""The player's composition root: recordings opened, laid out as vehicles, played to a hub.
+
+It stands beside `daemon.py`, for whoever starts a playback: the command line, a page, a test.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.config import GatewaySettings
+from gateway.edges.clock import GatewayClock
+from gateway.edges.disk.player_edge import PlayerEdge
+from gateway.edges.hub.hub import Hub
+from gateway.edges.operator.control_socket import ControlServer, socket_path
+from gateway.edges.operator.control_verbs import PlayerVerbs
+from gateway.flightlog.answers import VehicleAnswers
+from gateway.flightlog.moment import Moment, place_in
+from gateway.flightlog.playback import Player
+from gateway.flights.opening import PlayedFlight
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.routing.endpoint import parse_endpoint, stays_here
+from gateway.routing.hub_settings import HubSettings
+from gateway.units import US_PER_S
+from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
+from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, sequence_of
+
+READY_S: Final = 3.0
+"""A name that takes longer to be resolved is not waited for."""
+READY_STEP_S: Final = 0.01
+RESOLVING: Final = "resolving"
+
+
+@dataclass(frozen=True, slots=True)
+class PlayPlan:
+    """How to play: range, speed, silences, and what of the recording."""
+
+    begin: Moment | None = None
+    end: Moment | None = None
+    speed: float = 1.0
+    max_gap_s: float | None = None
+    loop: bool = False
+    paused: bool = False
+    with_commands: bool = False
+    """Play too what stations said and what else asks something of a vehicle."""
+    commands_anywhere: bool = False
+    """Let recorded commands leave this machine; the user was asked."""
+
+
+def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
+    """Fuse tables up to the begin that the user wants."""
+    tracks = [track for flight in flights for track in flight.tracks]
+    if plan.begin is not None:
+        begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
+        while not all(track.prepare(begin_us) for track in tracks):
+            pass
+
+
+def endpoints_beyond(settings: HubSettings) -> list[str]:
+    """Return the endpoints that are not on this machine alone."""
+    return [url for url in settings.endpoints if not stays_here(parse_endpoint(url))]
+
+
+class PlayerDaemon:
+    """A player with its clients: frames of recordings out, answers to what clients ask.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        The hub's.
+    flights : sequence of PlayedFlight
+        What is played.
+    plan : PlayPlan
+        How.
+    files : sequence of str
+        Names to show.
+
+    Raises
+    ------
+    ValueError
+        If recorded commands would leave this machine and nobody was asked.
+    """
+
+    def __init__(
+        self,
+        settings: GatewaySettings,
+        flights: Sequence[PlayedFlight],
+        plan: PlayPlan,
+        files: Sequence[str],
+    ) -> None:
+        if plan.with_commands and not plan.commands_anywhere and endpoints_beyond(settings.hub):
+            raise ValueError("recorded commands stay on this machine unless the user says yes")
+        self._now_us = GatewayClock()
+        self._plan = plan
+        self._player = self._make_player(flights)
+        self._hub = Hub(settings.hub, self._on_frame, self._now_us, on_gone=self._on_gone)
+        self._numbering = _Numbering()
+        self._vehicles = [
+            RecordedVehicle(played_as, self._answers_of(flight, system_id, played_as))
+            for flight in flights
+            for system_id, played_as in flight.system_ids.items()
+        ]
+        self._timer: asyncio.TimerHandle | None = None
+        self.ended = asyncio.Event()
+        self.edge = PlayerEdge(
+            self._player, self._send, self._now_us, files=files, on_end=self.ended.set
+        )
+        self._control = ControlServer(socket_path("play"))
+        PlayerVerbs(self.edge).register(self._control)
+
+    async def start(self) -> None:
+        """Open everything and begin; raises ControlError if another player runs."""
+        await self._control.start()
+        self._hub.start()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(READY_S):
+                while any(client.state == RESOLVING for client in self._hub.clients()):
+                    await asyncio.sleep(READY_STEP_S)
+        self.edge.start()
+        if not self._plan.paused:
+            self.edge.resume()
+
+    def close(self) -> None:
+        """End everything."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self.edge.close()
+        self._control.close()
+        self._hub.close()
+
+    def _make_player(self, flights: Sequence[PlayedFlight]) -> Player:
+        plan = self._plan
+        tracks = [track for flight in flights for track in flight.tracks]
+        first_us = min(track.first_us for track in tracks)
+        player = Player(
+            tracks,
+            self._now_us(),
+            speed=plan.speed,
+            begin_us=None if plan.begin is None else place_in(plan.begin, first_us),
+            end_us=None if plan.end is None else place_in(plan.end, first_us),
+            max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
+            loop=plan.loop,
+        )
+        # It waits for the network, and then if the user wants it to.
+        player.pause(self._now_us())
+        return player
+
+    def _answers_of(self, flight: PlayedFlight, system_id: int, played_as: int) -> VehicleAnswers:
+        return VehicleAnswers(
+            flight.answers,
+            system_id,
+            played_as,
+            lambda: self._player.position_us - flight.shift_us,
+        )
+
+    def _send(self, frames: Iterable[bytes]) -> None:
+        for frame in frames:
+            self._hub.send(Outgoing(self._numbering.played(frame), message_id_of(frame)))
+
+    def _on_frame(self, incoming: Incoming) -> None:
+        for vehicle in self._vehicles:
+            self._perform(vehicle.handle(incoming, self._now_us()))
+        self._poll()
+
+    def _on_gone(self, client_id: int) -> None:
+        for vehicle in self._vehicles:
+            vehicle.forget_client(client_id)
+
+    def _perform(self, actions: Iterable[RecordedAction]) -> None:
+        for action in actions:
+            if isinstance(action, ClientInterval):
+                self._hub.set_interval(action)
+            else:
+                frame = self._numbering.inserted(action.frame)
+                self._hub.send(Outgoing(frame, action.message_id, action.client_id))
+
+    def _poll(self) -> None:
+        """Send what is due of long answers, and come again when more is."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        for vehicle in self._vehicles:
+            self._perform(vehicle.poll(self._now_us()))
+        due_us = min(
+            (due for vehicle in self._vehicles if (due := vehicle.next_due_us()) is not None),
+            default=None,
+        )
+        if due_us is not None:
+            wait_s = max(due_us - self._now_us(), 0) / US_PER_S
+            self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
+
+
+class _Numbering:
+    """Sequence numbers: an answer between recorded frames must not look like a loss.
+
+    Until the first answer of a sender its frames are played byte for byte.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[int, int], int] = {}
+        self._added: dict[tuple[int, int], int] = {}
+
+    def played(self, frame: bytes) -> bytes:
+        """Give a recorded frame its number behind what was added."""
+        origin = origin_of(frame)
+        sequence = sequence_of(frame) + self._added.get(origin, 0) & 0xFF
+        self._last[origin] = sequence
+        return restamp(frame, sequence)
+
+    def inserted(self, frame: bytes) -> bytes:
+        """Give an answer its number, in addition to what was recorded."""
+        origin = origin_of(frame)
+        sequence = self._last[origin] = self._last.get(origin, 0xFF) + 1 & 0xFF
+        self._added[origin] = self._added.get(origin, 0) + 1
+        return restamp(frame, sequence)

@@ -1,0 +1,24 @@
+"""`mavgate play` asks before recorded commands leave this machine."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+
+pytestmark = pytest.mark.io
+
+
+def test_without_a_yes_no_command_leaves_this_machine(tmp_path: Path) -> None:
+    file = str(tmp_path / "missing.tlog")
+    away = ("--endpoint", "udp:tablet.example:14550")
+    asked = CliRunner().invoke(app, ["play", file, "--with-commands", *away], input="n\n")
+    assert asked.exit_code == 1
+    assert "udp:tablet.example:14550" in asked.output
+    for options in (("--yes", *away), ("--endpoint", "udp:127.0.0.1:14550")):
+        # They get as far as the file.
+        done = CliRunner().invoke(app, ["play", file, "--with-commands", *options])
+        assert (done.exit_code, "No such file" in done.output) == (2, True)
+    plain = CliRunner().invoke(app, ["play", file, *away])
+    assert (plain.exit_code, "No such file" in plain.output) == (2, True)

@@ -1,0 +1,154 @@
+"""The player whole, on the event loop: what reaches a client, and what it is answered."""
+
+import asyncio
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.opening import lay_out, open_flights
+from gateway.flights.reading import ReadOptions
+from gateway.pipeline import PipelineSettings
+from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
+from tests.flightlog.frames import START_US, make_tlog
+
+pytestmark = pytest.mark.io
+
+PARAMETERS = 26
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+LIMIT_S = 60
+
+
+def recording() -> list[TlogRecord]:
+    """Vehicle 3 tells its parameters, and station 255 arms it."""
+    vehicle, station = mavlink.MAVLink(None, 3, 1), mavlink.MAVLink(None, 255, 190)
+    said: list[tuple[Any, Any]] = [(vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
+    said += [
+        (vehicle, mavlink.MAVLink_param_value_message(f"P{i}".encode(), i, 9, PARAMETERS, i))
+        for i in range(PARAMETERS)
+    ]
+    arm = mavlink.MAVLink_command_long_message(3, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    said += [(station, arm), (vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
+    records = []
+    for i, (who, message) in enumerate(said):
+        records.append(TlogRecord(START_US + i, bytes(message.pack(who))))
+        who.seq = (who.seq + 1) % 256
+    return records
+
+
+class Station:
+    """A bare client on the event loop."""
+
+    def __init__(self) -> None:
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sock.bind(("127.0.0.1", 0))
+        self.sock.setblocking(False)
+        self.mav = mavlink.MAVLink(None, 255, 190)
+        self.frames: list[bytes] = []
+        self.peer: Any = None
+
+    @property
+    def url(self) -> str:
+        return f"udp:127.0.0.1:{self.sock.getsockname()[1]}"
+
+    async def until(self, count: int) -> None:
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(LIMIT_S):
+            while len(self.frames) < count:
+                frame, self.peer = await loop.sock_recvfrom(self.sock, 2048)
+                self.frames.append(frame)
+
+    def send(self, message: Any) -> None:
+        self.sock.sendto(message.pack(self.mav), self.peer)
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    station = Station()
+    yield station
+    station.sock.close()
+
+
+@pytest.fixture
+def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ExitStack]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "a.tlog").write_bytes(make_tlog(recording()))
+    with ExitStack() as stack:
+        yield stack
+
+
+def settings_of(*endpoints: str) -> GatewaySettings:
+    settings = GatewaySettings()
+    return msgspec.structs.replace(
+        settings,
+        hub=msgspec.structs.replace(settings.hub, endpoints=endpoints, ping_interval_s=0.0),
+    )
+
+
+def make_daemon(
+    folder: Path, opened: ExitStack, settings: GatewaySettings, **plan: Any
+) -> PlayerDaemon:
+    flights = open_flights([folder / "a.tlog"], OPTIONS, opened)
+    played = lay_out(flights, with_commands=plan.get("with_commands", False))
+    return PlayerDaemon(settings, played, PlayPlan(**plan), ["a.tlog"])
+
+
+@pytest.mark.parametrize("with_commands", [False, True])
+async def test_what_stations_said_is_played_only_to_who_asks(
+    tmp_path: Path, opened: ExitStack, station: Station, with_commands: bool
+) -> None:
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url), with_commands=with_commands)
+    await daemon.start()
+    wanted = [r.frame for r in recording() if with_commands or r.frame[5] == 3]
+    await station.until(len(wanted))
+    daemon.close()
+    assert station.frames == wanted
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "udp:tablet.example:14550",
+        "udp-listen:0.0.0.0:14550",
+        "udp-broadcast:127.255.255.255:14550",
+        "serial:/dev/ttyUSB0:57600",
+        "tcp:drone.example:5760",
+    ],
+)
+def test_commands_leave_this_machine_only_after_a_yes(
+    tmp_path: Path, opened: ExitStack, url: str
+) -> None:
+    settings = settings_of("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
+    assert endpoints_beyond(settings.hub) == [url]
+    with pytest.raises(ValueError, match="yes"):
+        make_daemon(tmp_path, opened, settings, with_commands=True)
+    make_daemon(tmp_path, opened, settings, with_commands=True, commands_anywhere=True)
+    make_daemon(tmp_path, opened, settings)
+
+
+async def test_every_parameter_arrives_and_none_looks_lost(
+    tmp_path: Path, opened: ExitStack, station: Station
+) -> None:
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url))
+    await daemon.start()
+    await station.until(PARAMETERS + 2)
+    station.frames.clear()
+    station.send(mavlink.MAVLink_param_request_list_message(3, 1))
+    await station.until(PARAMETERS)
+    daemon.edge.seek(0.0)
+    daemon.edge.resume()
+    await station.until(2 * PARAMETERS + 2)
+    daemon.close()
+    answers = [mavlink.MAVLink(None).decode(bytearray(f)) for f in station.frames[:PARAMETERS]]
+    assert [(m.param_id, m.param_count) for m in answers] == [
+        (f"P{i}", PARAMETERS) for i in range(PARAMETERS)
+    ]
+    # What was played before ended with 27; the answers go on from there.
+    assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(28, 28 + PARAMETERS))
