@@ -71,8 +71,8 @@ MAG_SAMPLES: Final = 2000
 MIN_MAG_SAMPLES: Final = 100
 FIT_EVERY: Final = 50
 
-SIDES: Final = ("front", "back", "left", "right", "down", "up")
-"""Which side points down when +x, -x, +y, -y, +z, -z reads plus one gravity."""
+SIDES: Final = ("back", "front", "left", "right", "up", "down")
+"""Which side lies below when +x, -x, +y, -y, +z, -z reads plus one gravity; level is "down"."""
 
 
 @dataclass(slots=True)

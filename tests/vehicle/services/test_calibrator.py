@@ -88,6 +88,23 @@ def test_simple_accelerometer(station: GroundStation) -> None:
     assert measured(station).error_b == pytest.approx((0.3, -0.2, 0.1), abs=0.005)
 
 
+@pytest.mark.parametrize(
+    ("roll_deg", "pitch_deg", "below"),
+    [
+        (0, 0, "down"), (180, 0, "up"), (-90, 0, "left"), (90, 0, "right"),
+        (0, -90, "front"), (0, 90, "back"),
+    ],
+)  # fmt: skip
+def test_a_side_is_named_by_what_lies_below(
+    station: GroundStation, roll_deg: float, pitch_deg: float, below: str
+) -> None:
+    """As the pictures of QGroundControl are named: level is "down", a bank to the left "left"."""
+    q_nb = from_euler(math.radians(roll_deg), math.radians(pitch_deg), 0.0)
+    station.command(CALIBRATE, *SIX_SIDES)
+    found = run(station, 2.5, rest(accel=rotate_inverse(q_nb, (0.0, 0.0, -G))))
+    assert [text.split()[0] for text in cal_texts(found) if "side done" in text] == [below]
+
+
 def test_accelerometer_on_six_sides(station: GroundStation) -> None:
     bias = np.array((0.3, -0.2, 0.1))
     assert acks(station.command(CALIBRATE, *SIX_SIDES)) == [IN_PROGRESS]
@@ -99,7 +116,8 @@ def test_accelerometer_on_six_sides(station: GroundStation) -> None:
             found += run(station, 0.5, lambda t: {"gyro_b_radps": (3.0 * math.sin(9.0 * t),) * 3})
     assert acks(found)[-1] == ACCEPTED
     sides = [text.split()[0] for text in cal_texts(found) if "side done" in text]
-    assert sides == ["front", "back", "left", "right", "down"]
+    # Specific force points away from the ground: along +x the tail lies below, along -z the belly.
+    assert sides == ["back", "front", "left", "right", "up"]
     assert measured(station).error_b == pytest.approx(tuple(bias), abs=0.005)
 
 
