@@ -90,7 +90,7 @@ class Daemon:
             settings.hub,
             self._on_frame,
             self.now_us,
-            on_foreign=self._on_foreign,
+            on_foreign=lambda frame: self._recorder.frame(frame),
             on_gone=self._pipeline.forget_client,
             on_trouble=self._on_trouble,
             seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us()),
@@ -103,7 +103,6 @@ class Daemon:
             self._announce,
             lambda vehicle_id: self._pipeline.aircraft[vehicle_id].fusion_state,
         )
-        self._heard: bytes | None = None
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
@@ -233,17 +232,16 @@ class Daemon:
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         self._perform(self._pipeline.feed(data, now_us))
 
-    def _on_foreign(self, frame: bytes) -> None:
-        # A ground station's broadcast comes both to us and past us.
-        if frame is not self._heard:
-            self._recorder.frame(frame)
-
     def _on_frame(self, incoming: Incoming) -> None:
-        self._heard = incoming.frame
-        self._recorder.frame(incoming.frame)
+        # A ground station's broadcast comes both to us and past us.
+        if not incoming.forwarded:
+            self._recorder.frame(incoming.frame)
         self._perform(self._pipeline.handle(incoming, self.now_us()))
 
     def _poll(self) -> None:
+        # First of all: whatever happens below, the next turn comes.
+        loop = asyncio.get_running_loop()
+        self._timer = loop.call_later(LONGEST_WAIT_S, self._poll)
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
         for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
@@ -254,7 +252,8 @@ class Daemon:
         self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
-        self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
+        self._timer.cancel()
+        self._timer = loop.call_later(wait_s, self._poll)
 
     def _perform(self, actions: Iterable[Action]) -> None:
         """Do outside what the pure stages decided."""

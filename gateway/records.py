@@ -340,3 +340,5 @@ class Incoming:
     frame: bytes
     trusted: bool
     """Whether the settings let this client change state."""
+    forwarded: bool = False
+    """Whether it also goes to other systems, and so past whoever sees what passes."""

@@ -11,6 +11,7 @@ from rich.logging import RichHandler
 from gateway import __version__
 from gateway.cli.live import calibrate, clients, demo, panel, record, run, setup
 from gateway.cli.recorded import convert, fuse, info, play, report, sweep
+from gateway.edges.operator.log_limit import LogLimit
 from gateway.extensions import ExtensionError, load_extensions
 
 app = typer.Typer(
@@ -52,11 +53,13 @@ def _options(
     ] = False,
 ) -> None:
     level = logging.DEBUG if verbose else logging.INFO
+    form = "%(asctime)s %(levelname)s %(message)s"
+    handler: logging.Handler = logging.StreamHandler()
     if sys.stderr.isatty():
-        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
-        logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
-    else:
-        logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s")
+        form = "%(message)s"
+        handler = RichHandler(console=Console(stderr=True), show_path=False)
+    handler.addFilter(LogLimit())
+    logging.basicConfig(level=level, format=form, handlers=[handler])
 
 
 def main() -> None:

@@ -78,6 +78,8 @@ class HubCounters:
     """Frames of ours that came back."""
     unroutable: int = 0
     """Frames for a system that nobody has heard, or from one who may not."""
+    unserved: int = 0
+    """Requests given up since their client asks for more than its share."""
 
 
 @dataclass(slots=True)
@@ -114,7 +116,7 @@ class ClientTable:
         return len(self._by_address)
 
     def is_full(self, now_us: int) -> bool:
-        """Tell whether there is no room and nobody has been silent for long; soon told."""
+        """Return whether there is no room and nobody has been silent for long; soon told."""
         return len(self) >= self.max_clients and now_us < self._full_until_us
 
     def presences(self) -> tuple[Presence, ...]:

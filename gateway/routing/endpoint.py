@@ -9,15 +9,17 @@
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
 IPv6 addresses stand in brackets. Options follow as in any URL:
-`?name=tablet&deny=RAW_IMU&pack=1100`.
+`?name=tablet&deny=RAW_IMU&pack=1100`. What other programs write is understood too: `spelling.py`.
 """
 
 import ipaddress
+import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl
 
+from gateway.routing.spelling import respell
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
@@ -25,7 +27,13 @@ MAX_PACK_BYTES: Final = 1100
 """Routers on the way cut or drop datagrams beyond 1120 bytes."""
 MAX_PORT: Final = 65535
 DEFAULT_BAUD: Final = 57600
+MIN_BAUD: Final = 300
+MAX_BAUD: Final = 12_000_000
+"""The fastest USB adapters."""
 MAX_NAME: Final = 64
+MAX_MESSAGE_ID: Final = (1 << 24) - 1
+MIN_RATE_HZ: Final = 0.001
+_HOST: Final = re.compile(r"[\w.-]+")
 
 NO_MESSAGES: Final = -1
 """An interval that stops a message."""
@@ -71,7 +79,7 @@ class Endpoint:
     port: int
     """Port number; the baud rate of a serial port."""
     place: str
-    """The URL without options; no two endpoints share one."""
+    """The URL in our own spelling and without options; no two endpoints share one."""
     name: str
     """What the operator calls it; the place unless given."""
     allow: frozenset[int] = frozenset()
@@ -91,7 +99,7 @@ class Endpoint:
         return self.host if serial else host_and_port(self.host, self.port)
 
     def passes(self, message_id: int) -> bool:
-        """Tell whether the lists let a message out to this endpoint."""
+        """Return whether the lists let a message out to this endpoint."""
         return message_id not in self.deny and (not self.allow or message_id in self.allow)
 
 
@@ -116,20 +124,17 @@ def parse_endpoint(url: str) -> Endpoint:
         If anything in it is not understood; the text says what is allowed.
     """
     address, _, query = url.partition("?")
-    word, _, place = address.partition(":")
-    if word not in set(EndpointKind):
-        raise ValueError(f"endpoint {url!r}: {word!r} is none of {', '.join(EndpointKind)}")
-    kind = EndpointKind(word)
-    host, port = _split_place(url, kind, place)
-    options = _options(url, query)
     try:
+        kind, place = _kind_and_place(address)
+        host, port = _split_place(kind, place)
+        options = _options(query)
         return Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            place=address,
-            name=options.get("name", address)[:MAX_NAME],
+            place=f"{kind}:{place}",
+            name=_name(options.get("name", f"{kind}:{place}")),
             allow=_messages(options.get("allow", "")),
             deny=_messages(options.get("deny", "")),
             interval_us=_intervals(options.get("rate", "")),
@@ -154,35 +159,64 @@ def message_id_from(text: str) -> int:
         If no message has that name.
     """
     if text.isdecimal():
-        return int(text)
+        return _number(text, "message id", 0, MAX_MESSAGE_ID)
     try:
         return MESSAGE_IDS[text.upper()]
     except KeyError:
         raise ValueError(f"no MAVLink message is called {text!r}") from None
 
 
-def _split_place(url: str, kind: EndpointKind, place: str) -> tuple[str, int]:
+def _kind_and_place(address: str) -> tuple[EndpointKind, str]:
+    if not address.isprintable():
+        raise ValueError("it cannot be shown")
+    word, place = respell(address)
+    if word not in set(EndpointKind):
+        raise ValueError(f"{word!r} is none of {', '.join(EndpointKind)}")
+    return EndpointKind(word), place
+
+
+def _split_place(kind: EndpointKind, place: str) -> tuple[str, int]:
     if kind is EndpointKind.SERIAL:
         device, colon, baud = place.rpartition(":")
         if not colon:
-            return place, DEFAULT_BAUD
-        if not baud.isdecimal() or not int(baud):
-            raise ValueError(f"endpoint {url!r}: {baud!r} is no baud rate")
-        return device, int(baud)
+            device, baud = place, str(DEFAULT_BAUD)
+        if not device:
+            raise ValueError(f"write {kind}:DEVICE:BAUD, as in {kind}:/dev/ttyUSB0:57600")
+        return device, _number(baud, "baud rate", MIN_BAUD, MAX_BAUD)
     host, _, port = place.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     if not host or (":" in host and not bracketed):
-        raise ValueError(f"endpoint {url!r}: write {kind}:HOST:PORT, an IPv6 host in [brackets]")
-    if not port.isdecimal() or int(port) > MAX_PORT:
-        raise ValueError(f"endpoint {url!r}: port {port!r} is not 0 to {MAX_PORT}")
-    host = host.strip("[]")
+        raise ValueError(f"write {kind}:HOST:PORT, an IPv6 host in [brackets]")
+    number = _number(port, "port", 0, MAX_PORT)
+    host = host[1:-1] if bracketed else host
     if kind in OPEN_TO_ALL and not is_numeric(host):
-        raise ValueError(f"endpoint {url!r}: {host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
-    return host, int(port)
+        raise ValueError(f"{host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
+    if not is_numeric(host) and not _is_name(host):
+        raise ValueError(f"{host!r} is neither an address nor a name")
+    return host, number
+
+
+def _number(text: str, what: str, low: int, high: int) -> int:
+    # A number of thousands of digits is refused by Python itself, in words about Python.
+    if not text.isascii() or not text.isdecimal() or len(text) > len(str(high)):
+        raise ValueError(f"{what} {text!r} is not {low} to {high}")
+    if not low <= int(text) <= high:
+        raise ValueError(f"{what} {text} is not {low} to {high}")
+    return int(text)
+
+
+def _is_name(host: str) -> bool:
+    """Return whether the resolver would take it; one that does not raises each time it is asked."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    # Four numbers with a slip of the hand are no name either.
+    return _HOST.fullmatch(host) is not None and not host.replace(".", "").isdecimal()
 
 
 def is_numeric(host: str) -> bool:
-    """Tell whether a host is an address and not a name."""
+    """Return whether a host is an address and not a name."""
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -191,7 +225,7 @@ def is_numeric(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether an address is one of this machine alone; a name is none but `localhost`."""
+    """Return whether an address is one of this machine alone; a name is none but `localhost`."""
     if host == "localhost":
         return True
     if not is_numeric(host):
@@ -202,18 +236,29 @@ def is_loopback(host: str) -> bool:
 
 
 def stays_here(endpoint: Endpoint) -> bool:
-    """Tell whether nothing that goes to an endpoint can leave this machine."""
+    """Return whether nothing that goes to an endpoint can leave this machine."""
     return endpoint.kind in HOSTED and is_loopback(endpoint.host)
 
 
-def _options(url: str, query: str) -> dict[str, str]:
+def _options(query: str) -> dict[str, str]:
+    """Read the options; each may be there once, or it would hang on the order which one holds."""
     known = {"name", "allow", "deny", "rate", "pack", "trusted"}
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    if unknown := options.keys() - known:
-        raise ValueError(
-            f"endpoint {url!r}: option {min(unknown)!r} is none of {', '.join(sorted(known))}"
-        )
+    options: dict[str, str] = {}
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in known:
+            raise ValueError(f"option {key!r} is none of {', '.join(sorted(known))}")
+        if key in options:
+            raise ValueError(f"option {key!r} is there twice")
+        if ";" in value:
+            raise ValueError(f"{key}={value!r}: options are joined by &")
+        options[key] = value
     return options
+
+
+def _name(text: str) -> str:
+    if not text.strip() or not text.isprintable():
+        raise ValueError(f"name {text!r} cannot be shown")
+    return text[:MAX_NAME]
 
 
 def _messages(text: str) -> frozenset[int]:
@@ -228,17 +273,15 @@ def _intervals(text: str) -> dict[int, int]:
             rate_hz = float(rate)
         except ValueError:
             raise ValueError(f"rate {part!r} is not NAME:hertz") from None
-        if not 0 <= rate_hz <= US_PER_S:
-            raise ValueError(f"rate {part!r} is not 0 to {US_PER_S} Hz")
+        if not (rate_hz == 0 or MIN_RATE_HZ <= rate_hz <= US_PER_S):
+            raise ValueError(f"rate {part!r} is not 0, or {MIN_RATE_HZ} to {US_PER_S} Hz")
         interval = round(US_PER_S / rate_hz) if rate_hz else NO_MESSAGES
         intervals[message_id_from(message)] = interval
     return intervals
 
 
 def _pack_bytes(text: str) -> int:
-    if not text.isdecimal() or int(text) > MAX_PACK_BYTES:
-        raise ValueError(f"pack {text!r} is not 0 to {MAX_PACK_BYTES}")
-    return int(text)
+    return _number(text, "pack", 0, MAX_PACK_BYTES)
 
 
 def _yes_or_no(text: str | None) -> bool | None:

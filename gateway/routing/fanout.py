@@ -12,7 +12,7 @@ all outlets that lack the same number share one copy, which is signed too if our
 Frames of other vehicles are never touched; a filter on those does show as loss.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -153,13 +153,27 @@ class Fanout:
         for stamp in plan.closed:
             _skip(stamp)
 
-    def answer(self, frame: bytes, client_id: int) -> None:
-        """Send one of our own frames to one outlet only, past its filters."""
+    def align(self, client_ids: Sequence[int]) -> None:
+        """Let outlets be sent the same from now on, number for number: they lead to one peer.
+
+        What one of them wishes holds for all; where they differ, the first decides.
+        """
+        outlets = [self._outlets[key] for key in client_ids if key in self._outlets]
+        origins = {origin for outlet in outlets for origin in outlet.stamps}
+        wishes = {k: v for outlet in reversed(outlets) for k, v in outlet.wishes.items()}
+        for outlet in outlets:
+            outlet.wishes = dict(wishes)
+            for origin in origins:
+                outlet.stamp_of(origin).skipped = outlets[0].stamp_of(origin).skipped
+        self._plans.clear()
+
+    def answer(self, frame: bytes, client_ids: Collection[int]) -> None:
+        """Send one of our own frames to some outlets only, past their filters."""
         origin = origin_of(frame)
         # A copy: an outlet that breaks at this frame removes itself.
         for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
-            if outlet.client_id == client_id:
+            if outlet.client_id in client_ids:
                 sequence = sequence_of(frame) - stamp.skipped & SEQUENCE_MASK
                 outlet.transmit(self._seal(frame, sequence), message_id_of(frame))
             else:

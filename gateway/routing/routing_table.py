@@ -10,6 +10,8 @@ first frames from another port.
 
 One deviation: what a ground station says to everybody goes only where there are vehicles. Stations
 have nothing to tell each other, and scripts take the first heartbeat they hear for the vehicle's.
+
+Only trusted clients belong in here: whoever may write into these tables decides who hears what.
 """
 
 from dataclasses import dataclass
@@ -20,11 +22,10 @@ from gateway.units import US_PER_S
 Origin = tuple[int, int]
 """System and component id."""
 
-MAX_ORIGINS: Final = 32
-"""Remembered per client; more are forged, or a network beyond what this table is for."""
+MAX_ORIGINS: Final = 256
+"""Remembered per client: every system there can be, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A way on which a system has spoken so lately is preferred to ways on which it fell silent."""
-MAX_STATIONS: Final = 256
 MEMORY_US: Final = US_PER_S
 """Copies come within a radio's delay; most links take longer to use up the sequence numbers."""
 MEMORY_FRAMES: Final = 8192
@@ -38,65 +39,86 @@ class _Way:
     since_us: int
     """Its first frame after a silence."""
     heard_us: int
+    is_station: bool = False
+    """What its last heartbeat by this way said."""
 
     def is_fresh(self, now_us: int) -> bool:
         return now_us - self.heard_us <= ROUTE_FRESH_US
 
 
 class RoutingTable:
-    """Which client has spoken for which system."""
+    """Which client has spoken for which system.
 
-    def __init__(self) -> None:
-        self._heard: dict[int, dict[Origin, _Way]] = {}
-        self._stations: set[Origin] = set()
+    Parameters
+    ----------
+    max_origins : int, optional
+        Remembered per client; a newcomer takes the place of the one that is silent longest.
+    """
+
+    def __init__(self, max_origins: int = MAX_ORIGINS) -> None:
+        self._max_origins = max_origins
+        self._of_client: dict[int, dict[Origin, _Way]] = {}
+        self._to: dict[Origin, dict[int, _Way]] = {}
+        """The same ways by system and component."""
+        self._components: dict[int, set[Origin]] = {}
+        """By system."""
 
     def hear(self, client_id: int, origin: Origin, now_us: int) -> bool:
-        """Note that a client has brought a frame of a system; tell whether that is news."""
-        ways = self._heard.setdefault(client_id, {})
-        way = ways.get(origin)
-        if way is not None and way.is_fresh(now_us):
+        """Note that a client has brought a frame of a system.
+
+        Returns
+        -------
+        bool
+            Whether it is news of which others must know: a further way to a system.
+        """
+        ways = self._to.get(origin)
+        way = ways.get(client_id) if ways else None
+        if way is None:
+            return self._discover(client_id, origin, now_us)
+        if way.is_fresh(now_us):
             way.heard_us = now_us
             return False
-        if way is not None or len(ways) < MAX_ORIGINS:
-            ways[origin] = _Way(now_us, now_us)
-        return True
+        way.since_us = way.heard_us = now_us
+        return len(self._to[origin]) > 1
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
-        """Tell whether a system has been heard of late by more than one way."""
-        ways = (ways.get(origin) for ways in self._heard.values())
-        return sum(way is not None and way.is_fresh(now_us) for way in ways) > 1
+        """Return whether a system has been heard of late by more than one way."""
+        ways = self._to.get(origin)
+        if ways is None or len(ways) == 1:
+            return False
+        return sum(way.is_fresh(now_us) for way in ways.values()) > 1
 
     def since_us(self, client_id: int, origin: Origin) -> int:
         """Return since when a client has brought a system's frames without a long silence."""
-        way = self._heard.get(client_id, {}).get(origin)
+        way = self._to.get(origin, {}).get(client_id)
         return 0 if way is None else way.since_us
 
-    def note_kind(self, origin: Origin, *, is_station: bool) -> None:
-        """Note what a heartbeat says of its sender."""
-        if not is_station:
-            self._stations.discard(origin)
-        elif len(self._stations) < MAX_STATIONS:
-            self._stations.add(origin)
+    def note_kind(self, client_id: int, origin: Origin, *, is_station: bool) -> None:
+        """Note what a heartbeat that a client brought says of its sender."""
+        if way := self._to.get(origin, {}).get(client_id):
+            way.is_station = is_station
 
     def is_station(self, origin: Origin) -> bool:
-        """Tell whether a system and component is a ground station."""
-        return origin in self._stations
+        """Return whether a system and component is a ground station."""
+        ways = self._to.get(origin)
+        return ways is not None and any(way.is_station for way in ways.values())
 
     def ways_to_vehicles(self, source_id: int) -> list[int]:
         """Return the clients, but the source, behind which there is more than ground stations."""
         return [
             client_id
-            for client_id, origins in self._heard.items()
-            if client_id != source_id and not origins.keys() <= self._stations
+            for client_id, ways in self._of_client.items()
+            if client_id != source_id and not all(way.is_station for way in ways.values())
         ]
 
     def forget(self, client_id: int) -> None:
         """Drop what a client has said."""
-        self._heard.pop(client_id, None)
+        for origin in self._of_client.pop(client_id, {}):
+            self._drop(client_id, origin)
 
     def origins(self, client_id: int) -> tuple[Origin, ...]:
         """Return the systems and components heard from a client, first heard first."""
-        return tuple(self._heard.get(client_id, ()))
+        return tuple(self._of_client.get(client_id, ()))
 
     def ways_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
         """Find the clients behind which a target is.
@@ -117,49 +139,75 @@ class RoutingTable:
             only if there is no other. Empty if the target is unknown.
         """
         system, component = target
-        of_system: dict[int, bool] = {}
-        exact: dict[int, bool] = {}
-        for client_id, ways in self._heard.items():
-            if client_id == source_id:
-                continue
-            fresh = [way.is_fresh(now_us) for (known, _), way in ways.items() if known == system]
-            if fresh:
-                of_system[client_id] = any(fresh)
-            if target in ways:
-                exact[client_id] = ways[target].is_fresh(now_us)
-        found = exact if component and exact else of_system
-        return [client_id for client_id, fresh in found.items() if fresh] or list(found)
+        exact = self._to.get(target, {}) if component else {}
+        known = self._components.get(system, set())
+        for origins in ({target} if exact.keys() - {source_id} else set(), known):
+            found: dict[int, bool] = {}
+            for origin in origins:
+                for client_id, way in self._to[origin].items():
+                    if client_id != source_id:
+                        found[client_id] = found.get(client_id, False) or way.is_fresh(now_us)
+            if found:
+                return sorted(key for key, fresh in found.items() if fresh) or sorted(found)
+        return []
+
+    def _discover(self, client_id: int, origin: Origin, now_us: int) -> bool:
+        known = self._of_client.setdefault(client_id, {})
+        if len(known) >= self._max_origins:
+            stalest = min(known, key=lambda each: known[each].heard_us)
+            if known[stalest].is_fresh(now_us):
+                # More live systems than there is room for: to keep this one would lose another.
+                return False
+            del known[stalest]
+            self._drop(client_id, stalest)
+        known[origin] = way = _Way(now_us, now_us)
+        self._to.setdefault(origin, {})[client_id] = way
+        self._components.setdefault(origin[0], set()).add(origin)
+        return len(self._to[origin]) > 1
+
+    def _drop(self, client_id: int, origin: Origin) -> None:
+        ways = self._to[origin]
+        del ways[client_id]
+        if not ways:
+            del self._to[origin]
+            components = self._components[origin[0]]
+            components.discard(origin)
+            if not components:
+                del self._components[origin[0]]
 
 
 class LoopGuard:
     """Remember the frames of the last second and tell copies."""
 
     def __init__(self) -> None:
-        self._recent: dict[bytes, int] = {}
-        self._older: dict[bytes, int] = {}
+        self._recent: dict[bytes, tuple[int, int]] = {}
+        self._older: dict[bytes, tuple[int, int]] = {}
         self._turned_us = 0
 
-    def is_copy(self, frame: bytes, since_us: int, now_us: int) -> bool:
-        """Note a frame; tell whether the same bytes have come before.
+    def first_way(self, frame: bytes, client_id: int, since_us: int, now_us: int) -> int | None:
+        """Note a frame; return who has brought the same bytes before.
 
         Parameters
         ----------
         frame : bytes
             A complete frame.
+        client_id : int
+            Who brings it.
         since_us : int
-            Since when its sender brings frames of that system; older ones are no copies.
+            Since when that client brings frames of that system; older ones are no copies.
         now_us : int
             Gateway time.
 
         Returns
         -------
-        bool
+        int or None
+            The client that was first, maybe the same one; None if the frame is no copy.
         """
         if now_us - self._turned_us >= MEMORY_US or len(self._recent) >= MEMORY_FRAMES:
             self._older, self._recent = self._recent, {}
             self._turned_us = now_us
-        known_us = self._recent.get(frame, self._older.get(frame))
-        if known_us is not None and known_us >= since_us:
-            return True
-        self._recent[frame] = now_us
-        return False
+        known = self._recent.get(frame) or self._older.get(frame)
+        if known is not None and known[0] >= since_us:
+            return known[1]
+        self._recent[frame] = (now_us, client_id)
+        return None

@@ -52,7 +52,7 @@ class OwnVehicles:
         return is_new
 
     def is_own(self, origin: Origin, now_us: int) -> bool:
-        """Tell whether a system and component is one of our vehicles."""
+        """Return whether a system and component is one of our vehicles."""
         seen_us = self._seen_us.get(origin)
         return seen_us is not None and now_us - seen_us <= OWN_FRESH_US
 

@@ -139,9 +139,12 @@ def message_id_of(frame: bytes) -> int:
 
 
 def is_station_heartbeat(frame: bytes) -> bool:
-    """Return whether a HEARTBEAT says that its sender is a ground station."""
-    at = (10 if frame[0] == START_V2 else 6) + HEARTBEAT_TYPE_OFFSET
-    return frame[1] > HEARTBEAT_TYPE_OFFSET and frame[at] == MAV_TYPE_GCS
+    """Return whether a HEARTBEAT says that its sender is a ground station.
+
+    Version 2 cuts trailing zeros off the payload, so a type beyond its end is 0: generic.
+    """
+    begin = 10 if frame[0] == START_V2 else 6
+    return frame[1] > HEARTBEAT_TYPE_OFFSET and frame[begin + HEARTBEAT_TYPE_OFFSET] == MAV_TYPE_GCS
 
 
 def is_signed(frame: bytes) -> bool:

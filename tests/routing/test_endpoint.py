@@ -27,6 +27,62 @@ def test_places(url: str, kind: EndpointKind, host: str, port: int) -> None:
     assert endpoint.name == url
 
 
+@pytest.mark.parametrize(
+    ("written", "place"),
+    [
+        ("udpin:0.0.0.0:14550", "udp-listen:0.0.0.0:14550"),
+        ("udpin://:14540", "udp-listen:0.0.0.0:14540"),
+        ("udp-listen::14550", "udp-listen:0.0.0.0:14550"),
+        ("udps:127.0.0.1:14550", "udp-listen:127.0.0.1:14550"),
+        ("udpout:127.0.0.1:14550", "udp:127.0.0.1:14550"),
+        ("udpout://127.0.0.1:14550", "udp:127.0.0.1:14550"),
+        ("udpc:127.0.0.1:14550", "udp:127.0.0.1:14550"),
+        ("127.0.0.1:14550", "udp:127.0.0.1:14550"),
+        ("localhost:14550", "udp:localhost:14550"),
+        ("ground.example:14550?name=x", "udp:ground.example:14550"),
+        ("[::1]:14550", "udp:[::1]:14550"),
+        ("udpbcast:127.255.255.255:14550", "udp-broadcast:127.255.255.255:14550"),
+        ("mcast:239.255.145.50:14550", "udp-multicast:239.255.145.50:14550"),
+        ("tcp://127.0.0.1:5760", "tcp:127.0.0.1:5760"),
+        ("tcpout://127.0.0.1:5760", "tcp:127.0.0.1:5760"),
+        ("tcpin:127.0.0.1:5760", "tcp-listen:127.0.0.1:5760"),
+        ("tcpin://:5760", "tcp-listen:0.0.0.0:5760"),
+        ("serial:///dev/ttyUSB0:57600", "serial:/dev/ttyUSB0:57600"),
+        ("/dev/ttyUSB0:57600", "serial:/dev/ttyUSB0:57600"),
+        ("/dev/ttyUSB0,57600", "serial:/dev/ttyUSB0:57600"),
+        ("/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
+    ],
+)
+def test_what_other_programs_write_means_what_they_mean(written: str, place: str) -> None:
+    endpoint = parse_endpoint(written)
+    assert endpoint.place == place
+    assert parse_endpoint(place).kind is endpoint.kind
+
+
+@pytest.mark.parametrize(
+    ("written", "right"),
+    [
+        ("udp://127.0.0.1:14550", ["udp-listen:127.0.0.1:14550", "udp:127.0.0.1:14550"]),
+        ("udp://127.0.0.1", ["udp-listen:127.0.0.1:PORT", "udp:127.0.0.1:PORT"]),
+        ("udp://:14540", ["udp-listen:0.0.0.0:14540", "udp:HOST:14540"]),
+        ("udp:0.0.0.0:14550", ["udp-listen:0.0.0.0:14550", "udp:HOST:14550"]),
+        ("udp::14550", ["udp-listen:0.0.0.0:14550", "udp:HOST:14550"]),
+        ("tcp:0.0.0.0:5760", ["tcp-listen:0.0.0.0:5760", "tcp:HOST:5760"]),
+    ],
+)
+def test_what_programs_differ_about_is_refused_with_both_spellings(
+    written: str, right: list[str]
+) -> None:
+    with pytest.raises(ValueError, match="to wait for callers there") as error:
+        parse_endpoint(written)
+    assert all(spelling in str(error.value) for spelling in right)
+
+
+def test_one_place_in_two_spellings_is_one_endpoint() -> None:
+    with pytest.raises(ValueError, match="twice"):
+        HubSettings(endpoints=("udp-listen:0.0.0.0:14550", "udpin://:14550"))
+
+
 def test_options() -> None:
     endpoint = parse_endpoint(
         "udp:10.0.0.7:14550?name=tablet&deny=RAW_IMU,105&rate=attitude:5,VFR_HUD:0"
@@ -54,19 +110,33 @@ def test_lists() -> None:
         ("udp:h:99999", "65535"),
         ("udp-listen:localhost:14550", "no address"),
         ("udp-multicast:group.example:14550", "no address"),
+        ("udp:127.0.0..1:14550", "neither an address nor a name"),
+        ("udp:127.0.0.256:14550", "neither an address nor a name"),
+        (f"udp:{'x' * 64}.example:14550", "neither an address nor a name"),
+        ("udp:a b:14550", "neither an address nor a name"),
+        ("udp:h:" + "9" * 5000, "65535"),
         ("serial:/dev/ttyUSB0:fast", "baud rate"),
+        ("serial:/dev/ttyUSB0:9999999999", "baud rate"),
+        ("serial:", "DEVICE"),
+        ("serial:/dev/tty\n:57600", "cannot be shown"),
         ("udp:h:1?colour=red", "colour"),
         ("udp:h:1?deny=NO_SUCH_MESSAGE", "NO_SUCH_MESSAGE"),
         ("udp:h:1?rate=ATTITUDE", "hertz"),
         ("udp:h:1?rate=ATTITUDE:-1", "Hz"),
         ("udp:h:1?rate=ATTITUDE:nan", "Hz"),
+        ("udp:h:1?rate=ATTITUDE:5e-324", "Hz"),
+        ("udp:h:1?deny=99999999", "message id"),
         ("udp:h:1?pack=1500", "1100"),
+        ("udp:h:1?trusted=no&trusted=yes", "'trusted' is there twice"),
+        ("udp:h:1?name=x;trusted=no", "joined by &"),
+        ("udp:h:1?name=%0a", "cannot be shown"),
         ("udp:h:1?trusted=maybe", "yes or no"),
     ],
 )
 def test_refusals_name_the_endpoint_and_what_is_allowed(url: str, words: str) -> None:
-    with pytest.raises(ValueError, match=r"endpoint .*" + words) as error:
+    with pytest.raises(ValueError, match=r"endpoint ") as error:
         parse_endpoint(url)
+    assert words in str(error.value)
     assert repr(url) in str(error.value)
 
 

@@ -80,7 +80,7 @@ def test_an_outlet_may_leave_while_it_is_sent_to(fanout: Fanout, vehicle: Vehicl
         frames.append(frame)
         fanout.remove(1)
 
-    for send in (lambda f: fanout.publish(f, 0), lambda f: fanout.answer(f, 1)):
+    for send in (lambda f: fanout.publish(f, 0), lambda f: fanout.answer(f, [1])):
         fanout.add(1, leave, parse_endpoint("tcp:h:1"))
         other = Outlet(fanout, 2)
         send(vehicle.attitude())
@@ -105,7 +105,7 @@ def test_an_answer_goes_to_one_and_leaves_no_gap_elsewhere(
 ) -> None:
     asker, other = Outlet(fanout, 1, "?deny=HEARTBEAT"), Outlet(fanout, 2)
     fanout.publish(vehicle.attitude(), 0)
-    fanout.answer(vehicle.heartbeat(), 1)
+    fanout.answer(vehicle.heartbeat(), [1])
     fanout.publish(vehicle.attitude(), 0)
     assert asker.message_ids == [ATTITUDE_ID, 0, ATTITUDE_ID]
     assert asker.sequences() == [0, 1, 2]
@@ -115,7 +115,7 @@ def test_an_answer_goes_to_one_and_leaves_no_gap_elsewhere(
 def test_systems_are_numbered_apart(fanout: Fanout) -> None:
     one, two = Vehicle(1), Vehicle(2)
     outlet = Outlet(fanout, 1)
-    fanout.answer(one.heartbeat(), 99)
+    fanout.answer(one.heartbeat(), [99])
     fanout.publish(one.attitude(), 0)
     fanout.publish(two.attitude(), 0)
     assert outlet.sequences() == [0, 0]

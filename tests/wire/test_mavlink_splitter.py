@@ -14,6 +14,7 @@ from gateway.wire.mavlink_splitter import (
     SplitFaultKind,
     is_frame,
     is_signed,
+    is_station_heartbeat,
     key_of,
     message_id_of,
     origin_of,
@@ -176,6 +177,22 @@ def test_keys_differ_by_system_component_message_and_version() -> None:
         V2,
     ]
     assert len({key_of(frame) for frame in others}) == len(others)
+
+
+@pytest.mark.parametrize("length", range(10))
+def test_a_heartbeat_cut_short_is_no_station_and_no_error(length: int) -> None:
+    """Cut zeros mean zero, and what follows the payload is no part of it."""
+    payload = bytes((0, 0, 0, 0, 6, 8, 0, 0, 3))[:length]
+    body = bytes((len(payload), 0, 0, 6, 7, 190, 0, 0, 0)) + payload
+    # The checksum may look like the type of a station.
+    frame = b"\xfd" + body + b"\x06\x06"
+    assert is_station_heartbeat(frame) is (length > 4)
+    assert is_station_heartbeat(bytes(dialect_v1_station())) is True
+
+
+def dialect_v1_station() -> bytes:
+    message = dialect_v1.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    return bytes(message.pack(dialect_v1.MAVLink(None, 7, 1)))
 
 
 class TestTarget:

@@ -52,7 +52,7 @@ class Client:
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
 
-    def become(self, state: str, error: OSError | ValueError | None = None) -> None:
+    def become(self, state: str, error: Exception | None = None) -> None:
         """Take on a state, and remember what led to it."""
         self.state = state
         self.reason = "" if error is None else reason_of(error)
@@ -63,6 +63,11 @@ class Client:
 
     def close(self) -> None:
         """Let go of the transport."""
+
+    def fail(self, error: Exception) -> None:
+        """Close after an error that nobody foresaw; the tick opens again what may be opened."""
+        self.become("unreachable", error)
+        self.close()
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Take over changed options of the same place."""
@@ -144,7 +149,7 @@ class HubContext(Protocol):
         """Return an id that no client had before."""
 
     def is_own(self, origin: Origin) -> bool:
-        """Tell whether a system and component is one of our vehicles."""
+        """Return whether a system and component is one of our vehicles."""
 
     def deliver(self, client: Client, frame: bytes, now_us: int) -> None:
         """Take one received frame."""
@@ -163,7 +168,7 @@ class HubContext(Protocol):
 
 
 def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
-    """Tell whether a peer may change state: as the URL says, else if named or on this machine."""
+    """Return whether a peer may change state: as the URL says, else if named or on this machine."""
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:

@@ -24,11 +24,6 @@ class GroupClient(DatagramClient):
     _own_address = ("", 0)
     _retry_us = 0
 
-    def __post_init__(self) -> None:
-        """Open at once if possible."""
-        super().__post_init__()
-        self.tick(self.context.now_us())
-
     def tick(self, now_us: int) -> None:
         """Open the sockets again if they failed."""
         if now_us < self._retry_us:

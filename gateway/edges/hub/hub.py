@@ -1,15 +1,17 @@
 """The hub: every frame of ours goes to every client, and what clients say finds its way."""
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 from gateway.edges.hub.client import Client
-from gateway.edges.hub.express import Express
 from gateway.edges.hub.group import GroupClient
 from gateway.edges.hub.listener import Listener
 from gateway.edges.hub.radio import RadioClient
+from gateway.edges.hub.router import Router
 from gateway.edges.hub.tcp import TcpClient, TcpListener
 from gateway.edges.hub.udp import UdpClient
 from gateway.edges.hub.udp_listen import UdpListener
@@ -20,25 +22,15 @@ from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.hub_settings import HubSettings
 from gateway.routing.probe import RoundTrip
-from gateway.routing.routing_table import LoopGuard, Origin, RoutingTable
+from gateway.routing.routing_table import Origin
 from gateway.routing.trouble import TroubleWatch
-from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
+from gateway.routing.vehicles import OwnVehicles
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import (
-    is_station_heartbeat,
-    key_of,
-    message_id_of,
-    origin_of,
-    restamp,
-    target_of,
-)
+from gateway.wire.mavlink_splitter import restamp
 
 log = logging.getLogger(__name__)
 
-MAX_EXPRESS: Final = 1024
-"""Kinds of frame a client; beyond a few hundred they are forged."""
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
 VISITS_IN_FULL: Final = 30
@@ -65,7 +57,8 @@ class Hub:
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame for our vehicles, every request to all, and every heartbeat.
+        Called with every frame for our vehicles, every request to all, and every heartbeat, as far
+        as its client's share of answers reaches.
     now_us : callable
         The gateway clock.
     on_foreign : callable, optional
@@ -91,25 +84,29 @@ class Hub:
         self.settings = settings
         self.seal = seal
         self.now_us = now_us
-        self._on_frame = on_frame
-        self._on_foreign = on_foreign
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()
         self._visits = Digest(VISITS_IN_FULL, "more comings and goings at listening ports")
         self._fanout = Fanout(seal)
-        self._table = RoutingTable()
-        self._guard = LoopGuard()
         self._probe = RoundTrip(seal)
         self._clients: dict[int, Client] = {}
-        self._express_sources: set[Client] = set()
         self._endpoints: dict[str, Client | Listener[Any]] = {}
         self._next_id = 1
         self._vehicles = OwnVehicles(seal)
+        self._router = Router(
+            self._clients,
+            self._fanout,
+            self._vehicles,
+            self._probe,
+            on_frame,
+            on_foreign,
+            now_us,
+        )
+        self.deliver = self._router.deliver
         self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._published = self._forwarded = self._duplicates = 0
-        self._looped = self._unroutable = 0
+        self._published = 0
 
     def start(self) -> None:
         """Open the endpoints; needs a running event loop. What fails is tried again."""
@@ -122,6 +119,7 @@ class Hub:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        self._router.close()
         for place in list(self._endpoints):
             self.remove(place)
 
@@ -131,18 +129,20 @@ class Hub:
         self._published += 1
         if self._vehicles.has_newcomers:
             self._welcome(frame)
+        self._router.charge(outgoing.client_id, len(frame))
         if outgoing.client_id is not None:
-            self._fanout.answer(frame, outgoing.client_id)
+            self._fanout.answer(frame, self._router.group(outgoing.client_id))
             return
         now_us = self.now_us()
         if self._vehicles.note(frame, outgoing.message_id, now_us):
-            self._forget_express()
+            self._router.forget_express()
         self._fanout.publish(frame, now_us)
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
-        self._fanout.set_interval(wish)
-        self._forget_express()
+        for client_id in self._router.group(wish.client_id):
+            self._fanout.set_interval(replace(wish, client_id=client_id))
+        self._router.forget_express()
 
     def add(self, url: str) -> None:
         """Open one more endpoint.
@@ -155,11 +155,14 @@ class Hub:
         endpoint = parse_endpoint(url)
         if endpoint.place in self._endpoints:
             raise ValueError(f"endpoint {endpoint.place!r} is there already")
+        now_us = self.now_us()
         if listen := LISTENERS.get(endpoint.kind):
-            self._endpoints[endpoint.place] = listen(self, endpoint)
+            listener = self._endpoints[endpoint.place] = listen(self, endpoint)
+            self._tick_one(listener, now_us)
             return
         client = CLIENTS[endpoint.kind](self, self.new_client_id(), endpoint)
         self._endpoints[endpoint.place] = client
+        self._tick_one(client, now_us)
         self.appear(client)
 
     def remove(self, name: str) -> None:
@@ -205,9 +208,9 @@ class Hub:
 
     def clients(self) -> tuple[ClientStats, ...]:
         """Describe every client at this moment, in the order of their ids."""
-        self._settle_express()
+        self._router.settle_express()
         return tuple(
-            self._clients[key].stats(self._table.origins(key)) for key in sorted(self._clients)
+            self._clients[key].stats(self._router.origins(key)) for key in sorted(self._clients)
         )
 
     def listeners(self) -> tuple[ListenerStats, ...]:
@@ -222,13 +225,14 @@ class Hub:
 
     def counters(self) -> HubCounters:
         """Return the totals since the start."""
-        self._settle_express()
+        router = self._router
         return HubCounters(
             published=self._published,
-            forwarded=self._forwarded,
-            duplicates=self._duplicates,
-            looped=self._looped,
-            unroutable=self._unroutable,
+            forwarded=router.forwarded,
+            duplicates=router.duplicates,
+            looped=router.looped,
+            unroutable=router.unroutable,
+            unserved=router.unserved,
         )
 
     def listening_ports(self) -> tuple[int, ...]:
@@ -241,38 +245,14 @@ class Hub:
         return self._next_id - 1
 
     def is_own(self, origin: Origin) -> bool:
-        """Tell whether a system and component is one of our vehicles."""
+        """Return whether a system and component is one of our vehicles."""
         return self._vehicles.is_own(origin, self.now_us())
-
-    def deliver(self, client: Client, frame: bytes, now_us: int) -> None:
-        """Take one frame that a client received, and pass it on to whom it concerns."""
-        origin = origin_of(frame)
-        if self._vehicles.is_own(origin, now_us) or origin == self._probe.origin:
-            self._looped += 1
-            return
-        if self._table.hear(client.client_id, origin, now_us):
-            self._forget_express()
-        message_id = message_id_of(frame)
-        if message_id == HEARTBEAT_ID:
-            self._table.note_kind(origin, is_station=is_station_heartbeat(frame))
-        round_trip_us = self._probe.read(frame, now_us)
-        if round_trip_us is not None:
-            client.round_trip_us = round_trip_us
-            return
-        if self._table.is_shared(origin, now_us) and self._guard.is_copy(
-            frame, self._table.since_us(client.client_id, origin), now_us
-        ):
-            self._duplicates += 1
-        elif target_of(frame)[0]:
-            self._route_addressed(client, frame, now_us)
-        else:
-            self._route_broadcast(client, frame, now_us)
 
     def appear(self, client: Client) -> None:
         """Let a client take part."""
         self._clients[client.client_id] = client
         self._fanout.add(client.client_id, client.transmit, client.endpoint)
-        self._forget_express()
+        self._router.forget_express()
         self._log_visit(client, f"client {client.client_id}: {client.remote}")
 
     def greet(self, client: Client) -> None:
@@ -282,74 +262,18 @@ class Hub:
     def reconfigure(self, client: Client) -> None:
         """Let a client's changed lists and rates hold from the next frame on."""
         self._fanout.reconfigure(client.client_id, client.endpoint)
-        self._forget_express()
+        self._router.reconfigure(client)
 
     def vanish(self, client: Client) -> None:
         """Close a client and forget it."""
         self._fanout.remove(client.client_id)
-        self._forget_express()
-        self._table.forget(client.client_id)
+        self._router.forget(client.client_id)
         self._vehicles.forget(client.client_id)
         if self._clients.pop(client.client_id, None):
             self._log_visit(client, f"client {client.client_id} has gone: {client.remote}")
             if self._on_gone is not None:
                 self._on_gone(client.client_id)
         client.close()
-
-    def _route_addressed(self, client: Client, frame: bytes, now_us: int) -> None:
-        target = target_of(frame)
-        ours = target[0] in self._vehicles.systems(now_us)
-        if ours:
-            self._on_frame(Incoming(client.client_id, frame, client.trusted))
-        ways = self._table.ways_to(target, client.client_id, now_us) if client.trusted else []
-        if ways:
-            self._tap(frame)
-            self._fanout.deliver(frame, ways)
-        elif not ours:
-            self._unroutable += 1
-
-    def _route_broadcast(self, client: Client, frame: bytes, now_us: int) -> None:
-        message_id = message_id_of(frame)
-        from_station = self._table.is_station(origin_of(frame))
-        telemetry = message_id != HEARTBEAT_ID and message_id not in TARGET_OFFSETS
-        if from_station or not telemetry:
-            self._on_frame(Incoming(client.client_id, frame, client.trusted))
-        if not client.trusted:
-            return
-        self._tap(frame)
-        if from_station:
-            self._fanout.deliver(frame, self._table.ways_to_vehicles(client.client_id))
-            return
-        self._fanout.forward(frame, client.client_id, now_us)
-        if telemetry and client.is_direct and not self._table.is_shared(origin_of(frame), now_us):
-            self._open_express(client, frame)
-
-    def _open_express(self, client: Client, frame: bytes) -> None:
-        """Let the next frames of this kind take the short way, if all of them go the same one."""
-        key = key_of(frame)
-        takers = self._fanout.takers(frame, client.client_id)
-        if takers is None or key in client.express or len(client.express) >= MAX_EXPRESS:
-            return
-        clients = [self._clients[taker] for taker in takers]
-        self._express_sources.add(client)
-        client.express[key] = Express(client, message_id_of(frame), clients, self._on_foreign)
-
-    def _tap(self, frame: bytes) -> None:
-        self._forwarded += 1
-        if self._on_foreign is not None:
-            self._on_foreign(frame)
-
-    def _forget_express(self) -> None:
-        """Judge every frame anew: somebody came, went or changed."""
-        self._settle_express()
-        for client in self._express_sources:
-            client.express.clear()
-        self._express_sources.clear()
-
-    def _settle_express(self) -> None:
-        for client in self._express_sources:
-            for express in client.express.values():
-                self._forwarded += express.settle()
 
     def _welcome(self, frame: bytes) -> None:
         newcomers, greeting = self._vehicles.greet(frame)
@@ -359,18 +283,29 @@ class Hub:
                     client.transmit(greeting_frame, message_id)
 
     def _tick(self) -> None:
+        # First of all: whatever happens below, the next tick comes.
+        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
         for endpoint in list(self._endpoints.values()):
             if not isinstance(endpoint, Client):
-                endpoint.tick(now_us)
+                self._tick_one(endpoint, now_us)
         for client in list(self._clients.values()):
-            client.tick(now_us)
+            self._tick_one(client, now_us)
+        self._router.tick(now_us)
         self._report_trouble(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         if interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
             self._ask_round_trips(now_us)
-        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _tick_one(self, link: Client | Listener[Any], now_us: int) -> None:
+        """Let one link do what is due; one that raises is closed, named, and tried again."""
+        try:
+            link.tick(now_us)
+        except Exception as error:
+            log.exception("%s is closed and tried again", link.endpoint.name)
+            with contextlib.suppress(Exception):
+                link.fail(error)
 
     def _report_trouble(self, now_us: int) -> None:
         if now_us - self._trouble_us < US_PER_S:

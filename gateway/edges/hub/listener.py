@@ -40,7 +40,6 @@ class Listener(Generic[Peer]):
         self._socket: socket.socket | None = None
         self._retry_us = 0
         self._told = ""
-        self.tick(context.now_us())
 
     @property
     def port(self) -> int:
@@ -74,10 +73,12 @@ class Listener(Generic[Peer]):
         """Part from all clients and close the port."""
         for client in list(self._clients.values()):
             self.leave(client)
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
+        self._shut()
+
+    def fail(self, error: Exception) -> None:
+        """Close the port after an error that nobody foresaw; the tick opens it again."""
+        self._complain(error)
+        self._shut()
 
     def leave(self, client: Peer) -> None:
         """Part from one client."""
@@ -96,6 +97,12 @@ class Listener(Generic[Peer]):
             turned_away=self.turned_away,
         )
 
+    def _shut(self) -> None:
+        if self._socket is not None:
+            self._loop.remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
     def _bind(self) -> socket.socket:
         """Open the port or raise OSError."""
         raise NotImplementedError
@@ -103,7 +110,7 @@ class Listener(Generic[Peer]):
     def _on_readable(self, sock: socket.socket) -> None:
         raise NotImplementedError
 
-    def _complain(self, error: OSError) -> None:
+    def _complain(self, error: Exception) -> None:
         self.reason = reason_of(error)
         if self.reason != self._told:
             log.warning("%s: %s; trying again until it works", self.endpoint.name, self.reason)

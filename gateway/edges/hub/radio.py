@@ -37,14 +37,13 @@ class RadioClient(Client):
     _timer: asyncio.TimerHandle | None = None
 
     def __post_init__(self) -> None:
-        """Open at once if possible."""
+        """Begin without a port."""
         super().__post_init__()
         baud = self.endpoint.port
         self._outbox = Outbox(max(MIN_QUEUE_BYTES, round(QUEUE_S * baud / BITS_PER_BYTE)))
         self._pacer = Pacer(baud, AHEAD_US)
         self._numbering = Numbering(self.context.is_own, self.context.seal)
         self._splitter = MavlinkSplitter()
-        self.tick(self.context.now_us())
 
     @property
     def queued(self) -> int:

@@ -141,11 +141,6 @@ class TcpClient(StreamClient):
     _retry_us = 0
     _task: asyncio.Task[None] | None = None
 
-    def __post_init__(self) -> None:
-        """Connect at once if possible."""
-        super().__post_init__()
-        self.tick(self.context.now_us())
-
     def tick(self, now_us: int) -> None:
         """Connect if there is no connection and the last attempt is long enough ago."""
         if self._socket is None and self._task is None and now_us >= self._retry_us:
@@ -170,7 +165,8 @@ class TcpClient(StreamClient):
             for family, _, _, _, address in found:
                 if await self._connect_to(family, address):
                     break
-        except OSError as error:
+        except (OSError, ValueError) as error:
+            # A name that cannot be one raises a ValueError.
             self.become("resolving", error)
         finally:
             self._task = None
@@ -206,6 +202,10 @@ class TcpPeer(StreamClient):
 
     def broke(self) -> None:
         """Leave for good; the client may connect again."""
+        self.leave(self)
+
+    def fail(self, error: Exception) -> None:  # noqa: ARG002
+        """Leave for good after an error that nobody foresaw."""
         self.leave(self)
 
 

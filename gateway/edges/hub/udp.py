@@ -226,11 +226,10 @@ class UdpClient(DatagramClient):
     _task: asyncio.Task[None] | None = None
 
     def __post_init__(self) -> None:
-        """Open at once if possible."""
+        """Begin without an address."""
         super().__post_init__()
         self._places: list[tuple[int, tuple[Any, ...]]] = []
         self.become("resolving")
-        self.tick(self.context.now_us())
 
     def tick(self, now_us: int) -> None:
         """Open the socket or look the name up again; forget a refusal that was not repeated."""
@@ -263,7 +262,8 @@ class UdpClient(DatagramClient):
         host, port = self.endpoint.host, self.endpoint.port
         try:
             found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        except OSError as error:
+        except (OSError, ValueError) as error:
+            # A name that cannot be one raises a ValueError.
             if self._socket is None:
                 self.become("resolving", error)
         else:

@@ -39,6 +39,8 @@ class UdpPeer(DatagramClient):
 
     def tick(self, now_us: int) -> None:
         """Call trouble off that was not repeated; try a client again that refused."""
+        if self._socket is None:
+            return
         self._end_hold()
         if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
             self.become("open")
@@ -59,7 +61,9 @@ class UdpPeer(DatagramClient):
             self.write = self._direct
 
     def has_died(self, now_us: int) -> bool:
-        """Tell whether the client is silent and its machine says that nobody listens."""
+        """Return whether it failed, or is silent and its machine says that nobody listens."""
+        if self._socket is None:
+            return True
         heard_us = self.heard_us if self.heard_us is not None else self.since_us
         return self.refused_us is not None and now_us - heard_us >= SILENT_AFTER_US
 

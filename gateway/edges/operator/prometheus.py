@@ -181,7 +181,7 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
             for node in report.nodes
         ]
         yield f"node_{field}{suffix}", kind, meaning, nodes
-    for field in ("published", "forwarded", "duplicates", "looped", "unroutable"):
+    for field in ("published", "forwarded", "duplicates", "looped", "unroutable", "unserved"):
         yield f"hub_{field}_total", "counter", f"Frames {field}.", [({}, getattr(hub, field))]
     ports = [({"name": port.name, "endpoint": port.endpoint}, port) for port in snapshot.listeners]
     is_open: list[Sample] = [(labels, float(port.state == "open")) for labels, port in ports]

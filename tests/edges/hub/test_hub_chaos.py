@@ -138,4 +138,4 @@ async def test_chaos(rig: Any, seed: int) -> None:
         pass
     assert errors == []
     assert not chaos.hub._fanout._outlets.keys() - chaos.hub._clients.keys()
-    assert set(chaos.hub._table._heard) <= set(chaos.hub._clients)
+    assert set(chaos.hub._router._table._of_client) <= set(chaos.hub._clients)

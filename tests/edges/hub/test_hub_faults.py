@@ -14,9 +14,11 @@ from typing import Any
 
 import msgspec
 import pytest
+from fastcrc.crc16 import mcrf4xx
 
 from gateway.edges.hub.hub import VISITS_IN_FULL
 from gateway.routing.digest import WINDOW_US
+from gateway.wire.mavlink_messages import CRC_EXTRA
 
 pytestmark = pytest.mark.io
 
@@ -233,6 +235,85 @@ async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
     before_and_after = seen["far end could hear"]
     assert before_and_after - 50 <= seen["far end heard"] <= before_and_after
     assert seen["far end heard"] >= seen["sent after"] - 5
+
+
+class TestALinkThatRaises:
+    """An error that nobody foresaw costs its own link a second, and nobody else anything."""
+
+    async def test_it_is_named_and_tried_again_and_the_others_go_on(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        gone = rig.station()
+        gone.socket.close()
+        ours, device = os.openpty()
+        rig.closing += [lambda: os.close(ours), lambda: os.close(device)]
+
+        def overflow(*_: object, **__: object) -> None:
+            raise OverflowError("signed integer is greater than maximum")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("serial.Serial", overflow)
+            hub = rig.hub(f"serial:{os.ttyname(device)}:57600?name=radio")
+            hub.add(f"udp:127.0.0.1:{gone.port}")
+            await rig.until(lambda: hub.clients()[1].state == "open")
+            hub.send(rig.out(rig.vehicle.attitude()))
+            hub.send(rig.out(rig.vehicle.attitude()))
+            assert hub.clients()[1].state == "refused"
+            radio = hub.clients()[0]
+            assert (radio.state, radio.reason[:14]) == ("unreachable", "signed integer")
+            for _ in range(3):
+                rig.clock.us += 1_000_000
+                rig.tick(hub)
+            assert "radio is closed and tried again" in caplog.text
+            assert hub.clients()[1].state == "open", "the other one's trouble is called off"
+            assert not hub._timer.cancelled()
+        rig.clock.us += 1_000_000
+        rig.tick(hub)
+        assert hub.clients()[0].state == "open"
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_listening_port_is_bound_again(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        listener = next(iter(hub._endpoints.values()))
+        with monkeypatch.context() as patched:
+            patched.setattr(type(listener), "tick", lambda *_: 1 // 0)
+            rig.tick(hub)
+            assert hub.listeners()[0].state == "closed"
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        assert hub.listeners()[0].state == "open"
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_name_that_the_resolver_chokes_on(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        errors: list[Any] = []
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: errors.append(context))
+
+        async def choke(*_: object, **__: object) -> None:
+            raise UnicodeError("label empty or too long")
+
+        monkeypatch.setattr(loop, "getaddrinfo", choke)
+        hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
+        await rig.until(lambda: hub.clients()[0].reason != "")
+        assert (hub.clients()[0].state, errors) == ("resolving", [])
+
+
+async def test_heartbeats_cut_short_do_no_harm(rig: Any) -> None:
+    errors: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no")
+    caller = rig.station(hub.listening_ports()[0])
+    for length in range(10):
+        payload = bytes((0, 0, 0, 0, 6, 8, 0, 4, 3))[:length]
+        body = bytes((len(payload), 0, 0, length, 255, 190, 0, 0, 0)) + payload
+        crc = mcrf4xx(CRC_EXTRA[0], mcrf4xx(body))
+        caller.say(b"\xfd" + body + crc.to_bytes(2, "little"))
+    await rig.until(lambda: len(rig.incoming) == 10)
+    assert errors == []
 
 
 async def test_strangers_without_number_do_not_flood_the_log(

@@ -142,6 +142,6 @@ async def test_ten_thousand_unknown_addresses(
     assert gateway.attitudes_heard == gateway.attitudes
     steps = {(b - a) % 256 for a, b in itertools.pairwise(gateway.sequence)}
     assert steps == {1}, "nothing lost, and no gap from what others were answered"
-    assert gateway.vehicle.refusals > 1000
+    assert gateway.vehicle.refusals > 500
     assert gateway.vehicle.places.missions.items[0] == ()
     assert gateway.vehicle.telemetry.settings == VehicleSettings()

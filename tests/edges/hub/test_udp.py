@@ -25,7 +25,7 @@ async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: An
     station.say(said)
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub.clients()
-    assert rig.incoming == [Incoming(client.client_id, said, trusted=True)]
+    assert rig.incoming == [Incoming(client.client_id, said, trusted=True, forwarded=True)]
     assert (client.name, client.sent, client.received) == ("laptop", 2, 1)
     assert client.bytes_sent == len(attitude) + len(heartbeat)
     assert client.systems == ((255, 190),)

@@ -1,0 +1,62 @@
+"""A bound on the log: whatever goes wrong, and however often, it does not fill the disk.
+
+A kind of line is the place in the code that writes it and, for an error nobody foresaw, the place
+that raised it. Of each kind a few lines at once are told and then one a second; the next one that
+is told says how many were not.
+"""
+
+import logging
+import traceback
+from dataclasses import dataclass
+from typing import Final
+
+BURST: Final = 20
+"""Lines of a kind at once: a start with many endpoints writes one for each."""
+REFILL_S: Final = 1.0
+MAX_KINDS: Final = 1024
+"""Places in the code; there are fewer, so nothing is forgotten in practice."""
+
+Kind = tuple[str, int, str]
+
+
+@dataclass(slots=True)
+class _Kind:
+    since_s: float
+    """Since when there has been a line to spare."""
+    untold: int = 0
+
+
+class LogLimit(logging.Filter):
+    """Let a bounded number of lines of each kind through a handler."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kinds: dict[Kind, _Kind] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a line is written; the first after a gap says how long the gap was."""
+        if len(self._kinds) >= MAX_KINDS:
+            self._kinds.clear()
+        now_s = record.created
+        kind = self._kinds.setdefault(_kind_of(record), _Kind(now_s - BURST * REFILL_S))
+        # A clock that was set back would silence a kind until it has caught up.
+        kind.since_s = min(max(kind.since_s, now_s - BURST * REFILL_S), now_s)
+        if now_s - kind.since_s < REFILL_S:
+            kind.untold += 1
+            return False
+        kind.since_s += REFILL_S
+        if kind.untold:
+            record.msg = f"{record.getMessage()} (and {kind.untold} more like it, not told)"
+            record.args = None
+            kind.untold = 0
+        return True
+
+
+def _kind_of(record: logging.LogRecord) -> Kind:
+    error = record.exc_info[1] if record.exc_info else None
+    if error is None:
+        return record.pathname, record.lineno, ""
+    frames = traceback.extract_tb(error.__traceback__, limit=-1)
+    if not frames:
+        return record.pathname, record.lineno, type(error).__name__
+    return frames[-1].filename, frames[-1].lineno or 0, type(error).__name__

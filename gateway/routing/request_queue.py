@@ -1,0 +1,111 @@
+"""Whose request is answered next, and how much answering anybody may cause.
+
+Theory of operation. Requests wait in a queue for each client, bounded, and are taken in turns: one
+that asks a thousand times a second waits for itself. Answers are paid for: each client has a purse
+of bytes that fills at a steady rate, a request costs what reading it costs, each byte of an answer
+costs one, and nothing is taken from a client that is in debt. All untrusted clients share a single
+small purse, for whoever is turned away comes back under another address.
+
+What a ground station does in a session (a parameter list, files of metadata, a mission of two
+thousand items) fits into a full purse; only then does its rate count.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+from gateway.records import Incoming
+from gateway.units import US_PER_S
+
+REQUEST_COST: Final = 200
+"""Bytes: to decode a request and build its answer takes as long as to send so many."""
+CLIENT_RATE: Final = 80_000
+"""Bytes a second: 400 requests, a few percent of a processor."""
+CLIENT_BURST: Final = 400_000
+STRANGERS_RATE: Final = 20_000
+STRANGERS_BURST: Final = 200_000
+"""The start of three ground stations on tablets."""
+MAX_WAITING: Final = 64
+"""Requests of a client; whoever waits for answers has one or two."""
+
+
+@dataclass(slots=True)
+class _Purse:
+    rate: int
+    burst: int
+    level: float
+    filled_us: int = 0
+
+    def fill(self, now_us: int) -> None:
+        gain = (now_us - self.filled_us) * self.rate / US_PER_S
+        self.level = min(self.burst, self.level + gain)
+        self.filled_us = now_us
+
+    def wait_us(self) -> int:
+        """Return how long until something may be taken; 0 is now."""
+        return 0 if self.level > 0 else round((1 - self.level) * US_PER_S / self.rate)
+
+
+@dataclass(slots=True, eq=False)
+class _Line:
+    """One client's requests."""
+
+    purse: _Purse
+    waiting: deque[Incoming] = field(default_factory=deque)
+
+
+class RequestQueue:
+    """Requests of all clients, taken in turns and within each client's means."""
+
+    def __init__(self) -> None:
+        self._lines: dict[int, _Line] = {}
+        self._turns: dict[int, _Line] = {}
+        """Those who have something waiting; who is first was served longest ago."""
+        self._strangers = _Purse(STRANGERS_RATE, STRANGERS_BURST, STRANGERS_BURST)
+
+    def offer(self, incoming: Incoming, now_us: int) -> bool:
+        """Let a request wait for its turn; return whether there was room."""
+        line = self._lines.get(incoming.client_id)
+        if line is None or (line.purse is self._strangers) == incoming.trusted:
+            purse = self._strangers
+            if incoming.trusted:
+                purse = _Purse(CLIENT_RATE, CLIENT_BURST, CLIENT_BURST, now_us)
+            line = self._lines[incoming.client_id] = _Line(purse)
+            self._turns.pop(incoming.client_id, None)
+        if len(line.waiting) >= MAX_WAITING:
+            return False
+        line.waiting.append(incoming)
+        self._turns.setdefault(incoming.client_id, line)
+        return True
+
+    def take(self, now_us: int) -> Incoming | None:
+        """Return the request that is served now; None if nothing waits that is paid for."""
+        for line in self._turns.values():
+            line.purse.fill(now_us)
+            if line.purse.level > 0:
+                return self._take_of(line)
+        return None
+
+    def wait_us(self, now_us: int) -> int | None:
+        """Return how long until `take` gives something; None if nothing waits."""
+        for line in self._turns.values():
+            line.purse.fill(now_us)
+        return min((line.purse.wait_us() for line in self._turns.values()), default=None)
+
+    def charge(self, client_id: int, size: int) -> None:
+        """Let a client pay for bytes that were sent because of it."""
+        if line := self._lines.get(client_id):
+            line.purse.level -= size
+
+    def forget(self, client_id: int) -> None:
+        """Drop what waits of a client that has gone; what strangers owe, they owe together."""
+        self._lines.pop(client_id, None)
+        self._turns.pop(client_id, None)
+
+    def _take_of(self, line: _Line) -> Incoming:
+        incoming = line.waiting.popleft()
+        del self._turns[incoming.client_id]
+        if line.waiting:
+            self._turns[incoming.client_id] = line
+        line.purse.level -= REQUEST_COST
+        return incoming
