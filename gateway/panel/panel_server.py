@@ -22,11 +22,13 @@ from gateway.edges.clock import GatewayClock
 from gateway.edges.operator.control_socket import socket_path
 from gateway.panel import feed
 from gateway.panel.control_client import ControlClient
+from gateway.panel.dialogues import Dialogues
 from gateway.panel.feed import TelemetryFeed
 from gateway.panel.page_guard import ROLE, PageGuard
 from gateway.panel.page_lock import PageLock
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.shell import build_page
+from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, PanelParts
@@ -75,7 +77,9 @@ def run_panel(
     clock, fleet = GatewayClock(), FleetPicture()
     control = ControlClient(socket_path("run"))
     uplink = Uplink(connect, fleet, control, clock)
-    parts = PanelParts(settings, recordings, clock, fleet, control, uplink)
+    history, dialogues = FieldHistory(), Dialogues(fleet, uplink.send, clock)
+    fleet.listen(history.take)
+    parts = PanelParts(settings, recordings, clock, fleet, control, uplink, history, dialogues)
     app = make_app(parts)
     lock = PageLock(settings.password, settings.viewer_password)
     config = uvicorn.Config(
@@ -94,7 +98,7 @@ def run_panel(
     except OSError as error:
         raise PanelError(f"certificate {settings.certificate}: {error.strerror}") from error
     on_open = partial(on_link, _link(settings, sock))
-    asyncio.run(_serve(config, sock, uplink, on_open, attached=attached))
+    asyncio.run(_serve(config, sock, parts, on_open, attached=attached))
 
 
 def make_app(parts: PanelParts) -> FastAPI:
@@ -129,7 +133,7 @@ def make_app(parts: PanelParts) -> FastAPI:
 async def _serve(
     config: uvicorn.Config,
     sock: socket.socket,
-    uplink: Uplink,
+    parts: PanelParts,
     on_open: Callable[[], None],
     *,
     attached: bool,
@@ -137,7 +141,8 @@ async def _serve(
     server = uvicorn.Server(config)
     if attached:
         _end_with_input(server)
-    uplink.start()
+    parts.uplink.start()
+    parts.dialogues.start()
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.01)
@@ -146,7 +151,8 @@ async def _serve(
     try:
         await serving
     finally:
-        uplink.close()
+        parts.dialogues.close()
+        parts.uplink.close()
 
 
 def _end_with_input(server: uvicorn.Server) -> None:

@@ -36,7 +36,9 @@ from nicegui import ui
 
 from gateway.edges.clock import GatewayClock
 from gateway.panel.control_client import READING, ControlClient
+from gateway.panel.dialogues import Dialogues
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.shown_units import ShownUnits
 from gateway.panel.state.vehicle_picture import VehiclePicture
@@ -68,6 +70,8 @@ class PanelParts:
     fleet: FleetPicture
     control: ControlClient
     uplink: Uplink
+    history: FieldHistory
+    dialogues: Dialogues
 
 
 @dataclass(eq=False)

@@ -1,0 +1,145 @@
+"""What an operator must not miss: states that last, as opposed to texts that pass by.
+
+Each is read anew from what came over MAVLink, so that an alert goes as soon as its cause has gone,
+and works with any vehicle; of a gateway, the nodes and the recorder are told by its texts.
+"""
+
+import re
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.status_texts import TimedText
+from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.units import US_PER_S
+
+SILENT_S: Final = 5.0
+FIX_OLD_US: Final = 5 * US_PER_S
+SHOUT_US: Final = 20 * US_PER_S
+"""How long a grave text of any vehicle stands as an alert of its own."""
+
+SENSORS: Final = {
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO: "gyroscope",
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL: "accelerometer",
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG: "magnetometer",
+    mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE: "barometer",
+    mavlink.MAV_SYS_STATUS_AHRS: "attitude estimator",
+    mavlink.MAV_SYS_STATUS_SENSOR_BATTERY: "battery",
+}
+
+_SILENT: Final = re.compile(r"^(?P<what>.+) silent$")
+_BACK: Final = re.compile(r"^(?P<what>.+) is back$")
+_RECEIVER_LOST: Final = re.compile(r"^Receiver lost: (?P<what>.+)$")
+_RECEIVER_BACK: Final = re.compile(r"^Receiver connected\b")
+_RECORDING_FAILED: Final = re.compile(r"^(Recording stopped|Cannot record): (?P<what>.+)$")
+_RECORDING_WELL: Final = re.compile(r"^Recording (?!stopped:).+$")
+
+
+class AlertLevel(IntEnum):
+    """How grave it is."""
+
+    WARNING = 0
+    CRITICAL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Alert:
+    """One thing that is wrong now."""
+
+    key: str
+    """The same as long as it is the same thing."""
+    level: AlertLevel
+    title: str
+    detail: str = ""
+
+
+def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+    """Tell what is wrong with one aircraft now, the gravest first.
+
+    Parameters
+    ----------
+    vehicle : VehiclePicture
+        What came of it.
+    now_us : int
+        The panel's clock.
+
+    Returns
+    -------
+    list of Alert
+    """
+    silent_s = vehicle.silent_s(now_us)
+    if silent_s > SILENT_S:
+        since = f"no heartbeat for {silent_s:.0f} s" if silent_s < 1e6 else "no heartbeat yet"
+        # All else would only tell what was wrong when it was last heard.
+        return [Alert("silent", AlertLevel.CRITICAL, "Aircraft silent", since)]
+    found = [*_gps(vehicle, now_us), *_sensors(vehicle), *_texts(vehicle, now_us)]
+    return sorted(found, key=lambda alert: -alert.level)
+
+
+def _gps(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+    """Tell of a GPS that had a fix and has none; one that never had is still searching."""
+    if not vehicle.fixes:
+        return []
+    newest = vehicle.newest["GPS_RAW_INT"]
+    age_us = now_us - vehicle.heard_us["GPS_RAW_INT"]
+    if age_us > FIX_OLD_US:
+        detail = f"nothing from the receiver for {age_us // US_PER_S} s"
+    elif newest.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
+        detail = "the receiver has no fix"
+    else:
+        return []
+    return [Alert("gps", AlertLevel.CRITICAL, "GPS lost", detail)]
+
+
+def _sensors(vehicle: VehiclePicture) -> list[Alert]:
+    status = vehicle.newest.get("SYS_STATUS")
+    if status is None:
+        return []
+    used = status.onboard_control_sensors_present & status.onboard_control_sensors_enabled
+    ill = used & ~status.onboard_control_sensors_health
+    names = [name for bit, name in SENSORS.items() if ill & bit]
+    if not names:
+        return []
+    return [Alert("sensors", AlertLevel.WARNING, "Sensors not healthy", ", ".join(names))]
+
+
+def _texts(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+    standing: dict[str, Alert] = {}
+    for text in vehicle.texts.all:
+        _fold(standing, text)
+        grave = text.severity <= mavlink.MAV_SEVERITY_CRITICAL
+        if grave and now_us - text.time_us < SHOUT_US and not _is_known(text.text):
+            key = f"text {text.number}"
+            standing[key] = Alert(key, AlertLevel.CRITICAL, text.text)
+    return list(standing.values())
+
+
+def _fold(standing: dict[str, Alert], text: TimedText) -> None:
+    """Let one text begin or end an alert."""
+    if match := _SILENT.match(text.text):
+        what = match["what"]
+        key = f"node {what}"
+        standing[key] = Alert(key, AlertLevel.CRITICAL, f"{what} silent", "no radio packets")
+    elif match := _BACK.match(text.text):
+        standing.pop(f"node {match['what']}", None)
+    elif match := _RECEIVER_LOST.match(text.text):
+        standing["receiver"] = Alert(
+            "receiver", AlertLevel.CRITICAL, "Receiver lost", match["what"]
+        )
+    elif _RECEIVER_BACK.match(text.text):
+        # Also what a gateway says that was started anew, which knows of no silent node.
+        for key in [key for key in standing if key.startswith(("receiver", "node "))]:
+            del standing[key]
+    elif match := _RECORDING_FAILED.match(text.text):
+        standing["recording"] = Alert(
+            "recording", AlertLevel.CRITICAL, "Recording failed", match["what"]
+        )
+    elif _RECORDING_WELL.match(text.text):
+        standing.pop("recording", None)
+
+
+def _is_known(text: str) -> bool:
+    patterns = (_SILENT, _BACK, _RECEIVER_LOST, _RECEIVER_BACK, _RECORDING_FAILED)
+    return any(pattern.match(text) for pattern in patterns)

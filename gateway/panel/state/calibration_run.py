@@ -1,0 +1,344 @@
+"""One calibration as the page follows it: what the vehicle says, and what its samples tell.
+
+The vehicle itself calibrates (MAV_CMD_PREFLIGHT_CALIBRATION); it says how far it is by COMMAND_ACK
+and by the `[cal]` texts that QGroundControl reads, so this works with PX4 as well. What is drawn
+and the residuals come from the samples that it sends meanwhile: those before it accepted tell the
+error that it began with, those behind what is left.
+"""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.sphere_cover import CELLS, seen_cells
+from gateway.records import NAN
+from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.vehicle.services.calibrator import fit_sphere
+
+FloatArray = NDArray[np.float64]
+
+UT_PER_GAUSS: Final = 100.0
+MILLI: Final = 1e-3
+NO_ANSWER_US: Final = 4 * US_PER_S
+"""After the last word of a vehicle that never answered the command."""
+GIVEN_UP_US: Final = 200 * US_PER_S
+AFTER_US: Final = 2 * US_PER_S
+"""How long the samples behind the calibration are watched."""
+WINDOW: Final = 25
+"""Samples, half a second at the rate that is asked for, that a position is read from."""
+MAX_SAMPLES: Final = 3000
+MIN_FIT: Final = 30
+
+SIDES: Final = ("down", "up", "left", "right", "front", "back")
+"""Which side of the aircraft lies below, in the words of the `[cal]` texts; down is level."""
+_POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
+"""By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
+SIDE_SHARE: Final = 0.85
+
+_STARTED: Final = re.compile(r"^\[cal\] calibration started: \d+ (\w+)")
+_PROGRESS: Final = re.compile(r"^\[cal\] progress <(\d+)>")
+_SIDE_DONE: Final = re.compile(r"^\[cal\] (\w+) side done")
+_DONE: Final = re.compile(r"^\[cal\] calibration done")
+_FAILED: Final = re.compile(r"^\[cal\] calibration failed: (.+)")
+_CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
+
+
+class CalibrationStep(StrEnum):
+    """What can be calibrated, in the order in which it is best done."""
+
+    GYRO = "gyro"
+    ACCEL = "accel"
+    LEVEL = "level"
+    MAG = "mag"
+
+
+PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
+    CalibrationStep.GYRO: (1.0,),
+    CalibrationStep.MAG: (0.0, 1.0),
+    CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
+    CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
+}
+"""Of MAV_CMD_PREFLIGHT_CALIBRATION."""
+
+
+class RunState(StrEnum):
+    """Where a calibration is."""
+
+    ASKED = "asked"
+    RUNNING = "running"
+    CHECKING = "checking"
+    """Done, and what it left is being measured."""
+    DONE = "done"
+    FAILED = "failed"
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will happen."""
+        return self in (RunState.DONE, RunState.FAILED)
+
+
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """One number that tells how good a sensor is, before and after."""
+
+    name: str
+    unit: str
+    before: float
+    after: float
+
+
+_Vector = tuple[float, float, float]
+
+
+@dataclass(slots=True)
+class _Samples:
+    accel: list[_Vector] = field(default_factory=list)
+    gyro: list[_Vector] = field(default_factory=list)
+    mag: list[_Vector] = field(default_factory=list)
+
+
+class CalibrationRun:
+    """One calibration of one vehicle.
+
+    Parameters
+    ----------
+    system_id : int
+        Whose.
+    step : CalibrationStep
+        Of what.
+    now_us : int
+        The panel's clock.
+    """
+
+    def __init__(self, system_id: int, step: CalibrationStep, now_us: int) -> None:
+        self.system_id = system_id
+        self.step = step
+        self.state = RunState.ASKED
+        self.progress = 0
+        """In percent, as the vehicle says."""
+        self.trouble = ""
+        """Why it failed."""
+        self.sides_done: list[str] = []
+        self.side_now: str | None = None
+        """The side that lies below at this moment, if any clearly does."""
+        self._before, self._after = _Samples(), _Samples()
+        self._side_means: dict[str, FloatArray] = {}
+        self._began_us = self._heard_us = now_us
+        self._done_us = 0
+
+    def start_message(self) -> Any:
+        """Tell the command that begins it."""
+        return _command(self.system_id, PARAMS[self.step])
+
+    def cancel_message(self) -> Any:
+        """Tell the command that breaks it off: all zero."""
+        return _command(self.system_id, ())
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one message of the vehicle."""
+        match message.get_type():
+            case "COMMAND_ACK" if message.command == mavlink.MAV_CMD_PREFLIGHT_CALIBRATION:
+                self._take_ack(message, now_us)
+            case "STATUSTEXT":
+                self._take_text(message.text, now_us)
+            case "HIGHRES_IMU":
+                self._take_sample(_highres(message))
+            case "SCALED_IMU" | "RAW_IMU":
+                self._take_sample(_milli(message))
+
+    def poll(self, now_us: int) -> None:
+        """Notice what has not come."""
+        if self.state is RunState.ASKED and now_us - self._heard_us > NO_ANSWER_US:
+            self._fail("the aircraft does not answer")
+        elif self.state is RunState.RUNNING and now_us - self._began_us > GIVEN_UP_US:
+            self._fail("nothing more was heard of it")
+        elif self.state is RunState.CHECKING and now_us - self._done_us > AFTER_US:
+            self.state = RunState.DONE
+
+    @property
+    def field_points(self) -> FloatArray:
+        """The magnetic field so far, shape (n, 3), uT, body FRD."""
+        return np.array(self._before.mag).reshape(-1, 3)
+
+    def sphere(self) -> tuple[_Vector, float]:
+        """Tell centre and radius of the magnetic field's sphere, uT, as far as they are known."""
+        points = self.field_points
+        if not len(points):
+            return (0.0, 0.0, 0.0), NAN
+        if len(points) >= MIN_FIT:
+            centre, radius = fit_sphere(points)
+            spread = float(np.ptp(points, axis=0).max())
+            # A small patch fits to a sphere of any size; till then the middle is as good.
+            if math.isfinite(radius) and radius < spread:
+                return centre, radius
+        x, y, z = (points.min(axis=0) + points.max(axis=0)).tolist()
+        middle = (0.5 * x, 0.5 * y, 0.5 * z)
+        return middle, float(np.linalg.norm(points - middle, axis=1).max())
+
+    def cover(self) -> list[bool]:
+        """Tell which cells of `CELLS` the magnetic field was seen in."""
+        if not self._before.mag:
+            return [False] * len(CELLS)
+        centre, _ = self.sphere()
+        return seen_cells(self.field_points - centre)
+
+    def residuals(self) -> list[Residual]:
+        """Tell what was wrong before and what is left, as far as it is known."""
+        match self.step:
+            case CalibrationStep.GYRO:
+                return [Residual("Rate at rest", "deg/s", *self._each(_rate_degps))]
+            case CalibrationStep.LEVEL:
+                return [Residual("Tilt when level", "deg", *self._each(_tilt_deg))]
+            case CalibrationStep.ACCEL:
+                return [Residual("Error of gravity over the six sides", "m/s²", *self._sides_rms())]
+            case CalibrationStep.MAG:
+                return [Residual("Spread of the field's strength", "µT", *self._field_rms())]
+
+    def _take_ack(self, message: Any, now_us: int) -> None:
+        self._heard_us = now_us
+        if self.state.is_over or self.state is RunState.CHECKING:
+            return
+        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+            self.state = RunState.RUNNING
+            if message.progress <= 100:
+                self.progress = max(self.progress, message.progress)
+        elif message.result == mavlink.MAV_RESULT_ACCEPTED:
+            # PX4 accepts at once and tells the rest by texts; the gateway accepts what is done.
+            if self.state is RunState.RUNNING:
+                self._finish(now_us)
+            else:
+                self.state = RunState.RUNNING
+        else:
+            name = mavlink.enums["MAV_RESULT"][message.result].name.removeprefix("MAV_RESULT_")
+            self._fail(name.lower().replace("_", " "))
+
+    def _take_text(self, text: str, now_us: int) -> None:
+        if match := _FAILED.match(text):
+            # The acknowledgement, which does not tell why, comes before it.
+            self.state, self.trouble = RunState.FAILED, match[1]
+        if self.state.is_over:
+            return
+        self._heard_us = now_us
+        if match := _PROGRESS.match(text):
+            self.progress = max(self.progress, min(int(match[1]), 100))
+        elif match := _SIDE_DONE.match(text):
+            if match[1] not in self.sides_done:
+                self.sides_done.append(match[1])
+        elif _STARTED.match(text):
+            self.state = RunState.RUNNING
+        elif _DONE.match(text):
+            self._finish(now_us)
+        elif _CANCELLED.match(text):
+            self._fail("cancelled")
+
+    def _finish(self, now_us: int) -> None:
+        if self.state is RunState.CHECKING:
+            return
+        self.state, self.progress, self._done_us = RunState.CHECKING, 100, now_us
+        if self.step is CalibrationStep.ACCEL:
+            self.sides_done = list(SIDES)
+
+    def _fail(self, why: str) -> None:
+        if self.state is not RunState.FAILED:
+            self.state, self.trouble = RunState.FAILED, why
+
+    def _take_sample(self, sample: tuple[_Vector, _Vector, _Vector | None]) -> None:
+        into = {RunState.RUNNING: self._before, RunState.CHECKING: self._after}.get(self.state)
+        if into is None:
+            return
+        accel, gyro, mag = sample
+        if mag is not None and len(into.mag) < MAX_SAMPLES:
+            into.mag.append(mag)
+        if len(into.accel) >= MAX_SAMPLES:
+            del into.accel[0], into.gyro[0]
+        into.accel.append(accel)
+        into.gyro.append(gyro)
+        if into is self._before and self.step is CalibrationStep.ACCEL:
+            self._note_side()
+
+    def _note_side(self) -> None:
+        """Notice which side lies below, and what gravity reads there."""
+        recent = np.array(self._before.accel[-WINDOW:])
+        mean = recent.mean(axis=0)
+        axis = int(np.abs(mean).argmax())
+        self.side_now = None
+        if abs(mean[axis]) < SIDE_SHARE * STANDARD_GRAVITY_MPS2:
+            return
+        side = _POSES[axis][int(mean[axis] < 0.0)]
+        self.side_now = side
+        if len(recent) == WINDOW and recent.std(axis=0).max() < 0.5:
+            self._side_means.setdefault(side, mean)
+
+    def _each(self, measure: Callable[[_Samples], float]) -> tuple[float, float]:
+        return measure(self._before), measure(self._after) if self.state.is_over else NAN
+
+    def _sides_rms(self) -> tuple[float, float]:
+        if len(self._side_means) < len(SIDES):
+            return NAN, NAN
+        means = np.array(list(self._side_means.values()))
+        error = np.linalg.norm(means, axis=1) - STANDARD_GRAVITY_MPS2
+        middle = 0.5 * (means.max(axis=0) + means.min(axis=0))
+        left = np.linalg.norm(means - middle, axis=1) - STANDARD_GRAVITY_MPS2
+        after = _rms(left) if self.state is RunState.DONE else NAN
+        return _rms(error), after
+
+    def _field_rms(self) -> tuple[float, float]:
+        points = self.field_points
+        if len(points) < MIN_FIT:
+            return NAN, NAN
+        strength = np.linalg.norm(points, axis=1)
+        centre, radius = self.sphere()
+        left = np.linalg.norm(points - centre, axis=1) - radius
+        after = _rms(left) if self.state is RunState.DONE else NAN
+        return _rms(strength - strength.mean()), after
+
+
+def _command(system_id: int, params: tuple[float, ...]) -> Any:
+    filled = (*params, *(0.0,) * (7 - len(params)))
+    return mavlink.MAVLink_command_long_message(
+        system_id, 1, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0, *filled
+    )
+
+
+def _highres(message: Any) -> tuple[_Vector, _Vector, _Vector | None]:
+    mag = (message.xmag, message.ymag, message.zmag)
+    known = all(math.isfinite(v) for v in mag) and any(mag)
+    return (
+        (message.xacc, message.yacc, message.zacc),
+        (message.xgyro, message.ygyro, message.zgyro),
+        (mag[0] * UT_PER_GAUSS, mag[1] * UT_PER_GAUSS, mag[2] * UT_PER_GAUSS) if known else None,
+    )
+
+
+def _milli(message: Any) -> tuple[_Vector, _Vector, _Vector | None]:
+    g, ut = STANDARD_GRAVITY_MPS2 * MILLI, UT_PER_GAUSS * MILLI
+    mag = (message.xmag, message.ymag, message.zmag)
+    return (
+        (message.xacc * g, message.yacc * g, message.zacc * g),
+        (message.xgyro * MILLI, message.ygyro * MILLI, message.zgyro * MILLI),
+        (mag[0] * ut, mag[1] * ut, mag[2] * ut) if any(mag) else None,
+    )
+
+
+def _rate_degps(samples: _Samples) -> float:
+    if not samples.gyro:
+        return NAN
+    return math.degrees(float(np.linalg.norm(np.mean(samples.gyro, axis=0))))
+
+
+def _tilt_deg(samples: _Samples) -> float:
+    if not samples.accel:
+        return NAN
+    x, y, z = np.mean(samples.accel, axis=0).tolist()
+    return math.degrees(math.atan2(math.hypot(x, y), -z))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

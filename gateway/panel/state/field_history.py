@@ -1,0 +1,210 @@
+"""The last minutes of every numeric field of every message, in bounded memory."""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.units import US_PER_S
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+SPAN_US: Final = 300 * US_PER_S
+MAX_RATE_HZ: Final = 50
+"""What comes faster is thinned out: no strip chart of minutes has more columns than that."""
+LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
+"""Shorter than the interval, so that jitter thins nothing out at the very rate."""
+MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
+FIRST_ROWS: Final = 256
+MAX_KINDS: Final = 200
+"""Messages of one aircraft, instances counted apart; more are forged."""
+MAX_ARRAY: Final = 32
+"""Longer arrays are files and logs, not quantities."""
+
+
+class FieldHistory:
+    """What was told, as columns over time, by aircraft and message."""
+
+    def __init__(self) -> None:
+        self._vehicles: dict[int, dict[str, _Columns]] = {}
+
+    def take(self, system_id: int, message: Any, now_us: int) -> None:
+        """Keep one message.
+
+        Parameters
+        ----------
+        system_id : int
+            Whose it is.
+        message : MAVLink_message
+            As pymavlink decodes it. One with instances, such as a battery's, is kept by instance.
+        now_us : int
+            When it came, on the panel's clock.
+        """
+        kinds = self._vehicles.setdefault(system_id, {})
+        name = _kind_of(message)
+        columns = kinds.get(name)
+        if columns is None:
+            if len(kinds) >= MAX_KINDS:
+                return
+            columns = kinds[name] = _Columns(message)
+        columns.add(message, now_us)
+
+    def fields(self, system_id: int) -> dict[str, tuple[str, ...]]:
+        """Tell which fields each message of an aircraft has, both in the order of the alphabet."""
+        kinds = self._vehicles.get(system_id, {})
+        return {kind: kinds[kind].names for kind in sorted(kinds) if kinds[kind].names}
+
+    def unit(self, system_id: int, name: str) -> str:
+        """Tell a field's unit as MAVLink writes it; empty if it has none or is not known."""
+        kind, _, field = name.partition(".")
+        columns = self._vehicles.get(system_id, {}).get(kind)
+        return "" if columns is None else columns.unit(field)
+
+    def series(
+        self, system_id: int, name: str, after_us: int = -1, until_us: int | None = None
+    ) -> tuple[IntArray, FloatArray]:
+        """Read one field.
+
+        Parameters
+        ----------
+        system_id : int
+            Whose.
+        name : str
+            Message and field, such as `ATTITUDE.roll` or `BATTERY_STATUS[0].voltages[1]`.
+        after_us, until_us : int, optional
+            Only what came later than the one, and not later than the other.
+
+        Returns
+        -------
+        time_us : ndarray of int64, shape (N,)
+            On the panel's clock, growing.
+        values : ndarray of float64, shape (N,)
+            As the message has them; both empty for a field that never came.
+        """
+        kind, _, field = name.partition(".")
+        columns = self._vehicles.get(system_id, {}).get(kind)
+        if columns is None or field not in columns.names:
+            return np.empty(0, np.int64), np.empty(0)
+        return columns.column(field, after_us, until_us)
+
+
+class _Columns:
+    """A ring of rows, which grows up to `MAX_ROWS`."""
+
+    def __init__(self, message: Any) -> None:
+        self._readers = _readers_of(message)
+        self.names = tuple(sorted(name for name, _, _ in self._readers))
+        self._index = {name: n for n, (name, _, _) in enumerate(self._readers)}
+        self._units: dict[str, str] = getattr(message, "fieldunits_by_name", {})
+        self._time_us = np.zeros(FIRST_ROWS, np.int64)
+        self._values = np.zeros((FIRST_ROWS, len(self._readers)))
+        self._count = 0
+        """Rows ever written; the newest is at `(count - 1) % capacity`."""
+
+    def unit(self, field: str) -> str:
+        return self._units.get(field.partition("[")[0], "")
+
+    def add(self, message: Any, now_us: int) -> None:
+        capacity = len(self._time_us)
+        if self._count:
+            last_us = int(self._time_us[(self._count - 1) % capacity])
+            if now_us - last_us < LEAST_GAP_US:
+                return
+        if self._count == capacity and capacity < MAX_ROWS:
+            self._grow(min(2 * capacity, MAX_ROWS))
+        row = self._count % len(self._time_us)
+        self._time_us[row] = now_us
+        self._values[row] = [read(message) for _, _, read in self._readers]
+        self._count += 1
+
+    def column(
+        self, field: str, after_us: int, until_us: int | None
+    ) -> tuple[IntArray, FloatArray]:
+        order = self._order()
+        time_us = self._time_us[order]
+        newest_us = int(time_us[-1]) if len(time_us) else 0
+        begin = np.searchsorted(time_us, max(after_us, newest_us - SPAN_US), "right")
+        end = len(time_us) if until_us is None else np.searchsorted(time_us, until_us, "right")
+        values = self._values[order[begin:end], self._index[field]]
+        return time_us[begin:end], values
+
+    def _order(self) -> IntArray:
+        capacity = len(self._time_us)
+        if self._count <= capacity:
+            return np.arange(self._count)
+        return np.arange(self._count - capacity, self._count) % capacity
+
+    def _grow(self, capacity: int) -> None:
+        # Called only while nothing was overwritten yet, so rows are in order.
+        self._time_us = np.concatenate(
+            [self._time_us, np.zeros(capacity - len(self._time_us), np.int64)]
+        )
+        self._values = np.concatenate(
+            [self._values, np.zeros((capacity - len(self._values), self._values.shape[1]))]
+        )
+
+
+_Reader = tuple[str, str, Callable[[Any], float]]
+
+
+def _readers_of(message: Any) -> list[_Reader]:
+    """Tell the numbers in a message: their names, the field they are of, how to read them."""
+    found: list[_Reader] = []
+    for field in message.fieldnames:
+        value = getattr(message, field)
+        if isinstance(value, int | float):
+            found.append((field, field, _scalar_reader(field)))
+        elif isinstance(value, list | tuple) and 0 < len(value) <= MAX_ARRAY:
+            found += [
+                (f"{field}[{n}]", field, _item_reader(field, n))
+                for n, item in enumerate(value)
+                if isinstance(item, int | float)
+            ]
+    return found
+
+
+def _scalar_reader(field: str) -> Callable[[Any], float]:
+    return lambda message: float(getattr(message, field))
+
+
+def _item_reader(field: str, index: int) -> Callable[[Any], float]:
+    return lambda message: float(getattr(message, field)[index])
+
+
+def _kind_of(message: Any) -> str:
+    name: str = message.get_type()
+    instance = getattr(message, "instance_field", None)
+    return name if instance is None else f"{name}[{getattr(message, instance)}]"
+
+
+def thin_out(time_us: IntArray, values: FloatArray, columns: int) -> tuple[IntArray, FloatArray]:
+    """Keep what a chart of so many columns shows: the least and the greatest of each.
+
+    Parameters
+    ----------
+    time_us : ndarray of int64, shape (N,)
+        Growing.
+    values : ndarray of float64, shape (N,)
+        NaN stays NaN where a column holds nothing else.
+    columns : int
+        At least 1.
+
+    Returns
+    -------
+    time_us, values : ndarray
+        At most twice `columns` rows, the last one among them, in order.
+    """
+    if len(time_us) <= 2 * columns:
+        return time_us, values
+    edges = np.linspace(0, len(time_us), columns + 1).astype(int)
+    kept = {len(time_us) - 1}
+    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = values[begin:end]
+        if np.isnan(part).all():
+            kept.add(begin)
+        else:
+            kept |= {begin + int(np.nanargmin(part)), begin + int(np.nanargmax(part))}
+    order = sorted(kept)
+    return time_us[order], values[order]

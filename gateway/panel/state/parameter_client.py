@@ -1,0 +1,197 @@
+"""The asking side of the parameter protocol: the whole list, and one change at a time.
+
+Theory of operation. PARAM_REQUEST_LIST makes the vehicle send everything; what is still missing
+when nothing came for a while is asked for one by one. A change is sent until the vehicle answers:
+PARAM_VALUE with the new value is a yes; PARAM_ERROR, or the old value, is a no.
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.units import US_PER_S
+from gateway.vehicle.services.parameters.parameters import INTEGER_CODES, decode_value
+
+QUIET_US: Final = US_PER_S
+MISSING_AT_ONCE: Final = 20
+MAX_ATTEMPTS: Final = 5
+MAX_PARAMETERS: Final = 5000
+"""Large autopilots have some 1500; more are forged."""
+AUTOPILOT: Final = 1
+NO_INDEX: Final = 65535
+"""Of a parameter that was sent unasked."""
+
+ERRORS: Final = {
+    mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",
+    mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE: "the value is out of range",
+    mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED: "this client may not change parameters",
+    mavlink.MAV_PARAM_ERROR_READ_ONLY: "it is read-only",
+}
+
+
+class ListState(StrEnum):
+    """How far the list is."""
+
+    UNKNOWN = "unknown"
+    LOADING = "loading"
+    COMPLETE = "complete"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterEntry:
+    """One parameter as the vehicle told it."""
+
+    name: str
+    value: float
+    kind: int
+    """MAV_PARAM_TYPE."""
+    index: int
+
+
+@dataclass(slots=True)
+class _Change:
+    value: float
+    due_us: int
+    attempts: int = 1
+
+
+class ParameterClient:
+    """Parameters of one vehicle.
+
+    Parameters
+    ----------
+    system_id : int
+        Whose.
+    """
+
+    def __init__(self, system_id: int) -> None:
+        self.system_id = system_id
+        self.state = ListState.UNKNOWN
+        self.count = 0
+        """How many the vehicle says that it has."""
+        self.entries: dict[str, ParameterEntry] = {}
+        self.refused: dict[str, str] = {}
+        """Why the last change of a parameter did not come about, until it is changed again."""
+        self.bytewise = False
+        """Whether integers travel as their bytes (PX4) and not as numbers (ArduPilot)."""
+        self._indices: set[int] = set()
+        self._changes: dict[str, _Change] = {}
+        self._attempts = 0
+        self._due_us: int | None = None
+
+    @property
+    def pending(self) -> frozenset[str]:
+        """Names of what was changed and is not confirmed yet."""
+        return frozenset(self._changes)
+
+    def load(self, now_us: int) -> list[Any]:
+        """Ask for all of them; returns what is to be sent."""
+        self.state, self._attempts = ListState.LOADING, 0
+        self._due_us = now_us + QUIET_US
+        return [mavlink.MAVLink_param_request_list_message(self.system_id, AUTOPILOT)]
+
+    def change(self, name: str, value: float, now_us: int) -> list[Any]:
+        """Set one; returns what is to be sent.
+
+        Raises
+        ------
+        ValueError
+            If there is no such parameter, or the value is not a number.
+        """
+        entry = self.entries.get(name)
+        if entry is None:
+            raise ValueError(f"aircraft {self.system_id} has no parameter {name}")
+        if not math.isfinite(value):
+            raise ValueError(f"{name}: {value} is not a number")
+        self.refused.pop(name, None)
+        self._changes[name] = _Change(value, now_us + QUIET_US)
+        return [self._set_message(entry, value)]
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one message of the vehicle; all but those about parameters are left aside."""
+        match message.get_type():
+            case "PARAM_VALUE":
+                self._take_value(message, now_us)
+            case "PARAM_ERROR":
+                name = message.param_id
+                if self._changes.pop(name, None) is not None:
+                    self.refused[name] = ERRORS.get(message.error, f"error {message.error}")
+            case "AUTOPILOT_VERSION":
+                bytewise = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+                self.bytewise = bool(message.capabilities & bytewise)
+            case "HEARTBEAT":
+                self.bytewise |= message.autopilot == mavlink.MAV_AUTOPILOT_PX4
+
+    def poll(self, now_us: int) -> list[Any]:
+        """Ask again for what did not come; returns what is to be sent."""
+        return self._poll_list(now_us) + self._poll_changes(now_us)
+
+    def _take_value(self, message: Any, now_us: int) -> None:
+        name, kind = message.param_id, message.param_type
+        if name not in self.entries and len(self.entries) >= MAX_PARAMETERS:
+            return
+        value = self._decoded(message.param_value, kind)
+        known = self.entries.get(name)
+        # 65535 is the index of one that was sent unasked.
+        index = (
+            message.param_index if message.param_index != 65535 or known is None else known.index
+        )
+        self.entries[name] = ParameterEntry(name, value, kind, index)
+        self._indices.add(index)
+        self.count = min(message.param_count, MAX_PARAMETERS) or self.count
+        change = self._changes.pop(name, None)
+        if change is not None and not math.isclose(value, change.value, rel_tol=1e-6, abs_tol=1e-9):
+            self.refused[name] = f"the aircraft keeps {value:g}"
+        if self.state is ListState.LOADING:
+            self._due_us = now_us + QUIET_US
+            if len(self._indices) >= self.count:
+                self.state, self._due_us = ListState.COMPLETE, None
+
+    def _poll_list(self, now_us: int) -> list[Any]:
+        if self._due_us is None or now_us < self._due_us:
+            return []
+        self._attempts += 1
+        self._due_us = now_us + QUIET_US
+        if self._attempts > MAX_ATTEMPTS + self.count // MISSING_AT_ONCE:
+            self.state, self._due_us = ListState.FAILED, None
+            return []
+        if not self.count:
+            return [mavlink.MAVLink_param_request_list_message(self.system_id, AUTOPILOT)]
+        missing = [n for n in range(self.count) if n not in self._indices][:MISSING_AT_ONCE]
+        return [
+            mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT, b"", index)
+            for index in missing
+        ]
+
+    def _poll_changes(self, now_us: int) -> list[Any]:
+        found = []
+        for name, change in list(self._changes.items()):
+            if now_us < change.due_us:
+                continue
+            if change.attempts >= MAX_ATTEMPTS:
+                del self._changes[name]
+                self.refused[name] = "no answer"
+                continue
+            change.attempts += 1
+            change.due_us = now_us + QUIET_US
+            found.append(self._set_message(self.entries[name], change.value))
+        return found
+
+    def _decoded(self, value: float, kind: int) -> float:
+        if self.bytewise:
+            return decode_value(value, kind)
+        return float(str(np.float32(value)))
+
+    def _set_message(self, entry: ParameterEntry, value: float) -> Any:
+        code = INTEGER_CODES.get(entry.kind) if self.bytewise else None
+        if code is not None:
+            value = struct.unpack("<f", struct.pack(code, round(value)))[0]
+        return mavlink.MAVLink_param_set_message(
+            self.system_id, AUTOPILOT, entry.name.encode(), value, entry.kind
+        )

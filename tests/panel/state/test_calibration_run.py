@@ -1,0 +1,150 @@
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.calibration_run import SIDES, CalibrationRun, CalibrationStep, RunState
+from gateway.panel.state.sphere_cover import CELLS, seen_cells
+from gateway.records import Incoming, Vec3
+from gateway.units import US_PER_S
+from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from tests.vehicle.samples import sample_at, state_at
+
+G = 9.80665
+
+
+class Bench:
+    """The gateway's vehicle in a hand, and the page that follows."""
+
+    def __init__(self, step: CalibrationStep) -> None:
+        rates = RateSettings(highres_imu_hz=50.0)
+        self.vehicle = Vehicle(VehicleSettings(rates=rates), 1)
+        self.now_us = US_PER_S
+        self.run = CalibrationRun(1, step, self.now_us)
+        self._mav = mavlink.MAVLink(None, 253, 25)
+        self._rng = np.random.default_rng(1)
+
+    def send(self, message: Any) -> None:
+        frame = message.pack(self._mav)
+        self._take(self.vehicle.handle(Incoming(1, frame, True), self.now_us))
+
+    def hold(
+        self,
+        seconds: float,
+        accel: Vec3 = (0.0, 0.0, -G),
+        gyro: Vec3 = (0.0, 0.0, 0.0),
+        mag: Vec3 | None = None,
+    ) -> None:
+        for _ in range(round(seconds * 100)):
+            self.now_us += 10_000
+            noise = self._rng.normal(scale=0.005, size=(2, 3))
+            values: dict[str, Any] = {
+                "accel_b_mps2": tuple((np.array(accel) + noise[0]).tolist()),
+                "gyro_b_radps": tuple((np.array(gyro) + noise[1]).tolist()),
+            }
+            if mag is not None:
+                values["mag_b_ut"] = mag
+            sample = sample_at(self.now_us, **values)
+            self._take(self.vehicle.on_state(state_at(self.now_us), sample, self.now_us))
+            self._take(self.vehicle.poll(self.now_us))
+            self.run.poll(self.now_us)
+
+    def _take(self, actions: Any) -> None:
+        for action in actions:
+            if hasattr(action, "frame"):
+                self.run.take(self._mav.decode(bytearray(action.frame)), self.now_us)
+
+
+def test_gyro_tells_the_bias_before_and_after() -> None:
+    bench = Bench(CalibrationStep.GYRO)
+    bench.send(bench.run.start_message())
+    assert bench.run.state is RunState.RUNNING
+    bench.hold(1.5, gyro=(0.01, 0.0, 0.0))
+    assert bench.run.progress in range(40, 60)
+    bench.hold(1.6, gyro=(0.01, 0.0, 0.0))
+    assert bench.run.state is RunState.CHECKING
+    bench.hold(2.1)
+    assert bench.run.state is RunState.DONE
+    [residual] = bench.run.residuals()
+    assert residual.before == pytest.approx(math.degrees(0.01), rel=0.1)
+    assert residual.after < 0.1
+
+
+def test_what_moves_fails_and_says_why() -> None:
+    bench = Bench(CalibrationStep.GYRO)
+    bench.send(bench.run.start_message())
+    for n in range(40):
+        bench.hold(0.1, gyro=(math.sin(n), 0.0, 0.0))
+    assert (bench.run.state, bench.run.trouble) == (RunState.FAILED, "it was moved")
+
+
+def test_six_sides_are_followed_one_by_one() -> None:
+    bench = Bench(CalibrationStep.ACCEL)
+    bench.send(bench.run.start_message())
+    bias = np.array((0.3, -0.2, 0.1))
+    for done, (axis, sign) in enumerate((a, s) for a in range(3) for s in (1.0, -1.0)):
+        pose = bias + sign * G * np.eye(3)[axis]
+        bench.hold(2.5, accel=tuple(pose.tolist()))
+        assert bench.run.side_now == VEHICLE_SIDES[2 * axis + (sign < 0)]
+        assert len(bench.run.sides_done) >= done + 1
+    assert sorted(bench.run.sides_done) == sorted(SIDES)
+    bench.hold(2.1)
+    [residual] = bench.run.residuals()
+    assert residual.before == pytest.approx(0.2, abs=0.1)
+    assert residual.after < 0.02
+
+
+def test_magnetometer_shows_what_is_uncovered() -> None:
+    bench = Bench(CalibrationStep.MAG)
+    bench.send(bench.run.start_message())
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(1500, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    centre = np.array((12.0, -7.0, 4.0))
+    upper = directions[directions[:, 2] < 0.0]
+    for direction in upper[:400]:
+        bench.hold(0.02, mag=tuple((centre + 48.0 * direction).tolist()))
+    half = sum(bench.run.cover())
+    assert 30 < half < 60
+    for direction in directions[:1000]:
+        if bench.run.state is not RunState.RUNNING:
+            break
+        bench.hold(0.02, mag=tuple((centre + 48.0 * direction).tolist()))
+    assert bench.run.state is RunState.CHECKING
+    bench.hold(2.1)
+    assert sum(bench.run.cover()) > half
+    found, radius = bench.run.sphere()
+    assert found == pytest.approx(centre.tolist(), abs=0.2)
+    assert radius == pytest.approx(48.0, abs=0.2)
+    [residual] = bench.run.residuals()
+    assert residual.before > 4.0
+    assert residual.after < 0.1
+
+
+def test_cancelling_and_silence_end_it() -> None:
+    bench = Bench(CalibrationStep.MAG)
+    bench.send(bench.run.start_message())
+    bench.send(bench.run.cancel_message())
+    assert (bench.run.state, bench.run.trouble) == (RunState.FAILED, "cancelled")
+    lonely = CalibrationRun(2, CalibrationStep.GYRO, 0)
+    lonely.poll(5 * US_PER_S)
+    assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")
+
+
+def test_a_refusal_is_told() -> None:
+    run = CalibrationRun(1, CalibrationStep.GYRO, 0)
+    command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
+    run.take(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
+    assert (run.state, run.trouble) == (RunState.FAILED, "denied")
+
+
+def test_every_direction_has_its_own_cell() -> None:
+    middles = CELLS.sum(axis=1)
+    assert all(seen_cells(middles))
+    assert sum(seen_cells(middles[:1])) == 1
+    assert not any(seen_cells(np.empty((0, 3))))
+    assert not any(seen_cells(np.full((2, 3), np.nan)))

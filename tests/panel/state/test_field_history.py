@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.field_history import MAX_ROWS, SPAN_US, FieldHistory, thin_out
+from gateway.units import US_PER_S
+
+
+def attitude(roll: float) -> mavlink.MAVLink_attitude_message:
+    return mavlink.MAVLink_attitude_message(0, roll, 0.2, 0.3, 0.0, 0.0, 0.0)
+
+
+def test_every_numeric_field_is_kept_with_its_time_and_unit() -> None:
+    history = FieldHistory()
+    for n in range(3):
+        history.take(7, attitude(0.1 * n), n * US_PER_S)
+    time_us, values = history.series(7, "ATTITUDE.roll")
+    assert time_us.tolist() == [0, US_PER_S, 2 * US_PER_S]
+    assert values.tolist() == pytest.approx([0.0, 0.1, 0.2])
+    assert history.unit(7, "ATTITUDE.roll") == "rad"
+    assert "rollspeed" in history.fields(7)["ATTITUDE"]
+    assert history.series(8, "ATTITUDE.roll")[0].tolist() == []
+    assert history.series(7, "ATTITUDE.nonsense")[0].tolist() == []
+
+
+def test_arrays_are_kept_by_element_and_instances_apart() -> None:
+    history = FieldHistory()
+    for instance, volt in ((0, 4000), (1, 3000)):
+        cells = [volt, *[65535] * 9]
+        message = mavlink.MAVLink_battery_status_message(
+            instance, 0, 0, 0, cells, 100, 0, 0, 50, 0, 0, [0] * 4, 0, 0
+        )
+        history.take(1, message, 5)
+    assert history.series(1, "BATTERY_STATUS[1].voltages[0]")[1].tolist() == [3000.0]
+    assert history.unit(1, "BATTERY_STATUS[0].voltages[0]") == "mV"
+
+
+def test_texts_and_files_are_no_quantities() -> None:
+    history = FieldHistory()
+    history.take(1, mavlink.MAVLink_statustext_message(6, b"hello"), 0)
+    history.take(1, mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251), 0)
+    assert history.fields(1)["STATUSTEXT"] == ("chunk_seq", "id", "severity")
+    assert not any("payload" in name for name in history.fields(1)["FILE_TRANSFER_PROTOCOL"])
+
+
+def test_memory_is_bounded_and_the_newest_minutes_stay() -> None:
+    """Seven minutes at 100 Hz leave the last five at 50."""
+    history = FieldHistory()
+    for n in range(42_000):
+        history.take(1, attitude(float(n)), n * 10_000)
+    time_us, values = history.series(1, "ATTITUDE.roll")
+    assert len(time_us) <= MAX_ROWS
+    assert time_us[-1] - time_us[0] == pytest.approx(SPAN_US, rel=0.01)
+    assert values[-1] == pytest.approx(41_999, abs=2)
+    assert np.all(np.diff(time_us) > 0)
+
+
+def test_a_span_can_be_asked_for() -> None:
+    history = FieldHistory()
+    for n in range(1000):
+        history.take(1, attitude(float(n)), n * 20_000)
+    time_us, values = history.series(1, "ATTITUDE.roll", 500 * 20_000, 510 * 20_000)
+    assert values.tolist() == [float(n) for n in range(501, 511)]
+    assert len(time_us) == 10
+
+
+def test_thinned_out_peaks_stay() -> None:
+    time_us = np.arange(10_000, dtype=np.int64)
+    values = np.zeros(10_000)
+    values[4321], values[4322] = 9.0, -9.0
+    thin_us, thin = thin_out(time_us, values, 200)
+    assert len(thin) <= 401
+    assert (thin.max(), thin.min()) == (9.0, -9.0)
+    assert thin_us[-1] == 9_999
+    assert np.all(np.diff(thin_us) > 0)
+
+
+def test_thinned_out_gaps_stay() -> None:
+    values = np.full(1000, np.nan)
+    assert np.isnan(thin_out(np.arange(1000), values, 10)[1]).all()

@@ -1,0 +1,150 @@
+import math
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.estimation.select import EstimationSettings
+from gateway.panel.state.file_client import FileClient
+from gateway.panel.state.parameter_client import ListState, ParameterClient
+from gateway.panel.state.parameter_meta import parameter_path, parse_parameters
+from gateway.records import Incoming
+from gateway.sensing.calibration import NodeCalibration
+from gateway.units import US_PER_S
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+
+
+class Bench:
+    """A client and the gateway's own vehicle, with a line between them that may lose messages."""
+
+    def __init__(self, client: Any, *, lose_every: int = 0, may_change: bool = True) -> None:
+        self.client = client
+        self.now_us = 10 * US_PER_S
+        sections = {"estimation": EstimationSettings(), "calibration": NodeCalibration()}
+        self._vehicle = Vehicle(VehicleSettings(), 1, sections=sections)
+        self._mav = mavlink.MAVLink(None, 253, 25)
+        self._lose_every, self._count, self._may_change = lose_every, 0, may_change
+
+    def run(self, messages: list[Any], seconds: float) -> None:
+        waiting = list(messages)
+        for _ in range(round(seconds / 0.01)):
+            self.now_us += 10_000
+            actions = list(self._vehicle.poll(self.now_us))
+            for message in waiting:
+                frame = message.pack(self._mav)
+                incoming = Incoming(1, frame, self._may_change)
+                actions += self._vehicle.handle(incoming, self.now_us)
+            waiting = []
+            for action in actions:
+                if hasattr(action, "frame") and not self._is_lost():
+                    message = self._mav.decode(bytearray(action.frame))
+                    waiting += self.client.take(message, self.now_us) or []
+            waiting += self.client.poll(self.now_us)
+
+    def _is_lost(self) -> bool:
+        self._count += 1
+        return bool(self._lose_every) and self._count % self._lose_every == 0
+
+
+@pytest.mark.parametrize("lose_every", [0, 3])
+def test_the_whole_list_comes_in_spite_of_losses(lose_every: int) -> None:
+    client = ParameterClient(1)
+    bench = Bench(client, lose_every=lose_every)
+    bench.run(client.load(bench.now_us), 40.0 if lose_every else 2.0)
+    assert client.state is ListState.COMPLETE
+    assert len(client.entries) == client.count > 90
+
+
+def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
+    client = ParameterClient(1)
+    bench = Bench(client)
+    bench.run(client.load(bench.now_us), 2.0)
+    old = client.entries["PAPER_ALPHA_GYRO"].value
+    bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
+    assert (client.entries["PAPER_ALPHA_GYRO"].value, old) != (old, 0.75)
+    assert client.entries["PAPER_ALPHA_GYRO"].value == 0.75
+    assert not client.pending
+    assert not client.refused
+    bench.run(client.change("PAPER_ALPHA_GYRO", 5.0, bench.now_us), 0.1)
+    assert client.refused == {"PAPER_ALPHA_GYRO": "the value is out of range"}
+    assert client.entries["PAPER_ALPHA_GYRO"].value == 0.75
+
+
+def test_a_client_that_may_not_change_is_told_so() -> None:
+    client = ParameterClient(1)
+    bench = Bench(client, may_change=False)
+    bench.run(client.load(bench.now_us), 2.0)
+    bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
+    assert "may not change" in client.refused["PAPER_ALPHA_GYRO"]
+
+
+def test_no_answer_ends() -> None:
+    client = ParameterClient(1)
+    messages = client.load(0)
+    for second in range(1, 30):
+        messages += client.poll(second * US_PER_S)
+    assert client.state is ListState.FAILED
+    assert len(messages) < 20
+
+
+def test_nonsense_is_not_sent() -> None:
+    client = ParameterClient(1)
+    with pytest.raises(ValueError, match="no parameter NIX"):
+        client.change("NIX", 1.0, 0)
+    client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
+    with pytest.raises(ValueError, match="not a number"):
+        client.change("P", math.nan, 0)
+
+
+def test_integers_travel_as_the_vehicle_has_them() -> None:
+    """PX4 packs their bytes into the float, ArduPilot writes the number."""
+    for autopilot, on_the_wire in ((12, 7.0e-45), (3, 5.0)):
+        client = ParameterClient(1)
+        client.take(mavlink.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3), 0)
+        client.take(mavlink.MAVLink_param_value_message(b"N", on_the_wire, 6, 1, 0), 0)
+        assert client.entries["N"].value == 5.0
+        [message] = client.change("N", 5.0, 0)
+        assert message.param_value == pytest.approx(on_the_wire, rel=0.01)
+
+
+@pytest.mark.parametrize("lose_every", [0, 5])
+def test_the_metadata_explains_every_parameter(lose_every: int) -> None:
+    parameters, files = ParameterClient(1), FileClient(1)
+    bench = Bench(parameters)
+    bench.run(parameters.load(bench.now_us), 2.0)
+    bench = Bench(files, lose_every=lose_every)
+    bench.run(files.read("/general.json", bench.now_us), 5.0)
+    path = parameter_path(files.files["/general.json"])
+    assert path == "/parameter.json"
+    bench.run(files.read(path, bench.now_us), 60.0 if lose_every else 5.0)
+    metas = parse_parameters(files.files[path])
+    assert metas.keys() == parameters.entries.keys()
+    meta = metas["PAPER_ALPHA_GYRO"]
+    assert (meta.low, meta.high, meta.group) == (0.0, 1.0, "paper")
+    assert meta.short
+    assert not files.busy
+
+
+def test_a_file_that_is_not_there_is_refused() -> None:
+    files = FileClient(1)
+    bench = Bench(files)
+    bench.run(files.read("/nothing.json", bench.now_us), 0.2)
+    assert files.refused == {"/nothing.json"}
+    assert not files.busy
+
+
+def test_a_vehicle_without_files_does_not_hold_up() -> None:
+    files = FileClient(1)
+    files.read("/general.json", 0)
+    for step in range(20):
+        files.poll(step * US_PER_S)
+    assert files.refused == {"/general.json"}
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b'{"parameters": 3}', b'{"parameters": [{"name": 3}, 4]}']
+)
+def test_broken_metadata_explains_nothing(content: bytes) -> None:
+    assert parse_parameters(content) == {}
+    assert parameter_path(content) is None
