@@ -12,16 +12,22 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway import Outgoing, Pipeline, PipelineSettings
 from gateway.aircraft import AircraftSettings
+from gateway.edges.disk.recording_streams import OTHER_FORMATS
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.extensions import ExtensionError, load_extensions
-from gateway.records import NavState
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import encode_head
+from gateway.flights.reading import READERS, ReadOptions
+from gateway.flights.writing import WRITERS, FlightToWrite
+from gateway.records import ImuRaw, NavState
+from gateway.replay import header_for
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"
-REGISTRIES = (ADDED_MESSAGES, ESTIMATORS)
+REGISTRIES: tuple[dict, ...] = (ADDED_MESSAGES, ESTIMATORS, WRITERS, READERS, OTHER_FORMATS)
 
 Install = Callable[[str, str], ModuleType]
 
@@ -58,6 +64,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         sys.modules.pop(name, None)
 
 
+def is_imu(record: object) -> bool:
+    return isinstance(record, ImuRaw)
+
+
 def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
     pipeline = Pipeline(PipelineSettings(settings))
     frames = []
@@ -87,6 +97,25 @@ def test_an_estimator_is_chosen_by_name(install: Install) -> None:
     frames = [f for f in fly_with(settings, 2.0) if message_id_of(f) == wanted]
     first = mavlink.MAVLink(None).parse_char(frames[0])
     assert (first.q1, first.q2, first.q3, first.q4) == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_a_format_is_written_and_read(install: Install, tmp_path: Path) -> None:
+    install("json_lines", example("A recording format"))
+    load_extensions()
+    settings = AircraftSettings()
+    options = ReadOptions(PipelineSettings(settings))
+    samples = [r for r in fly(SimulatorSettings(), duration_s=2.0).records() if is_imu(r)]
+    table = tmp_path / "flight.csv"
+    lines = [row_to_line(TableRow(r.time_us, raw=r)) for r in samples]
+    table.write_text(encode_head(header_for(settings, 1)) + "".join(lines))
+    refused = FlightToWrite([table], options, fuse=True)
+    written = tmp_path / "flight.jsonl"
+    written.write_bytes(b"".join(WRITERS[".jsonl"](refused)))
+    assert len(written.read_text().splitlines()) == len(samples)
+    again = FlightToWrite([written], options)
+    frames = [record.frame for record in again.frames()]
+    assert any(message_id_of(f) == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION for f in frames)
+    assert b"".join(WRITERS[".jsonl"](again)) == written.read_bytes()
 
 
 def test_an_unknown_estimator_is_refused_by_name() -> None:

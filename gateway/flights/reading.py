@@ -2,7 +2,7 @@
 
 import heapq
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import chain
@@ -13,9 +13,11 @@ import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import (
+    OTHER_FORMATS,
     FileKind,
     Progress,
     kind_of,
+    other_format,
     read_batches,
     read_chunks,
     read_events,
@@ -96,6 +98,35 @@ class RecordedTable:
         return (row for row in self.rows if isinstance(row, TableRow))
 
 
+Read = Callable[[Path, ReadOptions], RecordedTable]
+
+READERS: Final[dict[str, Read]] = {}
+"""Of the formats in `OTHER_FORMATS`."""
+
+
+def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
+    """Let every command that takes a flight read one more format.
+
+    Parameters
+    ----------
+    name : str
+        Of the format, for people.
+    knows : callable
+        Whether a file that begins with these bytes (some hundred) is of the format.
+    read : callable
+        Opens a file; see `table_of_rows` for samples that are calibrated already. Raises
+        FlightError if there is no flight in it.
+
+    Raises
+    ------
+    ValueError
+        If a format of that name is read already.
+    """
+    if name in READERS:
+        raise ValueError(f"{name} files are read already")
+    OTHER_FORMATS[name], READERS[name] = knows, read
+
+
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     """Open any file that holds a flight as a table.
 
@@ -125,6 +156,8 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
             return _open_foreign(path, options)
         case FileKind.TLOG:
             return _open_autopilot(path, options)
+        case FileKind.OTHER:
+            return READERS[other_format(path)](path, options)
 
 
 def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
@@ -270,7 +303,7 @@ def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
         raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
-    return _headed(first, rows, options, options.system_id or 1, None)
+    return table_of_rows(chain([first], rows), options, options.system_id or 1)
 
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
@@ -289,20 +322,37 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
         raise FlightError(
             f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )
-    return _headed(first, stream, options, reader.system_id or 1, reader.unix_us_at_zero)
+    return table_of_rows(
+        chain([first], stream), options, reader.system_id or 1, reader.unix_us_at_zero
+    )
 
 
-def _headed(
-    first: TableRow,
-    rest: Iterator[TableRow],
+def table_of_rows(
+    rows: Iterator[TableRow],
     options: ReadOptions,
-    vehicle_id: int,
-    unix_us_at_zero: int | None,
+    vehicle_id: int = 1,
+    unix_us_at_zero: int | None = None,
 ) -> RecordedTable:
-    """Give rows of another program the head of a table, with the settings of today."""
+    """Give rows of another program the head of a table, with the settings of today.
+
+    Parameters
+    ----------
+    rows : iterator of TableRow
+        Their values count as calibrated.
+    options : ReadOptions
+        Tells the settings of today.
+    vehicle_id : int
+        Of the aircraft.
+    unix_us_at_zero : int, optional
+        Civil time at the rows' zero, if it is known.
+
+    Returns
+    -------
+    RecordedTable
+    """
     current = options.current.aircraft.get(vehicle_id, options.current.default)
     # Its values are calibrated already, whatever the calibration of the aircraft of that number.
     calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
     known = header_for(calibrated, vehicle_id)
     header = msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
-    return RecordedTable(header, chain([first], rest))
+    return RecordedTable(header, rows)

@@ -112,8 +112,11 @@ class Refusion:
 
 def end_of(file: Path, options: ReadOptions) -> int | None:
     """Tell the civil time of a table's last row without reading all of it; None if unknown."""
+    kind = kind_of(file)
+    if kind is FileKind.OTHER:
+        return None
     head, tail = read_ends(file)
-    if kind_of(file) is FileKind.FOREIGN:
+    if kind is FileKind.FOREIGN:
         rows = list(foreign_rows((head + tail).decode(errors="replace").splitlines(), options))
         zero_us = 0
     else:

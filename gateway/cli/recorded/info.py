@@ -120,8 +120,8 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found
-    if kind is FileKind.FOREIGN:
-        raise FlightError(f"{file}: is a CSV of another program; convert it first")
+    if kind in (FileKind.FOREIGN, FileKind.OTHER):
+        raise FlightError(f"{file}: is of another program; convert it to CSV first")
     table, reader = TableSummary(), TableReader()
     for event in read_events(file, reader, advance):
         table.add([event], reader.header)

@@ -27,16 +27,34 @@ class FileKind(StrEnum):
     TABLE = "table"
     FOREIGN = "foreign"
     """Text with columns that are not ours."""
+    OTHER = "other"
+    """A format that `OTHER_FORMATS` knows."""
+
+
+OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {}
+"""Whether a file that begins with these bytes is of a format, by the format's name."""
 
 
 def kind_of(path: Path) -> FileKind:
     """Look at a file's first bytes; raises OSError if it cannot be read."""
     with _open(path) as file:
         head = file.read(SNIFF)
+    if any(knows(head) for knows in OTHER_FORMATS.values()):
+        return FileKind.OTHER
     if head.startswith((b"# mavgate table", b"time_us,")):
         return FileKind.TABLE
     is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
     return FileKind.TLOG if is_binary or b"," not in head else FileKind.FOREIGN
+
+
+def other_format(path: Path) -> str:
+    """Return which of `OTHER_FORMATS` a file is; raises KeyError if it is none."""
+    with _open(path) as file:
+        head = file.read(SNIFF)
+    for name, knows in OTHER_FORMATS.items():
+        if knows(head):
+            return name
+    raise KeyError(path)
 
 
 def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:

@@ -1,0 +1,216 @@
+"""Flights written as files: one writer a format, by the ending of the file's name."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
+from gateway.flightlog.moment import Moment, place_in
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import (
+    TableHeader,
+    TableMark,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_state,
+)
+from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flights.reading import (
+    NO_RECORDING,
+    FlightError,
+    Line,
+    ReadOptions,
+    RecordedTable,
+    joined_rows,
+    open_rows,
+    points_of_frames,
+    points_of_rows,
+    recorded_frames,
+)
+from gateway.flights.refusion import Refusion
+from gateway.records import FusionState
+
+LINES: Final = 1000
+"""Lines of a table that are written at once."""
+
+Limits = tuple[Moment | None, Moment | None]
+
+
+class FlightToWrite:
+    """Recordings that become one file: as MAVLink or as rows, whichever its format wants.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Tlogs, or tables of one aircraft.
+    options : ReadOptions
+        How to read and fuse.
+    limits : tuple of Moment or None
+        First and last moment.
+    title : str
+        What the flight is called in the file.
+    fuse : bool
+        Fuse tables again in place of their recorded states.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        options: ReadOptions,
+        *,
+        limits: Limits = (None, None),
+        title: str = "flight",
+        fuse: bool = False,
+    ) -> None:
+        self.files, self.options, self.title = files, options, title
+        self._limits = limits
+        kinds = {kind_of(file) for file in files}
+        self.is_mavlink = kinds == {FileKind.TLOG}
+        """Whether the frames are those that were recorded, and the rows are read out of them."""
+        self._as_recorded = kinds == {FileKind.TABLE} and not fuse
+        self._refusion: Refusion | None = None
+
+    def frames(self) -> Iterator[TlogRecord]:
+        """Yield the MAVLink: as recorded, or what the gateway would send for the rows."""
+        if not self.is_mavlink:
+            return _within(self._fused().frames(), self._limits)
+        recorded = recorded_frames(self.files, self.options.progress)
+        first = next(recorded, None)
+        if first is None:
+            raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
+        return _within(chain([first], recorded), self._limits)
+
+    def table(self) -> RecordedTable:
+        """Return the rows: as recorded, or fused again from the start and then cut."""
+        if self._as_recorded:
+            table = joined_rows([open_rows(file, self.options) for file in self.files])
+        else:
+            table = self._fused().table()
+        return _trimmed(table, self._limits)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the user should know, once all is written."""
+        return self._refusion.remarks if self._refusion else []
+
+    def _fused(self) -> Refusion:
+        self._refusion = Refusion(self.files, self.options)
+        return self._refusion
+
+
+Write = Callable[[FlightToWrite], Iterable[bytes]]
+
+WRITERS: Final[dict[str, Write]] = {}
+"""By the ending of the file's name."""
+
+
+def add_writer(ending: str, write: Write) -> None:
+    """Let `mavgate convert` write one more format.
+
+    Parameters
+    ----------
+    ending : str
+        Of the file's name, with its dot.
+    write : callable
+        Yields the file's bytes piece by piece.
+
+    Raises
+    ------
+    ValueError
+        If the ending is taken.
+    """
+    if ending in WRITERS:
+        raise ValueError(f"files that end in {ending} are written already")
+    WRITERS[ending] = write
+
+
+def _write_tlog(flight: FlightToWrite) -> Iterator[bytes]:
+    return (encode_record(record.time_us, record.frame) for record in flight.frames())
+
+
+def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
+    table = flight.table()
+    yield encode_head(table.header).encode()
+    lines: list[str] = []
+    for row in table.rows:
+        match row:
+            case TableRow():
+                lines.append(row_to_line(row))
+            case TableHeader():
+                lines.append(encode_header(row))
+            case TableMark():
+                lines.append(encode_mark(row))
+            case FusionState():
+                lines.append(encode_state(row))
+        if len(lines) == LINES:
+            yield "".join(lines).encode()
+            lines.clear()
+    yield "".join(lines).encode()
+
+
+def _write_kml(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_kml(flight.title, _points(flight)))
+
+
+def _write_gpx(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_gpx(flight.title, _points(flight)))
+
+
+def _points(flight: FlightToWrite) -> Iterator[TrackPoint]:
+    if flight.is_mavlink:
+        points = points_of_frames(flight.frames(), flight.options.system_id)
+    else:
+        points = points_of_rows(flight.table())
+    first = next(points, None)
+    if first is None:
+        raise FlightError(f"{flight.title}: nothing to draw, for the flight tells no position")
+    return thin_out(chain([first], points))
+
+
+add_writer(".tlog", _write_tlog)
+add_writer(".csv", _write_table)
+add_writer(".kml", _write_kml)
+add_writer(".gpx", _write_gpx)
+
+
+def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:
+    begin, end = limits
+    first_us: int | None = None
+    for record in records:
+        first_us = record.time_us if first_us is None else first_us
+        if end is not None and record.time_us > place_in(end, first_us):
+            return
+        if begin is None or record.time_us >= place_in(begin, first_us):
+            yield record
+
+
+def _trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
+    begin, end = limits
+    zero_us = table.header.unix_us_at_zero or 0
+
+    def rows() -> Iterator[Line]:
+        first_us: int | None = None
+        begun = begin is None
+        for row in table.rows:
+            if isinstance(row, TableRow):
+                time_us = zero_us + row.time_us
+                first_us = time_us if first_us is None else first_us
+                if end is not None and time_us > place_in(end, first_us):
+                    return
+                begun = begun or (begin is not None and time_us >= place_in(begin, first_us))
+            # What was changed before the begin still holds, but a state from there does not.
+            if begun or isinstance(row, TableHeader):
+                yield row
+
+    cold_start = table.header.cold_start and begin is None
+    return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), rows())
