@@ -26,6 +26,7 @@ from gateway.edges.operator.prometheus import MetricsServer
 from gateway.edges.operator.service import ServiceNotifier, set_realtime_priority
 from gateway.edges.receiver.pty_port import PtyPort
 from gateway.edges.receiver.serial_port import SerialPort
+from gateway.flightlog.recording_budget import RecordingBudget
 from gateway.flightlog.table.table import TableHeader
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
@@ -91,7 +92,7 @@ class Daemon:
             self._on_frame,
             self.now_us,
             on_foreign=lambda frame: self._recorder.frame(frame),
-            on_gone=self._pipeline.forget_client,
+            on_gone=self._on_gone,
             on_trouble=self._on_trouble,
             seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us()),
         )
@@ -101,8 +102,9 @@ class Daemon:
             unix_time_us,
             self._table_head,
             self._announce,
-            lambda vehicle_id: self._pipeline.aircraft[vehicle_id].fusion_state,
+            lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
         )
+        self._budget = RecordingBudget()
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self.snapshot)
@@ -227,16 +229,30 @@ class Daemon:
             log.warning("no orders can be taken: %s", error)
 
     def _table_head(self, vehicle_id: int) -> TableHeader:
-        return header_for(self._pipeline.aircraft[vehicle_id].settings, vehicle_id)
+        return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         self._perform(self._pipeline.feed(data, now_us))
 
     def _on_frame(self, incoming: Incoming) -> None:
-        # A ground station's broadcast comes both to us and past us.
-        if not incoming.forwarded:
-            self._recorder.frame(incoming.frame)
-        self._perform(self._pipeline.handle(incoming, self.now_us()))
+        frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()
+        self._budget.note(client_id, now_us, trusted=incoming.trusted)
+        actions = self._pipeline.handle(incoming, now_us)
+        # A ground station's broadcast comes both to us and past us; of strangers only what came to
+        # something is kept.
+        kept = incoming.trusted or bool(actions)
+        if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
+            self._recorder.frame(frame)
+        self._perform(actions)
+
+    def _on_gone(self, client_id: int) -> None:
+        self._pipeline.forget_client(client_id)
+        self._budget.forget_client(client_id)
+
+    def _record_sent(self, sent: Outgoing) -> None:
+        frame, to = sent.frame, sent.client_id
+        if to is None or self._budget.takes(to, len(frame), self.now_us()):
+            self._recorder.frame(frame)
 
     def _poll(self) -> None:
         # First of all: whatever happens below, the next turn comes.
@@ -262,7 +278,7 @@ class Daemon:
                 case Outgoing():
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
-                    self._recorder.frame(action.frame)
+                    self._record_sent(action)
                 case ClientInterval():
                     self._hub.set_interval(action)
                 case SaveSettings():
@@ -278,7 +294,7 @@ class Daemon:
 
     def _save(self, vehicle_id: int) -> None:
         """Write an aircraft's settings to its file, and tell how that went."""
-        aircraft = self._pipeline.aircraft[vehicle_id]
+        aircraft = self._pipeline.find(vehicle_id)
         try:
             file = save_aircraft(self._settings, vehicle_id, aircraft.settings)
         except OSError as error:
@@ -293,7 +309,7 @@ class Daemon:
         status = StatusText(NOTICE, "Mission, mark and home are kept again")
         if trouble is not None:
             status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
-        self._announce_for(self._pipeline.aircraft[vehicle_id], status)
+        self._announce_for(self._pipeline.find(vehicle_id), status)
 
     def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
         now_us = self.now_us()

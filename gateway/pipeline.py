@@ -6,8 +6,9 @@
                                                                                           actions
 
 Pure: time is an argument, and what should happen outside comes back as a list of actions, in
-order. An aircraft comes into being with its first payload. Live, demo and playback differ only in
-who calls `feed` (bytes) or `take` (raw records of a recording).
+order. An aircraft comes into being with its first record. One that is silent for `GONE_US` goes,
+and comes back as it was when it is heard again. Live, demo and playback differ only in who calls
+`feed` (bytes) or `take` (raw records of a recording).
 """
 
 from collections.abc import Callable, Mapping
@@ -34,6 +35,8 @@ from gateway.wire.mavlink_signing import Signer
 from gateway.wire.mavlink_splitter import origin_of, restamp
 
 REPORT_INTERVAL_US: Final = US_PER_S
+GONE_US: Final = 600 * US_PER_S
+"""An aircraft that was silent for so long is no longer told; longer than a change of batteries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,9 @@ class Pipeline:
         self._port = ""
         self._report_due_us = 0
         self.aircraft: dict[int, Aircraft] = {}
+        """Those that are there, by vehicle id."""
+        self._gone: dict[int, Aircraft] = {}
+        self._heard_us: dict[int, int] = {}
         self.report: LinkReport = self._link.report(0, connected=False, port="")
         """The newest link report, renewed once a second."""
 
@@ -82,6 +88,7 @@ class Pipeline:
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
         is_new = record.node.vehicle_id not in self.aircraft
+        self._heard_us[record.node.vehicle_id] = now_us
         aircraft = self._aircraft_of(record.node.vehicle_id)
         # Its heartbeat comes first: before it ground stations hear nothing of an aircraft.
         first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us) if is_new else []
@@ -90,15 +97,27 @@ class Pipeline:
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
-            known = self._settings
-            aircraft = self.aircraft[vehicle_id] = Aircraft(
-                vehicle_id,
-                known.aircraft.get(vehicle_id, known.default),
-                unix_us_at_zero=known.unix_us_at_zero,
-                stored=known.places.get(vehicle_id),
-                correct=known.correct,
-            )
+            aircraft = self._gone.pop(vehicle_id, None) or self._new(vehicle_id)
+            self.aircraft[vehicle_id] = aircraft
         return aircraft
+
+    def _new(self, vehicle_id: int) -> Aircraft:
+        known = self._settings
+        return Aircraft(
+            vehicle_id,
+            known.aircraft.get(vehicle_id, known.default),
+            unix_us_at_zero=known.unix_us_at_zero,
+            stored=known.places.get(vehicle_id),
+            correct=known.correct,
+        )
+
+    def find(self, vehicle_id: int) -> Aircraft:
+        """Give an aircraft that was heard, also one that has gone; raises KeyError for another."""
+        found = self.aircraft.get(vehicle_id)
+        return self._gone[vehicle_id] if found is None else found
+
+    def _ever(self) -> list[Aircraft]:
+        return [*self.aircraft.values(), *self._gone.values()]
 
     def change(self, vehicle_id: int, settings: AircraftSettings) -> None:
         """Let an aircraft go on with other settings, as it did when it was recorded."""
@@ -133,8 +152,8 @@ class Pipeline:
         default = with_passphrase(known.default, common)
         self._settings = replace(known, default=default, aircraft=aircraft)
         actions: list[Action] = []
-        for key, each in self.aircraft.items():
-            actions += each.sign_by(own.get(key, common), now_us)
+        for each in self._ever():
+            actions += each.sign_by(own.get(each.vehicle_id, common), now_us)
         return actions
 
     def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
@@ -165,7 +184,7 @@ class Pipeline:
 
     def forget_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
-        for aircraft in self.aircraft.values():
+        for aircraft in self._ever():
             aircraft.vehicle.forget_client(client_id)
 
     def say(self, status: StatusText, now_us: int) -> list[Action]:
@@ -200,12 +219,12 @@ class Pipeline:
     @property
     def refused(self) -> int:
         """Requests to change something, of clients that may not."""
-        return sum(aircraft.vehicle.refusals for aircraft in self.aircraft.values())
+        return sum(aircraft.vehicle.refusals for aircraft in self._ever())
 
     @property
     def forged(self) -> int:
         """Requests whose signature was wrong, old, or there before."""
-        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self.aircraft.values())
+        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self._ever())
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; ground stations are told."""
@@ -222,11 +241,17 @@ class Pipeline:
         if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
             self.report = self._link.report(now_us, connected=self._connected, port=self._port)
+            self._let_go(now_us)
         for aircraft in self.aircraft.values():
             if reporting:
                 actions += aircraft.perform(aircraft.vehicle.on_link(self.report, now_us), now_us)
             actions += aircraft.perform(aircraft.vehicle.poll(now_us), now_us)
         return actions
+
+    def _let_go(self, now_us: int) -> None:
+        for vehicle_id in list(self.aircraft):
+            if now_us - self._heard_us.setdefault(vehicle_id, now_us) > GONE_US:
+                self._gone[vehicle_id] = self.aircraft.pop(vehicle_id)
 
     def next_due_us(self) -> int:
         """Return when `poll` is to be called next, at the latest."""

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import Action, AircraftSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
     FusedSample,
@@ -51,6 +51,11 @@ class Tracker:
         self.seq = [0, 0]
 
     def frame(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
+        """Encode a payload; a node's first behind another, without which it is not believed."""
+        first = b"" if self.seq[node] else self._frame(time_us, QUALITY, node)
+        return first + self._frame(time_us, payload, node)
+
+    def _frame(self, time_us: int, payload: payloads.Payload, node: int) -> bytes:
         header = payloads.Header(NodeId(self.vehicle_id, node), self.seq[node], time_us)
         self.seq[node] += 1
         packet = payloads.encode_payload(header, payload)
@@ -83,6 +88,36 @@ def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
     assert message.time_boot_ms == 5
     (attitude,) = named(actions, "ATTITUDE")
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_a_single_frame_makes_no_aircraft(pipeline: Pipeline) -> None:
+    """Noise may pass the check of a frame; two of it that agree do not come."""
+    ghost, true = Tracker(7), Tracker()
+    assert pipeline.feed(ghost._frame(0, LEVEL, 0), 5_000) == []
+    pipeline.feed(true.frame(0, LEVEL), 6_000)
+    assert list(pipeline.aircraft) == [1]
+    late = ghost._frame(3_000_000_000, LEVEL, 0)
+    assert pipeline.feed(late, 20_000) == [], "their clocks do not agree"
+    assert list(pipeline.aircraft) == [1]
+    actions = pipeline.feed(ghost._frame(3_000_010_000, LEVEL, 0), 30_000)
+    assert sum(isinstance(action, FusedSample) for action in actions) == 2, "nothing is lost"
+    assert sorted(pipeline.aircraft) == [1, 7]
+
+
+def test_an_aircraft_goes_after_a_long_silence_and_comes_back_as_it_was(pipeline: Pipeline) -> None:
+    tracker = Tracker()
+    pipeline.feed(tracker.frame(0, LEVEL), 5_000)
+    pipeline.mark(Place(-7.0, 110.0, 0.0), 1, 5_000)
+    aircraft = pipeline.aircraft[1]
+    pipeline.poll(GONE_US)
+    assert list(pipeline.aircraft) == [1]
+    pipeline.poll(GONE_US + 2_000_000)
+    assert pipeline.aircraft == {}
+    assert pipeline.find(1) is aircraft
+    assert named(pipeline.poll(GONE_US + 4_000_000), "HEARTBEAT") == []
+    actions = pipeline.feed(tracker.frame(605_000_000, LEVEL), 605_010_000)
+    assert decode(actions)[0].get_type() == "HEARTBEAT"
+    assert pipeline.aircraft[1] is aircraft
 
 
 def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:

@@ -10,10 +10,13 @@ what came of it.
 | opening   | failed                             | blocked   | announce why                      |
 | recording | not wanted any more                | idle      | close, announce                   |
 | recording | part too large or too old          | opening   | close, open the next part         |
-| recording | the clock turns out to be wrong    | opening   | close, rename, open the next part |
+| recording | the clock turns out to be wrong *  | opening   | close, rename, open the next part |
 | recording | too little free space, or failed   | blocked   | close, announce why               |
 | blocked   | retry is due and there is space    | opening   | open the next part                |
 | blocked   | not wanted any more                | idle      | announce                          |
+
+* Only once a part: the part that this opens is not corrected again. Clocks that disagree for ever
+would else rewrite the session for ever.
 
 What is wanted: a user's start or stop counts until the user says otherwise; without one the mode
 of the settings decides.
@@ -33,6 +36,8 @@ RESUME_FACTOR: Final = 1.25
 RESUME_LEAST_MB: Final = 1.0
 """And this in any case: some ten seconds of recording."""
 MAX_NAME: Final = 100
+NEWEST: Final = "last"
+"""What people call the newest recording, whatever its name."""
 PART_DIGITS: Final = 2
 
 
@@ -147,8 +152,10 @@ def check_name(name: str) -> str:
     Raises
     ------
     ValueError
-        If a file must not be named so.
+        If a file must not be named so, or the name means another recording.
     """
+    if name == NEWEST:
+        raise ValueError(f"{name!r} is no name for a recording: it always means the newest")
     sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
     if not sound or not name[:1].isalnum() or name.endswith((" ", ".")):
         raise ValueError(
@@ -174,6 +181,7 @@ class Session:
         self._begun_us = 0
         self._opened_us = 0
         self._retry_us = 0
+        self._corrected = False
         self.state = SessionState.IDLE
         self.name = ""
         """Name of the session that runs, or ran last."""
@@ -250,6 +258,7 @@ class Session:
         match self.state:
             case SessionState.IDLE if self.wanted:
                 self.name, self.part, self._begun_us = session_name(unix_us), 0, now_us
+                self._corrected = False
                 if self._is_short(free_bytes):
                     return self._stop_short(now_us)
                 return self._open_next()
@@ -270,10 +279,12 @@ class Session:
             return self._stop_short(now_us)
         s, age_us = self._settings, now_us - self._opened_us
         too_old = age_us > s.rotate_min * 60 * US_PER_S
-        if jumped:
+        if jumped and not self._corrected:
+            self._corrected = True
             old, self.name = self.name, session_name(unix_us - (now_us - self._begun_us))
             return [ClosePart(), Rename(old, self.name), *self._open_next()]
         if too_old or part_bytes > s.rotate_mb * 1e6:
+            self._corrected = False
             return [ClosePart(), *self._open_next()]
         return []
 

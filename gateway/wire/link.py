@@ -110,6 +110,8 @@ class Link:
         self._receiver_clock = ClockTracker()
         self._receiver_status: ReceiverStatus | None = None
         self._nodes: dict[NodeId, _Node] = {}
+        self._unproven: dict[NodeId, tuple[_Node, RawRecord | None]] = {}
+        """Nodes of which a single payload was heard, and what it said: noise may pass for one."""
         self._faults: Counter[str] = Counter()
         self._bytes_received = 0
         self._frames = 0
@@ -142,8 +144,8 @@ class Link:
             heard_us = self._hear(decoded, arrival_us)
             if isinstance(decoded, payloads.ReceiverStatusFrame):
                 self._receiver_status = _receiver_status(decoded, heard_us)
-            elif record := self._take_radio(decoded, heard_us, arrival_us):
-                records.append(record)
+            else:
+                records += self._take_radio(decoded, heard_us, arrival_us)
         return records
 
     def reopened(self) -> None:
@@ -193,21 +195,43 @@ class Link:
 
     def _take_radio(
         self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
-    ) -> RawRecord | None:
+    ) -> list[RawRecord]:
+        """Tell what a payload says; a node is believed from the second one that agrees."""
         header = frame.header
-        node = self._nodes.setdefault(header.node, _Node())
-        restarts = node.clock.restarts
-        time_us = node.clock.observe(header.node_time_us, heard_us)
-        if node.clock.restarts != restarts:
-            node.sequence.forget()
-        # A late payload is counted but not used: every stage behind relies on growing times.
-        if node.sequence.count(header.seq) is not Arrival.NEW:
-            return None
-        node.pipe = frame.pipe
-        node.arrivals_us.append(arrival_us)
-        # A better estimate of the clock may move time back by a hair; a sample may not.
-        node.last_time_us = max(time_us, node.last_time_us + 1)
-        return _to_record(header, frame.payload, node)
+        node = self._nodes.get(header.node)
+        if node is not None:
+            record = _hear_node(node, frame, heard_us, arrival_us)
+            return [] if record is None else [record]
+        node, first = self._unproven.pop(header.node, (_Node(), None))
+        second = _hear_node(node, frame, heard_us, arrival_us)
+        if node.clock.restarts:
+            # Their stamps do not agree with when they came: the first was none, or this one is.
+            node = _Node()
+            first, second = None, _hear_node(node, frame, heard_us, arrival_us)
+        elif node.sequence.received > 1:
+            self._nodes[header.node] = node
+            return [record for record in (first, second) if record is not None]
+        self._unproven[header.node] = node, first or second
+        return []
+
+
+def _hear_node(
+    node: _Node, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
+) -> RawRecord | None:
+    """Count a payload of a node, and tell what it says if it is new."""
+    header = frame.header
+    restarts = node.clock.restarts
+    time_us = node.clock.observe(header.node_time_us, heard_us)
+    if node.clock.restarts != restarts:
+        node.sequence.forget()
+    # A late payload is counted but not used: every stage behind relies on growing times.
+    if node.sequence.count(header.seq) is not Arrival.NEW:
+        return None
+    node.pipe = frame.pipe
+    node.arrivals_us.append(arrival_us)
+    # A better estimate of the clock may move time back by a hair; a sample may not.
+    node.last_time_us = max(time_us, node.last_time_us + 1)
+    return _to_record(header, frame.payload, node)
 
 
 def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) -> RawRecord | None:

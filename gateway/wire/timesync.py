@@ -12,6 +12,7 @@ sum of distances to the points.
 | stamp agrees with the arrival, any number of wraps on  | unwraps it, adds the point             |
 | stamp is late, or early, by less than RESTART_JUMP_US  | the same: a queue, not a restart       |
 | stamp disagrees by more                                | the remote restarted: learns anew      |
+| packet seems to come before it was sent                | waits for a second one that agrees     |
 
 References
 ----------
@@ -33,6 +34,9 @@ MAX_SKEW: Final = 0.01
 """Ceramic resonators drift by up to 0.5 %; twice that is not a clock."""
 RESTART_JUMP_US: Final = 1_500_000
 """More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
+AHEAD_US: Final = 50_000
+"""More than the line can err by between two packets. Either the line was learned in a queue, and
+the next packets say the same, or a single stamp is wrong and must not move all that follow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,7 @@ class ClockTracker:
         self._buckets: list[_Point] = []
         self._line = _Point(0, 0)
         self._skew = 0.0
+        self._suspect: _Point | None = None
 
     @property
     def skew_ppm(self) -> float:
@@ -76,8 +81,23 @@ class ClockTracker:
             The stamp on the local clock, in µs; never later than the arrival.
         """
         remote_us = self._unwrap(remote_u32, arrival_us)
-        self._add(_Point(remote_us, arrival_us - remote_us))
+        point = _Point(remote_us, arrival_us - remote_us)
+        if self._is_doubtful(point, arrival_us):
+            return arrival_us
+        if self._last_remote_us is None or remote_us > self._last_remote_us:
+            self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
+        self._add(point)
         return min(self._to_local(remote_us), arrival_us)
+
+    def _is_doubtful(self, point: _Point, arrival_us: int) -> bool:
+        """Tell whether a packet is far too early, and no other says so too."""
+        before, self._suspect = self._suspect, None
+        if not self._buckets or self._to_local(point.remote_us) - arrival_us <= AHEAD_US:
+            return False
+        if before is not None and abs(before.delta_us - point.delta_us) <= AHEAD_US:
+            return False
+        self._suspect = point
+        return True
 
     def _unwrap(self, remote_u32: int, arrival_us: int) -> int:
         if self._last_remote_us is not None:
@@ -85,13 +105,9 @@ class ClockTracker:
             error_us = remote_u32 - self._last_remote_us - elapsed_us
             error_us = (error_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
             if abs(error_us) <= RESTART_JUMP_US + MAX_SKEW * elapsed_us:
-                remote_us = self._last_remote_us + elapsed_us + error_us
-                if remote_us > self._last_remote_us:
-                    self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
-                return remote_us
+                return self._last_remote_us + elapsed_us + error_us
             self._forget()
             self.restarts += 1
-        self._last_remote_us, self._last_arrival_us = remote_u32, arrival_us
         return remote_u32
 
     def _add(self, point: _Point) -> None:

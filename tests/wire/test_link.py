@@ -97,7 +97,10 @@ def test_far_behind_is_another_life() -> None:
 
 
 def test_imu_record() -> None:
-    (record,) = Link().feed(Line(3).frame(1_000_000, IMU), 9_000_000)
+    line, link = Line(3), Link()
+    assert link.feed(line.frame(1_000_000, IMU), 9_000_000) == [], "not believed yet"
+    record, second = link.feed(line.frame(1_010_000, IMU), 9_010_000)
+    assert second.time_us == 9_010_000
     assert record == ImuRaw(
         time_us=9_000_000,
         node=NodeId(3, 0),
@@ -115,7 +118,8 @@ def test_imu_record() -> None:
 
 def test_baro_and_status_records() -> None:
     line, link = Line(), Link()
-    (baro,) = link.feed(line.frame(0, payloads.BaroPayload(10_132_550, -12)), 0)
+    pressure = payloads.BaroPayload(10_132_550, -12)
+    baro, _ = link.feed(line.frame(0, pressure) + line.frame(500, pressure), 0)
     assert isinstance(baro, BaroRaw)
     assert (baro.pressure_pa, baro.temperature_degc) == pytest.approx((101_325.5, -1.2))
     status = payloads.NodeStatusPayload((1, 2), 8, 7, 1, 3, 4, 5, 600, 100, 3300)

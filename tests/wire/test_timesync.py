@@ -87,6 +87,25 @@ def test_a_late_stamp_is_placed_in_the_past() -> None:
     assert tracker.restarts == 0
 
 
+@pytest.mark.parametrize("ahead_us", [60_000, 600_000, 1_400_000])
+def test_one_stamp_ahead_moves_nothing(ahead_us: int) -> None:
+    tracker = ClockTracker()
+    told = []
+    for step in range(300):
+        arrival_us = 2_000_000 + step * 10_000
+        told.append(tracker.observe(step * 10_000 + ahead_us * (step == 150), arrival_us))
+    assert told == [2_000_000 + step * 10_000 for step in range(300)]
+
+
+def test_a_clock_learned_in_a_queue_is_learned_anew_from_two_packets() -> None:
+    tracker = ClockTracker()
+    for step in range(10):
+        tracker.observe(step * 10_000, 2_000_000 + 400_000 + step * 10_000)
+    told = [tracker.observe(step * 10_000, 2_000_000 + step * 10_000) for step in (100, 101, 102)]
+    assert told == [3_000_000, 3_010_000, 3_020_000]
+    assert tracker.observe(1_030_000, 3_330_000) == 3_030_000, "its queue is known again"
+
+
 def test_memory_is_bounded(rng: np.random.Generator) -> None:
     stamps, _, arrivals = packets(rng, seconds=120, rate_hz=200.0)
     tracker = ClockTracker()

@@ -15,6 +15,7 @@ from gateway.edges.disk.recordings import (
     Recording,
     RecordingError,
     delete_recording,
+    find_recording,
     list_recordings,
     rename_recording,
 )
@@ -82,15 +83,20 @@ def delete(
     config: ConfigOption = None,
 ) -> None:
     """Delete a recording, after asking."""
-    if not yes:
-        typer.confirm(f"Delete the recording {name!r} for ever?", abort=True)
-    if socket_path("run").exists():
-        deleted = _recording(ask("record.delete", {"name": name}))
-    else:
-        try:
-            deleted = delete_recording(_folder(config), name)
-        except RecordingError as error:
-            refuse(str(error))
+    running = socket_path("run").exists()
+    folder = Path(ask("record.status")["folder"]) if running else _folder(config)
+    try:
+        # `last` may have become another one while the person thinks.
+        found = find_recording(folder, name)
+        if not yes:
+            what = f"{found.name!r}: {len(found.files)} files, {found.size / 1e6:.2f} MB"
+            typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
+        if running:
+            deleted = _recording(ask("record.delete", {"name": found.name}))
+        else:
+            deleted = delete_recording(folder, found.name)
+    except RecordingError as error:
+        refuse(str(error))
     for path in deleted.files:
         print(f"deleted {path}")
 

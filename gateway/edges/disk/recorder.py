@@ -219,7 +219,7 @@ class Recorder:
     def flight(self, record: BaroRaw | GpsFix | FusedSample) -> None:
         """Keep what the estimator took, and the state that it made of it."""
         if isinstance(record, GpsFix) and record.utc_us is not None:
-            self._civil.hear_gps(record.utc_us, record.time_us)
+            self._civil.hear_gps(record.node.vehicle_id, record.utc_us, record.time_us)
         vehicle_id = (
             record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
         )

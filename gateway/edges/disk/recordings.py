@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.flightlog.session import check_name
+from gateway.flightlog.session import NEWEST, check_name
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 
@@ -71,7 +71,7 @@ def list_recordings(folder: Path) -> list[Recording]:
 
 
 def find_recording(folder: Path, name: str) -> Recording:
-    """Find one recording by name; `last` is the newest.
+    """Find one recording by name; `last` is the newest, unless one is really called so.
 
     Raises
     ------
@@ -79,11 +79,11 @@ def find_recording(folder: Path, name: str) -> Recording:
         If there is none.
     """
     recordings = list_recordings(folder)
-    if name == "last" and recordings:
-        return recordings[-1]
     for recording in recordings:
         if recording.name == name:
             return recording
+    if name == NEWEST and recordings:
+        return recordings[-1]
     raise RecordingError(f"no recording {name!r} in {folder}")
 
 

@@ -1,5 +1,6 @@
 """The verbs of the control socket; see docs/control.md."""
 
+import asyncio
 import math
 from collections.abc import Callable
 
@@ -118,18 +119,20 @@ class RecorderVerbs:
             raise ControlError(str(error)) from error
         return self._recorder.status()
 
-    def _delete(self, params: Named) -> Recording:
-        folder, now = self._recorder.folder, self._recorder.status()
+    # A folder of thousands of files takes its time, which the telemetry has not.
+    async def _delete(self, params: Named) -> Recording:
+        folder = self._recorder.folder
         try:
-            name = find_recording(folder, params.name).name
+            name = (await asyncio.to_thread(find_recording, folder, params.name)).name
+            now = self._recorder.status()
             if name != now.name or now.state == SessionState.IDLE:
-                return delete_recording(folder, name)
+                return await asyncio.to_thread(delete_recording, folder, name)
         except (RecordingError, OSError) as error:
             raise ControlError(str(error)) from error
         raise ControlError(f"{name} is being recorded; stop it first")
 
-    def _list(self, _: NoParams) -> list[Recording]:
-        return list_recordings(self._recorder.folder)
+    async def _list(self, _: NoParams) -> list[Recording]:
+        return await asyncio.to_thread(list_recordings, self._recorder.folder)
 
     def _note(self, params: Text) -> RecorderStatus:
         self._recorder.mark(params.text)

@@ -8,6 +8,7 @@ new file.
 from typing import Final
 
 from gateway.units import US_PER_S
+from gateway.wire.gps_time import GpsTime
 
 JUMP_US: Final = 2 * US_PER_S
 """Larger differences between the known time and the true one are worth a new file. GPS arrival
@@ -23,6 +24,7 @@ class CivilClock:
     def __init__(self) -> None:
         self._offset_us: int | None = None
         self._from_gps = False
+        self._gps = GpsTime()
 
     @property
     def offset_us(self) -> int | None:
@@ -34,13 +36,14 @@ class CivilClock:
         if not self._from_gps:
             self._offset_us = unix_us - now_us
 
-    def hear_gps(self, utc_us: int, time_us: int) -> None:
-        """Note the time of a fix and when it arrived.
+    def hear_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
+        """Note the time of an aircraft's fix and when it arrived.
 
-        The arrival is taken for the fix itself: late by the latency, so never in the future. A
-        machine that agrees within `JUMP_US` keeps its own, finer time.
+        A machine that agrees within `JUMP_US` keeps its own, finer time.
         """
-        offset_us = utc_us - time_us
+        offset_us = self._gps.hear(vehicle_id, utc_us, time_us)
+        if offset_us is None:
+            return
         if self._offset_us is None or abs(offset_us - self._offset_us) > JUMP_US:
             self._offset_us = offset_us
             self._from_gps = True

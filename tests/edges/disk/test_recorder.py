@@ -18,6 +18,7 @@ from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
 from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
 from gateway.records import FusedSample, FusionState
+from gateway.wire.gps_time import ENOUGH
 from tests.conftest import ManualClock
 from tests.flightlog.frames import make_frames
 from tests.flightlog.samples import make_baro, make_flight, make_fused
@@ -276,7 +277,8 @@ async def test_names_and_times_are_put_right_once_gps_tells_them(
     bench.send(FRAMES[3:5])
     bench.recorder.flight(make_fused(rng, 1000))
     await bench.turn()
-    bench.recorder._civil.hear_gps(UNIX_US + bench.clock(), bench.clock())
+    for _ in range(ENOUGH):
+        bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock(), bench.clock())
     await bench.turn()
     bench.send(FRAMES[5:])
     bench.recorder.close()
@@ -293,6 +295,21 @@ async def test_names_and_times_are_put_right_once_gps_tells_them(
     times = [record.time_us for record in records]
     assert times == sorted(times)
     assert UNIX_US < times[0] < times[-1] <= UNIX_US + bench.clock()
+
+
+async def test_two_aircraft_whose_times_differ_split_no_session_for_ever(
+    tmp_path: Path, clock: ManualClock
+) -> None:
+    bench = Bench(tmp_path / "recordings", clock)
+    await bench.turn()
+    for n in range(60):
+        bench.send(FRAMES[:2])
+        wrong_us = 5_000_000 * (1 + n % 2)
+        for _ in range(20):
+            bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock() + wrong_us, bench.clock())
+        await bench.turn()
+    bench.recorder.close()
+    assert len(list(bench.recorder.folder.glob("*.tlog"))) <= 2
 
 
 async def test_save_renames_while_it_runs(tmp_path: Path, clock: ManualClock) -> None:

@@ -1,6 +1,7 @@
 """The verbs do what docs/control.md says."""
 
 import math
+import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,12 @@ from typing import Any
 import msgspec
 import pytest
 
+from gateway.edges.disk.recordings import Recording
 from gateway.edges.operator.control_socket import ControlServer
 from gateway.edges.operator.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
 from gateway.vehicle.home import Place
 from tests.conftest import ManualClock
-from tests.edges.disk.test_player import Played
+from tests.edges.disk.test_player_edge import Played
 from tests.edges.disk.test_recorder import Bench
 from tests.flightlog.frames import START_US, make_frames, make_records, make_tlog
 
@@ -55,6 +57,22 @@ async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) 
     assert (await ask(server, "record.list"))["result"] == []
     assert not (await ask(server, "record.delete", name="first"))["ok"]
     assert bench.announced[1] == (False, "Mark: here")
+
+
+async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = ControlServer(tmp_path / "s")
+    RecorderVerbs(bench.recorder).register(server)
+    looked: list[threading.Thread] = []
+
+    def look(_folder: Path) -> list[Recording]:
+        looked.append(threading.current_thread())
+        return []
+
+    monkeypatch.setattr("gateway.edges.operator.control_verbs.list_recordings", look)
+    assert (await ask(server, "record.list"))["result"] == []
+    assert looked != [threading.main_thread()]
 
 
 async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:

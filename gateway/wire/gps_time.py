@@ -1,0 +1,41 @@
+"""What civil time it is by the GPS receivers of all aircraft, whatever one of them says."""
+
+from collections import deque
+from statistics import median_low
+from typing import Final
+
+RECENT: Final = 15
+"""Fixes of an aircraft that count: some seconds."""
+ENOUGH: Final = 3
+"""Fixes of an aircraft before it counts: the first one may hold the time of the last flight."""
+
+
+class GpsTime:
+    """The place of the gateway clock in civil time: the median of the aircraft's medians."""
+
+    def __init__(self) -> None:
+        self._offsets_us: dict[int, deque[int]] = {}
+
+    def hear(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
+        """Note the time of a fix.
+
+        The arrival is taken for the fix itself: late by the latency, so never in the future.
+
+        Parameters
+        ----------
+        vehicle_id : int
+            Whose fix it is.
+        utc_us : int
+            Time of the fix in µs since 1970.
+        time_us : int
+            Its arrival on the gateway clock.
+
+        Returns
+        -------
+        int or None
+            Civil time of gateway time zero in µs since 1970; None as long as too few have spoken.
+        """
+        heard = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
+        heard.append(utc_us - time_us)
+        medians = [median_low(each) for each in self._offsets_us.values() if len(each) >= ENOUGH]
+        return median_low(medians) if medians else None

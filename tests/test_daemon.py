@@ -1,0 +1,63 @@
+"""The composition root: what is recorded of whom."""
+
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.daemon import Daemon
+from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
+from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
+
+PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
+
+
+@pytest.fixture
+def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    settings = GatewaySettings(aircraft_folder=str(tmp_path))
+    made = Daemon(settings, {}, lambda: settings)
+    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
+    return made
+
+
+@pytest.fixture
+def recorded(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    frames: list[bytes] = []
+    monkeypatch.setattr(daemon._recorder, "frame", frames.append)
+    return frames
+
+
+def frame(message: mavlink.MAVLink_message, sequence: int = 0) -> bytes:
+    mav = mavlink.MAVLink(None, 255, 190)
+    mav.seq = sequence
+    return bytes(message.pack(mav))
+
+
+def test_of_a_stranger_only_what_was_taken_is_recorded(
+    daemon: Daemon, recorded: list[bytes]
+) -> None:
+    daemon._on_frame(Incoming(5, frame(HEARTBEAT), False))
+    assert recorded == []
+    daemon._on_frame(Incoming(5, frame(PING), False))
+    question, answer = recorded
+    assert question == frame(PING)
+    assert answer != question
+    recorded.clear()
+    daemon._on_frame(Incoming(6, frame(HEARTBEAT), True))
+    assert recorded == [frame(HEARTBEAT)]
+
+
+def test_a_stranger_that_asks_without_end_fills_no_disk(
+    daemon: Daemon, recorded: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
+    for n in range(5000):
+        daemon._on_frame(Incoming(5, frame(PING, n % 256), False))
+    assert sum(map(len, recorded)) <= STRANGERS_BPS * (BURST_S + 1)
+    told = Outgoing(b"telemetry", 30, None)
+    daemon._perform([told])
+    assert recorded[-1] == b"telemetry", "all the same"
