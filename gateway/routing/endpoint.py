@@ -6,6 +6,9 @@
     udp-multicast:GROUP:PORT send to a group and hear it
     tcp:HOST:PORT            connect, and connect again when it breaks
     tcp-listen:HOST:PORT     serve every client that connects
+    ws:HOST:PORT             connect by WebSocket, and connect again when it breaks
+    ws-listen:HOST:PORT      serve every program and page that connects by WebSocket
+    wss:, wss-listen:        the same within TLS
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
 IPv6 addresses stand in brackets. Options follow as in any URL:
@@ -19,6 +22,7 @@ from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl
 
+from gateway.routing.page_origin import NULL_ORIGIN
 from gateway.routing.spelling import respell
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -48,6 +52,10 @@ class EndpointKind(StrEnum):
     UDP_MULTICAST = "udp-multicast"
     TCP = "tcp"
     TCP_LISTEN = "tcp-listen"
+    WS = "ws"
+    WS_LISTEN = "ws-listen"
+    WSS = "wss"
+    WSS_LISTEN = "wss-listen"
     SERIAL = "serial"
 
 
@@ -57,13 +65,26 @@ OPEN_TO_ALL: Final = frozenset(
         EndpointKind.UDP_BROADCAST,
         EndpointKind.UDP_MULTICAST,
         EndpointKind.TCP_LISTEN,
+        EndpointKind.WS_LISTEN,
+        EndpointKind.WSS_LISTEN,
     }
 )
 """Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
+TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
+"""Kinds that speak within TLS."""
+COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "trusted"})
+OWN_OPTIONS: Final = {
+    EndpointKind.WS: frozenset({"path"}),
+    EndpointKind.WSS: frozenset({"path"}),
+    EndpointKind.WS_LISTEN: frozenset({"origins"}),
+    EndpointKind.WSS_LISTEN: frozenset({"origins"}),
+}
+"""What only some kinds know."""
 
 
 HOSTED: Final = frozenset(
     {EndpointKind.UDP, EndpointKind.UDP_LISTEN, EndpointKind.TCP, EndpointKind.TCP_LISTEN}
+    | {EndpointKind.WS, EndpointKind.WS_LISTEN, EndpointKind.WSS, EndpointKind.WSS_LISTEN}
 )
 """Kinds whose frames go to hosts by their addresses, one by one."""
 
@@ -88,9 +109,13 @@ class Endpoint:
     interval_us: dict[int, int] = field(default_factory=dict)
     """Least time between two frames of a message, by message id."""
     pack_bytes: int = 0
-    """Gather frames into datagrams of up to this size; 0 sends each on its own."""
+    """Gather frames into datagrams or messages of up to this size; 0 sends each on its own."""
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers may."""
+    origins: frozenset[str] = frozenset()
+    """Pages of other machines that may connect by WebSocket, as browsers name them."""
+    path: str = "/"
+    """What a WebSocket server is asked for."""
 
     @property
     def address(self) -> str:
@@ -110,8 +135,8 @@ def parse_endpoint(url: str) -> Endpoint:
     ----------
     url : str
         As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
-        separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes) and
-        `trusted` (yes or no).
+        separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
+        `trusted` (yes or no), and of some kinds `origins` (separated by commas) or `path`.
 
     Returns
     -------
@@ -127,7 +152,7 @@ def parse_endpoint(url: str) -> Endpoint:
     try:
         kind, place = _kind_and_place(address)
         host, port = _split_place(kind, place)
-        options = _options(query)
+        options = _options(kind, query)
         return Endpoint(
             url=url,
             kind=kind,
@@ -140,6 +165,8 @@ def parse_endpoint(url: str) -> Endpoint:
             interval_us=_intervals(options.get("rate", "")),
             pack_bytes=_pack_bytes(options.get("pack", "0")),
             trusted=_yes_or_no(options.get("trusted")),
+            origins=_origins(options.get("origins", "")),
+            path=_path(options.get("path", "/")),
         )
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
@@ -240,9 +267,9 @@ def stays_here(endpoint: Endpoint) -> bool:
     return endpoint.kind in HOSTED and is_loopback(endpoint.host)
 
 
-def _options(query: str) -> dict[str, str]:
+def _options(kind: EndpointKind, query: str) -> dict[str, str]:
     """Read the options; each may be there once, or it would hang on the order which one holds."""
-    known = {"name", "allow", "deny", "rate", "pack", "trusted"}
+    known = COMMON_OPTIONS | OWN_OPTIONS.get(kind, frozenset())
     options: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
@@ -290,3 +317,20 @@ def _yes_or_no(text: str | None) -> bool | None:
     if text not in {"yes", "no"}:
         raise ValueError(f"trusted {text!r} is not yes or no")
     return text == "yes"
+
+
+def _origins(text: str) -> frozenset[str]:
+    origins = frozenset(filter(None, text.lower().split(",")))
+    for origin in origins:
+        scheme, _, place = origin.partition("://")
+        if origin != NULL_ORIGIN and (not scheme or not place or "/" in place):
+            raise ValueError(
+                f"origin {origin!r} is not {NULL_ORIGIN} or like https://example.org:8080"
+            )
+    return origins
+
+
+def _path(text: str) -> str:
+    if not text.startswith("/") or not text.isascii() or not text.isprintable() or " " in text:
+        raise ValueError(f"path {text!r} does not begin with / or has spaces")
+    return text

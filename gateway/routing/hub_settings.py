@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from gateway.routing.endpoint import parse_endpoint
+from gateway.routing.endpoint import EndpointKind, parse_endpoint
 from gateway.settings import Settings, setting
 
 
@@ -13,19 +13,22 @@ class HubSettings(Settings, frozen=True):
         tuple[str, ...],
         setting(
             "Endpoint URLs: udp:HOST:PORT, udp-listen:HOST:PORT, udp-broadcast:HOST:PORT, "
-            "udp-multicast:GROUP:PORT, tcp:HOST:PORT, tcp-listen:HOST:PORT, serial:DEVICE:BAUD; "
+            "udp-multicast:GROUP:PORT, tcp:HOST:PORT, tcp-listen:HOST:PORT, ws:HOST:PORT, "
+            "ws-listen:HOST:PORT (56781 is usual), wss:HOST:PORT, wss-listen:HOST:PORT, "
+            "serial:DEVICE:BAUD; "
             "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
         ),
     ] = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
     max_clients: Annotated[
         int,
-        setting("Most clients that a listening endpoint serves at once.", ge=1, le=500),
+        setting("Most clients that a listening endpoint serves at once.", ge=1, le=2000),
     ] = 32
     idle_timeout_s: Annotated[
         float,
         setting(
             "A client of a listening UDP port is dropped after this silence. Ground stations "
-            "send a heartbeat every second.",
+            "send a heartbeat every second. One that came by WebSocket is dropped after so long "
+            "without an answer to the pings that it has answered before.",
             "s",
             ge=2,
             le=3600,
@@ -34,8 +37,8 @@ class HubSettings(Settings, frozen=True):
     queue_bytes: Annotated[
         int,
         setting(
-            "What may wait for a slow or stalled TCP client; beyond it the oldest telemetry goes. "
-            "Small: fresh data after a stall. Large: fewer gaps.",
+            "What may wait for a slow or stalled client by TCP or WebSocket; beyond it the oldest "
+            "telemetry goes. Small: fresh data after a stall. Large: fewer gaps.",
             "byte",
             ge=1024,
             le=16_777_216,
@@ -49,6 +52,24 @@ class HubSettings(Settings, frozen=True):
         int,
         setting("Loopback port that serves Prometheus text; 0 serves none.", ge=0, le=65535),
     ] = 0
+    tls_certificate: Annotated[
+        str,
+        setting(
+            "PEM file with the certificate of this machine, and of those who vouch for it, that "
+            "wss-listen: shows. One that is replaced holds for the next who connect."
+        ),
+    ] = ""
+    tls_key: Annotated[
+        str,
+        setting("PEM file with the key of the certificate; empty if it is in the same file."),
+    ] = ""
+    tls_authority: Annotated[
+        str,
+        setting(
+            "PEM file with the certificates that wss: accepts servers by, as of an authority of "
+            "one's own; empty for those that the machine knows."
+        ),
+    ] = ""
     realtime_priority: Annotated[
         int,
         setting(
@@ -63,7 +84,9 @@ class HubSettings(Settings, frozen=True):
         """Refuse a wrong endpoint when the settings are read, not when they are used."""
         places: set[str] = set()
         for url in self.endpoints:
-            place = parse_endpoint(url).place
-            if place in places:
-                raise ValueError(f"endpoint {place!r} is there twice")
-            places.add(place)
+            endpoint = parse_endpoint(url)
+            if endpoint.place in places:
+                raise ValueError(f"endpoint {endpoint.place!r} is there twice")
+            if endpoint.kind is EndpointKind.WSS_LISTEN and not self.tls_certificate:
+                raise ValueError(f"endpoint {endpoint.place!r} needs a tls_certificate")
+            places.add(endpoint.place)

@@ -8,6 +8,8 @@
 | `udpbcast:`, `udpb:`                          | pymavlink, mavp2p          | `udp-broadcast:` |
 | `tcp://`, `tcpout:`, `tcpout://`, `tcpc:`      | MAVSDK, pymavlink, mavp2p  | `tcp:`           |
 | `tcpin:`, `tcpin://`, `tcps:`                  | MAVProxy, MAVSDK, mavp2p   | `tcp-listen:`    |
+| `ws://`, `wss://`                              | browsers, pymavlink        | `ws:`, `wss:`    |
+| `wsserver:`                                    | pymavlink                  | `ws-listen:`     |
 | `serial://DEV:BAUD`, `DEV:BAUD`, `DEV,BAUD`    | MAVSDK, routers, MAVProxy  | `serial:`        |
 
 `udp://` listens in MAVSDK, binds and sends in MAVROS, and looks like `udp:`, which sends here: it
@@ -28,10 +30,11 @@ ALIASES: Final = {
     "tcps": "tcp-listen",
     "tcpout": "tcp",
     "tcpc": "tcp",
+    "wsserver": "ws-listen",
 }
 ANY_ADDRESS: Final = "0.0.0.0"
-SENDING: Final = frozenset({"udp", "tcp"})
-LISTENING: Final = frozenset({"udp-listen", "tcp-listen"})
+SENDING: Final = frozenset({"udp", "tcp", "ws", "wss"})
+LISTENING: Final = frozenset({"udp-listen", "tcp-listen", "ws-listen", "wss-listen"})
 
 
 def respell(address: str) -> tuple[str, str]:

@@ -17,6 +17,10 @@ from gateway.routing.hub_settings import HubSettings
         ("udp-multicast:[ff02::1%lo]:14550", EndpointKind.UDP_MULTICAST, "ff02::1%lo", 14550),
         ("tcp:ground.example:5760", EndpointKind.TCP, "ground.example", 5760),
         ("tcp-listen:127.0.0.1:5760", EndpointKind.TCP_LISTEN, "127.0.0.1", 5760),
+        ("ws:[::1]:56781", EndpointKind.WS, "::1", 56781),
+        ("ws-listen:127.0.0.1:56781", EndpointKind.WS_LISTEN, "127.0.0.1", 56781),
+        ("wss:ground.example:443", EndpointKind.WSS, "ground.example", 443),
+        ("wss-listen:0.0.0.0:443", EndpointKind.WSS_LISTEN, "0.0.0.0", 443),
         ("serial:/dev/ttyUSB1:115200", EndpointKind.SERIAL, "/dev/ttyUSB1", 115200),
         ("serial:/dev/ttyUSB1", EndpointKind.SERIAL, "/dev/ttyUSB1", 57600),
     ],
@@ -47,6 +51,8 @@ def test_places(url: str, kind: EndpointKind, host: str, port: int) -> None:
         ("tcpout://127.0.0.1:5760", "tcp:127.0.0.1:5760"),
         ("tcpin:127.0.0.1:5760", "tcp-listen:127.0.0.1:5760"),
         ("tcpin://:5760", "tcp-listen:0.0.0.0:5760"),
+        ("wsserver:127.0.0.1:56781", "ws-listen:127.0.0.1:56781"),
+        ("ws://127.0.0.1:56781", "ws:127.0.0.1:56781"),
         ("serial:///dev/ttyUSB0:57600", "serial:/dev/ttyUSB0:57600"),
         ("/dev/ttyUSB0:57600", "serial:/dev/ttyUSB0:57600"),
         ("/dev/ttyUSB0,57600", "serial:/dev/ttyUSB0:57600"),
@@ -95,6 +101,13 @@ def test_options() -> None:
     assert endpoint.trusted is False
 
 
+def test_options_of_a_websocket() -> None:
+    listening = parse_endpoint("ws-listen:127.0.0.1:1?origins=https://Example.org:8443,null")
+    assert listening.origins == {"https://example.org:8443", "null"}
+    assert parse_endpoint("ws:127.0.0.1:1?path=/v1/raw").path == "/v1/raw"
+    assert parse_endpoint("wss:127.0.0.1:1").path == "/"
+
+
 def test_lists() -> None:
     allowing = parse_endpoint("udp:h:1?allow=HEARTBEAT,ATTITUDE&deny=ATTITUDE")
     assert [allowing.passes(message_id) for message_id in (0, 30, 33)] == [True, False, False]
@@ -120,6 +133,12 @@ def test_lists() -> None:
         ("serial:", "DEVICE"),
         ("serial:/dev/tty\n:57600", "cannot be shown"),
         ("udp:h:1?colour=red", "colour"),
+        ("tcp-listen:127.0.0.1:1?origins=null", "origins"),
+        ("ws-listen:127.0.0.1:1?origins=example.org", "https://example.org:8080"),
+        ("ws-listen:127.0.0.1:1?origins=https://example.org/page", "https://example.org:8080"),
+        ("ws-listen:localhost:1", "no address"),
+        ("ws:h:1?path=raw", "begin with /"),
+        ("ws:h:1?path=/a b", "spaces"),
         ("udp:h:1?deny=NO_SUCH_MESSAGE", "NO_SUCH_MESSAGE"),
         ("udp:h:1?rate=ATTITUDE", "hertz"),
         ("udp:h:1?rate=ATTITUDE:-1", "Hz"),

@@ -8,17 +8,13 @@ from dataclasses import replace
 from typing import Any, Final
 
 from gateway.edges.hub.client import Client
-from gateway.edges.hub.group import GroupClient
 from gateway.edges.hub.listener import Listener
-from gateway.edges.hub.radio import RadioClient
 from gateway.edges.hub.router import Router
-from gateway.edges.hub.tcp import TcpClient, TcpListener
-from gateway.edges.hub.udp import UdpClient
-from gateway.edges.hub.udp_listen import UdpListener
+from gateway.edges.hub.transports import CLIENTS, LISTENERS
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
 from gateway.routing.digest import Digest
-from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.routing.endpoint import parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.hub_settings import HubSettings
 from gateway.routing.probe import RoundTrip
@@ -35,18 +31,6 @@ TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
 VISITS_IN_FULL: Final = 30
 """Comings and goings at listening ports that are logged one by one in a minute."""
-
-CLIENTS: Final[dict[EndpointKind, Callable[["Hub", int, Endpoint], Client]]] = {
-    EndpointKind.UDP: UdpClient,
-    EndpointKind.UDP_BROADCAST: GroupClient,
-    EndpointKind.UDP_MULTICAST: GroupClient,
-    EndpointKind.TCP: TcpClient,
-    EndpointKind.SERIAL: RadioClient,
-}
-LISTENERS: Final[dict[EndpointKind, Callable[["Hub", Endpoint], Listener[Any]]]] = {
-    EndpointKind.UDP_LISTEN: UdpListener,
-    EndpointKind.TCP_LISTEN: TcpListener,
-}
 
 
 class Hub:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gateway.edges.hub.client import Client
-from gateway.edges.hub.listener import RETRY_US, Listener
+from gateway.edges.hub.listener import RETRY_US, Listener, Peer
 from gateway.routing.endpoint import host_and_port
 from gateway.routing.outbox import Numbering, Outbox
 from gateway.wire.mavlink_splitter import MavlinkSplitter
@@ -20,16 +20,20 @@ CHUNK_BYTES: Final = 4096
 """Joined into one write while a queue drains; and read at once."""
 READ_BUDGET: Final = 16
 """Chunks taken at one wake-up, so that one flooding peer cannot starve the others."""
+ACCEPT_BUDGET: Final = 16
+"""Callers taken in at one wake-up."""
 USER_TIMEOUT_MS: Final = 30_000
 """A peer that acknowledges nothing for so long is gone; a stopped one may come back sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
 """Small, so that what waits does so in the queue, where the old can make room for the new."""
-ACCEPT_BACKLOG: Final = 16
+ACCEPT_BACKLOG: Final = 128
+"""A thousand pages that connect again at once find room within a few wake-ups."""
 
 
 class StreamClient(Client):
     """A peer behind a byte stream."""
 
+    read_budget = READ_BUDGET
     _partial = b""
     _socket: socket.socket | None = None
 
@@ -55,7 +59,7 @@ class StreamClient(Client):
         if self._partial or self._outbox:
             self._drop(self._outbox.push(frame, message_id, step))
         else:
-            self._write(self._socket, self._numbering.leave(frame, step))
+            self._write(self._socket, self.wrap(self._numbering.leave(frame, step)))
 
     def adopt(self, sock: socket.socket) -> None:
         """Use a connected socket from now on."""
@@ -67,8 +71,12 @@ class StreamClient(Client):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         self._socket = sock
         self._splitter.reset()
-        self.become("open")
         self.loop.add_reader(sock, self._on_readable, sock)
+        self.begin()
+
+    def begin(self) -> None:
+        """Take up the talk on a connection that has just been made."""
+        self.become("open")
         self.context.greet(self)
 
     def close(self) -> None:
@@ -84,6 +92,14 @@ class StreamClient(Client):
     def broke(self) -> None:
         """Handle the end of the connection."""
         raise NotImplementedError
+
+    def wrap(self, frames: bytes) -> bytes:
+        """Return the bytes that carry some frames on this connection."""
+        return frames
+
+    def accept(self, data: bytes, now_us: int) -> None:
+        """Take some bytes of the connection."""
+        self.receive(self._splitter.feed(data), len(data), now_us)
 
     def _drop(self, frames: int) -> None:
         self.counters.dropped += frames
@@ -115,12 +131,12 @@ class StreamClient(Client):
     def _next_chunk(self) -> bytes:
         frames, size = [], 0
         while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
-            frames.append(self._numbering.leave(*waiting))
+            frames.append(self.wrap(self._numbering.leave(*waiting)))
             size += len(frames[-1])
         return b"".join(frames)
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(READ_BUDGET):
+        for _ in range(self.read_budget):
             try:
                 data = sock.recv(CHUNK_BYTES)
             except BlockingIOError:
@@ -130,7 +146,7 @@ class StreamClient(Client):
             if not data:
                 self.broke()
                 return
-            self.receive(self._splitter.feed(data), len(data), self.context.now_us())
+            self.accept(data, self.context.now_us())
             if self._socket is not sock:
                 return
 
@@ -209,8 +225,8 @@ class TcpPeer(StreamClient):
         self.leave(self)
 
 
-class TcpListener(Listener[TcpPeer]):
-    """A TCP port and its clients."""
+class StreamListener(Listener[Peer]):
+    """A port that takes connections in."""
 
     def _bind(self) -> socket.socket:
         host, port = self.endpoint.host, self.endpoint.port
@@ -226,7 +242,7 @@ class TcpListener(Listener[TcpPeer]):
         return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(READ_BUDGET):
+        for _ in range(ACCEPT_BUDGET):
             try:
                 connection, address = sock.accept()
             except BlockingIOError:
@@ -240,8 +256,19 @@ class TcpListener(Listener[TcpPeer]):
                 self.turned_away += 1
                 connection.close()
                 continue
-            client_id, peer = self._context.new_client_id(), host_and_port(*address[:2])
-            client = TcpPeer(self._context, client_id, self.endpoint, peer, peer, leave=self.leave)
-            self._clients[client_id] = client
-            self._context.appear(client)
-            client.adopt(connection)
+            self._admit(connection, host_and_port(*address[:2]))
+
+    def _admit(self, connection: socket.socket, peer: str) -> None:
+        """Make a client of a connection."""
+        raise NotImplementedError
+
+
+class TcpListener(StreamListener[TcpPeer]):
+    """A TCP port and its clients."""
+
+    def _admit(self, connection: socket.socket, peer: str) -> None:
+        client_id = self._context.new_client_id()
+        client = TcpPeer(self._context, client_id, self.endpoint, peer, peer, leave=self.leave)
+        self._clients[client_id] = client
+        self._context.appear(client)
+        client.adopt(connection)

@@ -1,0 +1,1 @@
+"""MAVLink over WebSocket, for pages in a browser and for programs behind a web proxy."""

@@ -1,0 +1,365 @@
+"""WebSocket to pages and programs, on the sockets and queues that TCP clients have.
+
+A page that stalls fills its own queue and loses its own oldest telemetry. A silent peer is pinged:
+one that has answered before and does so no more is gone; one that never answers, as simple
+programs do, is left to the kernel, which ends a connection that acknowledges nothing.
+"""
+
+import asyncio
+import contextlib
+import logging
+import socket
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from wsproto.frame_protocol import CloseReason
+
+from gateway.edges.hub.client import HubContext
+from gateway.edges.hub.tcp import CHUNK_BYTES, StreamClient, StreamListener, TcpClient
+from gateway.edges.hub.udp import PACK_DELAY_S
+from gateway.edges.hub.web.tls_layer import TlsLayer, caller_context, server_context
+from gateway.edges.hub.web.ws_protocol import WsCaller, WsInput, WsProtocol, WsServer
+from gateway.edges.reasons import reason_of
+from gateway.routing.digest import Digest
+from gateway.routing.endpoint import TLS_KINDS, Endpoint
+from gateway.routing.page_origin import admits_page
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import SplitFault, SplitFaultKind
+
+log = logging.getLogger(__name__)
+
+HANDSHAKE_US: Final = 5 * US_PER_S
+"""From the connection to the upgrade; who takes longer only holds a place."""
+PINGS: Final = 3
+"""Within the idle time-out, so that one lost answer costs nobody the connection."""
+UNREAD_BYTES: Final = 65_536
+"""What may wait beside the queue: answers to one who asks and never reads."""
+REFUSED_IN_FULL: Final = 5
+"""Callers that were refused which are logged one by one in a minute."""
+
+
+class WebStream(StreamClient):
+    """A peer behind a WebSocket, within TLS or not."""
+
+    read_budget = 1
+    """A chunk holds hundreds of the smallest messages, and each costs as much as a large one."""
+    _web: WsProtocol
+    _tls: TlsLayer | None = None
+    _flush_timer: asyncio.TimerHandle | None = None
+    _begun_us = _spoke_us = _pinged_us = 0
+    _answers = False
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a connection, be the handshake done or not."""
+        return self._socket is not None
+
+    def begin(self) -> None:
+        """Begin the handshake."""
+        self._begun_us = self._spoke_us = self.context.now_us()
+        self._answers = False
+        self.become("connecting")
+        try:
+            self._tls = self.secure() if self.endpoint.kind in TLS_KINDS else None
+        except OSError as error:
+            self.give_up(reason_of(error))
+            return
+        self._web = self.protocol()
+
+    def protocol(self) -> WsProtocol:
+        """Make our end of a new connection."""
+        raise NotImplementedError
+
+    def secure(self) -> TlsLayer:
+        """Make our end of TLS, or raise OSError."""
+        raise NotImplementedError
+
+    def opened(self) -> None:
+        """Take part: the handshake is done."""
+        self.become("open")
+        self.context.greet(self)
+
+    def give_up(self, reason: str) -> None:
+        """Give the connection up."""
+        raise NotImplementedError
+
+    def wrap(self, frames: bytes) -> bytes:
+        """Return the bytes that carry some frames on this connection."""
+        return self._seal(self._web.wrap(frames))
+
+    def transmit(self, frame: bytes, message_id: int) -> None:
+        """Send one frame at once, or queue it if others wait or shall be packed with it."""
+        if self.state != "open":
+            self.counters.dropped += 1
+            return
+        if not self.endpoint.pack_bytes:
+            super().transmit(frame, message_id)
+            return
+        self.counters.sent += 1
+        self._drop(self._outbox.push(frame, message_id, self._numbering.enter(frame)))
+        if self._outbox.size >= self.endpoint.pack_bytes:
+            self._flush()
+        elif self._flush_timer is None:
+            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+
+    def accept(self, data: bytes, now_us: int) -> None:
+        """Take some bytes of the connection."""
+        self._spoke_us = now_us
+        plain = self._open_up(data) if self._tls is not None else data
+        if not plain or not self.is_connected:
+            return
+        found = self._web.feed(plain)
+        self._answers |= found.ponged
+        if found.reply and not self.say(found.reply):
+            return
+        if found.opened:
+            self.opened()
+        self._take(found, now_us)
+        if found.ended:
+            self.give_up(found.ended)
+
+    def say(self, data: bytes) -> bool:
+        """Send something of the protocol's own, past the queue; tell whether the peer is there."""
+        assert self._socket is not None
+        data = self._seal(data)
+        if not self._partial:
+            self._write(self._socket, data)
+        elif len(self._partial) < UNREAD_BYTES:
+            self._partial += data
+        else:
+            self.give_up("it asks and does not read")
+        return self.is_connected
+
+    def tick(self, now_us: int) -> None:
+        """Ask whether a silent peer is there, and part from one that is not."""
+        super().tick(now_us)
+        if self._socket is None:
+            return
+        if self.state != "open":
+            if now_us - self._begun_us >= HANDSHAKE_US:
+                self.give_up("no handshake")
+            return
+        idle_us = round(self.context.settings.idle_timeout_s * US_PER_S)
+        silent_us = now_us - self._spoke_us
+        if self._answers and silent_us >= idle_us:
+            self.give_up("no answer to pings")
+        elif min(silent_us, now_us - self._pinged_us) >= idle_us // PINGS:
+            self._pinged_us = now_us
+            self.say(self._web.ping())
+
+    def close(self) -> None:
+        """Say good-bye if there is room for it, and close the connection; what waits is lost."""
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+        if self._socket is not None and self.state == "open" and not self._partial:
+            with contextlib.suppress(OSError):
+                self._socket.send(self._seal(self._web.close(CloseReason.GOING_AWAY)))
+        super().close()
+
+    def _open_up(self, data: bytes) -> bytes:
+        """Return what bytes of the network say."""
+        assert self._tls is not None
+        assert self._socket is not None
+        was_open = self._tls.is_open
+        try:
+            plain, reply = self._tls.feed(data)
+        except ssl.SSLError as error:
+            with contextlib.suppress(OSError):
+                self._socket.send(self._tls.outgoing())
+            self.give_up(f"TLS: {error.reason or error}".replace("_", " ").lower())
+            return b""
+        if reply:
+            self._write(self._socket, reply)
+        if self._tls.is_open and not was_open and self.is_connected:
+            self.secured()
+        if self._tls.is_ended and not plain and self.is_connected:
+            self.broke()
+        return plain
+
+    def secured(self) -> None:
+        """Go on after the keys were agreed on."""
+
+    def _seal(self, data: bytes) -> bytes:
+        return data if self._tls is None else self._tls.wrap(data)
+
+    def _take(self, found: WsInput, now_us: int) -> None:
+        events: list[bytes | SplitFault] = []
+        if found.payload:
+            events += self._splitter.feed(found.payload)
+        if found.text_size:
+            events.append(SplitFault(SplitFaultKind.GARBAGE, found.text_size))
+        if events or found.payload:
+            self.receive(events, len(found.payload) + found.text_size, now_us)
+
+    def _flush(self) -> None:
+        """Send what has gathered."""
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+        if self._socket is not None and not self._partial:
+            self._on_writable(self._socket)
+
+    def _next_chunk(self) -> bytes:
+        pack_bytes = self.endpoint.pack_bytes
+        if not pack_bytes:
+            return super()._next_chunk()
+        messages, frames, size = [], b"", 0
+        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+            frame = self._numbering.leave(*waiting)
+            if frames and len(frames) + len(frame) > pack_bytes:
+                messages.append(self.wrap(frames))
+                frames = b""
+            frames += frame
+            size += len(frame)
+        if frames:
+            messages.append(self.wrap(frames))
+        return b"".join(messages)
+
+
+class WsClient(WebStream, TcpClient):
+    """A connection that the gateway makes, and makes again when it breaks."""
+
+    _caller: WsCaller
+
+    def begin(self) -> None:
+        """Begin the handshake."""
+        super().begin()
+        if self._socket is None:
+            return
+        if self._tls is None:
+            self._write(self._socket, self._caller.hello)
+        else:
+            self._write(self._socket, self._tls.feed(b"")[1])
+
+    def protocol(self) -> WsProtocol:
+        """Make our end of a new connection."""
+        self._caller = WsCaller(self.endpoint.address, self.endpoint.path)
+        return self._caller
+
+    def secure(self) -> TlsLayer:
+        """Make our end of TLS, or raise OSError."""
+        return TlsLayer(caller_context(self.context.settings), self.endpoint.host)
+
+    def secured(self) -> None:
+        """Ask for the upgrade."""
+        self.say(self._caller.hello)
+
+    def give_up(self, reason: str) -> None:
+        """Give the connection up, and tell why until another is made."""
+        was_open = self.state == "open"
+        self.broke()
+        if not was_open:
+            self.state = "refused"
+        self.reason = reason
+
+
+@dataclass(eq=False)
+class WsPeer(WebStream):
+    """A connection that a page or a program made."""
+
+    local_host: str = field(kw_only=True)
+    """Address of ours that it came to."""
+    welcome: Callable[["WsPeer"], None] = field(kw_only=True)
+    leave: Callable[["WsPeer"], None] = field(kw_only=True)
+    complain: Callable[[str], None] = field(kw_only=True)
+    """Takes why a caller was refused."""
+
+    def protocol(self) -> WsProtocol:
+        """Make our end of a new connection."""
+        return WsServer(lambda origin: admits_page(origin, self.local_host, self.endpoint.origins))
+
+    def secure(self) -> TlsLayer:
+        """Make our end of TLS, or raise OSError."""
+        return TlsLayer(server_context(self.context.settings))
+
+    def opened(self) -> None:
+        """Take part: the handshake is done."""
+        self.welcome(self)
+        super().opened()
+
+    def give_up(self, reason: str) -> None:
+        """Give the connection up for good."""
+        if self.state != "open":
+            self.complain(f"{self.remote}: {reason}")
+        self.broke()
+
+    def broke(self) -> None:
+        """Leave for good; the client may connect again."""
+        self.leave(self)
+
+    def fail(self, error: Exception) -> None:  # noqa: ARG002
+        """Leave for good after an error that nobody foresaw."""
+        self.leave(self)
+
+
+class WsListener(StreamListener[WsPeer]):
+    """A port for WebSockets, its clients, and its callers whose handshake is not done."""
+
+    def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
+        self._callers: dict[int, WsPeer] = {}
+        self._refused = Digest(REFUSED_IN_FULL, "more callers were refused")
+        super().__init__(context, endpoint)
+
+    def tick(self, now_us: int) -> None:
+        """Bind again if that failed, and part from callers that say nothing."""
+        super().tick(now_us)
+        for caller in list(self._callers.values()):
+            caller.tick(now_us)
+        self._tell(self._refused.poll(now_us))
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options; pages that may not be here any more stay till they go."""
+        super().reconfigure(endpoint)
+        for caller in self._callers.values():
+            caller.endpoint = endpoint
+
+    def close(self) -> None:
+        """Part from all clients and close the port."""
+        for caller in list(self._callers.values()):
+            self.leave(caller)
+        super().close()
+
+    def leave(self, client: WsPeer) -> None:
+        """Part from one client."""
+        self._callers.pop(client.client_id, None)
+        super().leave(client)
+
+    def _bind(self) -> socket.socket:
+        if self.endpoint.kind in TLS_KINDS:
+            server_context(self._context.settings)
+        return super()._bind()
+
+    def _admit(self, connection: socket.socket, peer: str) -> None:
+        """Let a caller begin; where there is no room, the one that has taken longest goes."""
+        if len(self._clients) + len(self._callers) >= self._context.settings.max_clients:
+            next(iter(self._callers.values())).give_up("no handshake yet, and others wait")
+        client_id = self._context.new_client_id()
+        caller = WsPeer(
+            self._context,
+            client_id,
+            self.endpoint,
+            peer,
+            peer,
+            local_host=str(connection.getsockname()[0]),
+            welcome=self._welcome,
+            leave=self.leave,
+            complain=self._note_refusal,
+        )
+        self._callers[client_id] = caller
+        caller.adopt(connection)
+
+    def _welcome(self, peer: WsPeer) -> None:
+        self._callers.pop(peer.client_id, None)
+        self._clients[peer.client_id] = peer
+        self._context.appear(peer)
+
+    def _note_refusal(self, text: str) -> None:
+        self.turned_away += 1
+        self._tell(self._refused.say(text, self._context.now_us()))
+
+    def _tell(self, lines: list[str]) -> None:
+        for line in lines:
+            log.warning("%s: %s", self.endpoint.name, line)

@@ -1,0 +1,227 @@
+"""One WebSocket connection without a socket: bytes in; payload, bytes to answer and events out.
+
+MAVLink goes as binary messages. A page gets one frame a message, or several if they are packed;
+what comes is taken as a stream of bytes, so that it does not matter where messages end.
+
+| it comes                                        | it is answered by                        |
+| ----------------------------------------------- | ---------------------------------------- |
+| a request to upgrade from a page that may       | 101, and the connection is open          |
+| one from another page                           | 403 and the end                          |
+| no such request                                 | 400 or 426 and the end                   |
+| a binary message, in any number of fragments    | nothing; its bytes are payload           |
+| a text message                                  | nothing; it is counted as garbage        |
+| a ping                                          | a pong, of several at once the last one  |
+| a message beyond `MAX_MESSAGE`                  | close 1009                               |
+| unmasked or compressed frames, wrong ones       | close 1002                               |
+| a close                                         | a close                                  |
+
+Compression is offered by browsers and never agreed to: telemetry does not shrink, and each
+connection would hold a window of memory.
+
+References
+----------
+.. [1] RFC 6455, The WebSocket Protocol.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import (
+    AcceptConnection,
+    BytesMessage,
+    CloseConnection,
+    Event,
+    Ping,
+    Pong,
+    RejectConnection,
+    RejectData,
+    Request,
+    TextMessage,
+)
+from wsproto.frame_protocol import CloseReason
+from wsproto.utilities import ProtocolError
+
+MAX_MESSAGE: Final = 65_536
+"""No program packs more; what is longer is no MAVLink."""
+SUBPROTOCOLS: Final = ("mavlink", "binary")
+"""Names that pages ask for when they ask at all; a browser gives up if none is agreed to."""
+FINAL_BINARY: Final = b"\x82"
+SHORT: Final = 126
+"""From this length on two bytes tell it."""
+TWO_BYTES: Final = struct.Struct("!BH")
+
+
+@dataclass(slots=True)
+class WsInput:
+    """What came of some received bytes."""
+
+    payload: bytes = b""
+    """Bytes of binary messages."""
+    text_size: int = 0
+    """Bytes of text messages, which are no MAVLink."""
+    reply: bytes = b""
+    """To be sent at once, as it is."""
+    opened: bool = False
+    """The handshake is done."""
+    ponged: bool = False
+    """The peer has answered a ping."""
+    ended: str = ""
+    """Why the connection is to be closed after the reply; empty if it goes on."""
+
+
+class WsProtocol:
+    """What both ends of a connection do."""
+
+    def __init__(self, role: ConnectionType) -> None:
+        self._wire = WSConnection(role)
+        self._message_size = 0
+        self._ended = False
+
+    def feed(self, data: bytes) -> WsInput:
+        """Take received bytes; never raises on data."""
+        found = WsInput()
+        if self._ended or not data:
+            return found
+        pong: Ping | None = None
+        try:
+            self._wire.receive_data(data)
+            for event in self._wire.events():
+                if isinstance(event, Ping):
+                    pong = event
+                else:
+                    self._note(event, found)
+                if found.ended:
+                    break
+        except ProtocolError as error:
+            hint = getattr(error, "event_hint", None)
+            self._end(found, f"not a WebSocket: {error}", hint or RejectConnection())
+        except UnicodeError as error:
+            self._end(found, f"not a WebSocket: {error}", RejectConnection())
+        if pong is not None and not found.ended:
+            found.reply += self._wire.send(pong.response())
+        self._ended = bool(found.ended)
+        return found
+
+    def wrap(self, payload: bytes) -> bytes:
+        """Make a binary message of some MAVLink."""
+        raise NotImplementedError
+
+    def ping(self) -> bytes:
+        """Ask the peer whether it is there."""
+        return self._wire.send(Ping())
+
+    def close(self, code: CloseReason) -> bytes:
+        """Say good-bye, unless that has been said."""
+        try:
+            return self._wire.send(CloseConnection(code=code))
+        except ProtocolError:
+            return b""
+
+    def _note(self, event: Event, found: WsInput) -> None:
+        if isinstance(event, BytesMessage):
+            found.payload += event.data
+            self._measure(len(event.data), found, finished=event.message_finished)
+        elif isinstance(event, TextMessage):
+            size = len(event.data.encode())
+            found.text_size += size
+            self._measure(size, found, finished=event.message_finished)
+        elif isinstance(event, Pong):
+            found.ponged = True
+        elif isinstance(event, CloseConnection):
+            reason = f"closed: {event.code:d} {event.reason or ''}".rstrip()
+            self._end(found, reason, event.response())
+        else:
+            self._shake_hands(event, found)
+
+    def _measure(self, size: int, found: WsInput, *, finished: bool) -> None:
+        self._message_size += size
+        if self._message_size > MAX_MESSAGE:
+            close = CloseConnection(code=CloseReason.MESSAGE_TOO_BIG)
+            self._end(found, f"closed: a message of more than {MAX_MESSAGE} bytes", close)
+        if finished:
+            self._message_size = 0
+
+    def _shake_hands(self, event: Event, found: WsInput) -> None:
+        raise NotImplementedError
+
+    def _end(self, found: WsInput, reason: str, *answers: Event) -> None:
+        found.ended = reason
+        try:
+            for answer in answers:
+                found.reply += self._wire.send(answer)
+        except ProtocolError:
+            # There is no answer in this state: a peer that says what none may say any more.
+            return
+
+
+class WsServer(WsProtocol):
+    """Our end of a connection that a page or a program has made.
+
+    Parameters
+    ----------
+    admits : callable
+        Tells whether a page of this origin may connect.
+    """
+
+    def __init__(self, admits: Callable[[str], bool]) -> None:
+        super().__init__(ConnectionType.SERVER)
+        self._admits = admits
+
+    def wrap(self, payload: bytes) -> bytes:
+        """Make a binary message: written here, since every frame to every page takes this way."""
+        size = len(payload)
+        if size < SHORT:
+            return FINAL_BINARY + size.to_bytes() + payload
+        return FINAL_BINARY + TWO_BYTES.pack(SHORT, size) + payload
+
+    def _shake_hands(self, event: Event, found: WsInput) -> None:
+        if not isinstance(event, Request):
+            return
+        origins = [value for name, value in event.extra_headers if name == b"origin"]
+        origin = b",".join(origins).decode("latin-1")
+        if origins and not self._admits(origin):
+            text = f"pages of {origin} may not connect; name them in the endpoint: origins={origin}"
+            self._end(
+                found,
+                f"a page of {origin!r} was refused",
+                RejectConnection(
+                    status_code=403,
+                    headers=[(b"content-type", b"text/plain"), (b"connection", b"close")],
+                    has_body=True,
+                ),
+                RejectData(data=f"{text}\n".encode()),
+            )
+            return
+        agreed = next((name for name in SUBPROTOCOLS if name in event.subprotocols), None)
+        found.reply += self._wire.send(AcceptConnection(subprotocol=agreed))
+        found.opened = True
+
+
+class WsCaller(WsProtocol):
+    """Our end of a connection that we make.
+
+    Parameters
+    ----------
+    place : str
+        Host and port of the server.
+    path : str
+        What it is asked for.
+    """
+
+    def __init__(self, place: str, path: str) -> None:
+        super().__init__(ConnectionType.CLIENT)
+        self.hello = self._wire.send(Request(host=place, target=path))
+        """What opens the handshake."""
+
+    def wrap(self, payload: bytes) -> bytes:
+        """Make a binary message, masked as those of clients have to be."""
+        return self._wire.send(BytesMessage(data=payload))
+
+    def _shake_hands(self, event: Event, found: WsInput) -> None:
+        if isinstance(event, AcceptConnection):
+            found.opened = True
+        elif isinstance(event, RejectConnection):
+            self._end(found, f"the server answers HTTP {event.status_code}")
