@@ -24,8 +24,8 @@ async def test_it_calls(rig: Rig) -> None:
     url = f"ws:127.0.0.1:{hub.listening_ports()[0]}"
     link = await asyncio.to_thread(mavutil.mavlink_connection, url, source_system=255)
     try:
-        assert (await receive(link, "HEARTBEAT")).get_srcSystem() == 1
         hub.send(rig.out(rig.vehicle.raw_imu()))
+        assert (await receive(link, "HEARTBEAT")).get_srcSystem() == 1
         assert (await receive(link, "RAW_IMU")).zmag == 9
         link.mav.command_long_send(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)
         await rig.until(lambda: bool(rig.incoming))
