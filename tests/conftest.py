@@ -1,10 +1,17 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+USERS_OWN = (
+    *("XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR"),
+    *("MAVGATE_SOCKET", "NOTIFY_SOCKET", "RUNTIME_DIRECTORY"),
+)
+"""What tells a program where its user keeps things, or that it is a service."""
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -21,6 +28,17 @@ class ManualClock:
     def advance(self, seconds: float) -> int:
         self.now_us += round(seconds * 1e6)
         return self.now_us
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _own_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Give the tests a home that nobody has used: no settings, recordings or gateways of a user."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("HOME", str(home))
+        for name in USERS_OWN:
+            environment.delenv(name, raising=False)
+        yield
 
 
 @pytest.fixture

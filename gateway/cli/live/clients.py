@@ -8,7 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.live.record import JsonOption, ask
+from gateway.cli.live.record import JsonOption
+from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, table_of
 from gateway.units import US_PER_S
 
@@ -19,15 +20,15 @@ US_PER_MS: Final = 1000
 Record = Mapping[str, Any]
 """What a dataclass becomes on the control socket."""
 
-group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
+group = AskingTyper(help="List, add and remove clients and sources.", no_args_is_help=True)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command(rich_help_panel=PANEL)(status)
+    app.command(rich_help_panel=PANEL)(with_socket(status))
     app.add_typer(group, name="clients", rich_help_panel=PANEL)
-    app.command(rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(mark)
-    app.command(rich_help_panel=PANEL)(reload)
+    app.command(rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(with_socket(mark))
+    app.command(rich_help_panel=PANEL)(with_socket(reload))
 
 
 def status(*, json: JsonOption = False) -> None:

@@ -8,6 +8,7 @@ import msgspec
 import typer
 
 from gateway.cli.live.run import ConfigOption, read_settings
+from gateway.cli.support.asking import AskingTyper, ask, is_running
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import PANEL
 from gateway.cli.support.terminal import console_of, table_of
@@ -19,12 +20,14 @@ from gateway.edges.disk.recordings import (
     list_recordings,
     rename_recording,
 )
-from gateway.edges.operator.control_socket import ControlError, request, socket_path
 
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
-group = typer.Typer(help="Start, stop, name, list and delete recordings.", no_args_is_help=True)
+group = AskingTyper(
+    help="Start, stop, name, list and delete recordings.",
+    no_args_is_help=True,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -65,7 +68,7 @@ def save(
     config: ConfigOption = None,
 ) -> None:
     """Give a recording a name; nothing is ever overwritten."""
-    if recording is None and socket_path("run").exists():
+    if recording is None and is_running():
         _show(ask("record.save", {"name": name}))
         return
     try:
@@ -83,7 +86,7 @@ def delete(
     config: ConfigOption = None,
 ) -> None:
     """Delete a recording, after asking."""
-    running = socket_path("run").exists()
+    running = is_running()
     folder = Path(ask("record.status")["folder"]) if running else _folder(config)
     try:
         # `last` may have become another one while the person thinks.
@@ -104,7 +107,7 @@ def delete(
 @group.command("list")
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
-    if config is None and socket_path("run").exists():
+    if config is None and is_running():
         found = [_recording(fields) for fields in ask("record.list")]
     else:
         found = list_recordings(_folder(config))
@@ -118,14 +121,6 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
 def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
     """Put a remark at this moment into the recording, and tell the ground stations."""
     ask("record.note", {"text": text})
-
-
-def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
-    """Ask the gateway (or the player) that runs; end the command if that fails."""
-    try:
-        return request(socket_path(of), verb, params)
-    except ControlError as error:
-        refuse(str(error))
 
 
 def _recording(fields: dict[str, Any]) -> Recording:

@@ -11,7 +11,6 @@ import typer
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gateway.cli.live.record import ask
 from gateway.cli.live.run import (
     ConfigOption,
     EndpointOption,
@@ -19,6 +18,7 @@ from gateway.cli.live.run import (
     read_settings,
     with_endpoints,
 )
+from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import (
     PANEL,
@@ -54,7 +54,7 @@ FASTEST: Final = "max"
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command("play", rich_help_panel=PANEL)(play)
-    app.command("seek", rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(seek)
+    app.command("seek", rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(with_socket(seek))
     app.add_typer(group, name="player", rich_help_panel=PANEL)
 
 
@@ -128,7 +128,7 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
         )
 
 
-group = typer.Typer(help="Steer the player that runs.", no_args_is_help=True)
+group = AskingTyper(help="Steer the player that runs.", no_args_is_help=True)
 
 
 def seek(

@@ -1,13 +1,14 @@
 """The control socket: how the command line talks to a gateway that runs.
 
-A Unix socket that only the user (and root) can open. One line of JSON asks, one line answers;
-docs/control.md describes every verb. Whoever offers a verb registers a handler and the shape of
-its parameters, which are checked before the handler sees them.
+A Unix socket that only the user (and root) can open; a system service's, its group too. One line of
+JSON asks, one line answers; docs/control.md describes every verb. Whoever offers a verb registers a
+handler and the shape of its parameters, which are checked before the handler sees them.
 """
 
 import asyncio
 import logging
 import os
+import pwd
 import socket
 import struct
 from collections.abc import Awaitable, Callable
@@ -23,6 +24,13 @@ MAX_LINE: Final = 64 << 10
 MAX_CONNECTIONS: Final = 16
 FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
+SERVICE_SOCKET_RIGHTS: Final = 0o660
+SERVICE_FOLDER: Final = Path("/run/mavgate")
+"""What the unit has systemd make."""
+GROUP: Final = "mavgate"
+"""Whose members may steer the service."""
+MOST_GATEWAYS: Final = 9
+"""Of one user that can be told apart: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
 STARTERS: Final = {"run": "`mavgate run` or `mavgate demo`", "play": "`mavgate play`"}
 """What opens which socket."""
@@ -60,11 +68,12 @@ class ControlServer:
     Parameters
     ----------
     path : Path
-        Where the socket is made.
+        Where the socket is made; where another gateway listens there, the next number is taken.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._for_group = "RUNTIME_DIRECTORY" in os.environ
         self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
@@ -96,16 +105,15 @@ class ControlServer:
         Raises
         ------
         ControlError
-            If another gateway listens there, or the socket cannot be made.
+            If the socket cannot be made, or as many gateways as can be told apart run already.
         """
         try:
             self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)
-            if self.path.is_socket():
-                self._remove_stale()
+            self.path = _first_free(self.path)
             self._server = await asyncio.start_unix_server(
                 self._serve, str(self.path), limit=MAX_LINE
             )
-            self.path.chmod(SOCKET_RIGHTS)
+            self.path.chmod(SERVICE_SOCKET_RIGHTS if self._for_group else SOCKET_RIGHTS)
         except OSError as error:
             raise ControlError(f"control socket {self.path}: {error.strerror}") from error
 
@@ -141,7 +149,7 @@ class ControlServer:
         return self._verbs[verb]
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._writers) >= MAX_CONNECTIONS or not _is_allowed(writer):
+        if len(self._writers) >= MAX_CONNECTIONS or not self._is_allowed(writer):
             writer.close()
             return
         self._writers.add(writer)
@@ -156,19 +164,47 @@ class ControlServer:
             self._writers.discard(writer)
             writer.close()
 
-    def _remove_stale(self) -> None:
-        """Remove the socket of a gateway that was killed; never that of one that lives."""
+    def _is_allowed(self, writer: asyncio.StreamWriter) -> bool:
+        """Check who is at the other end; the folder's rights alone may be lax."""
+        user, groups = peer_of(writer)
+        is_member = self._for_group and os.getgid() in groups
+        return user in (0, os.getuid()) or is_member
+
+
+def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
+    """Tell by the kernel's word the user at the other end, and the user's groups."""
+    link = writer.get_extra_info("socket")
+    data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    _, user, group = _CREDENTIALS.unpack(data)
+    try:
+        groups = os.getgrouplist(pwd.getpwuid(user).pw_name, group)
+    except KeyError:
+        groups = [group]
+    return user, tuple(groups)
+
+
+def numbered(path: Path) -> list[Path]:
+    """List the names under which the gateways of one user make their sockets."""
+    others = [path.with_stem(f"{path.stem}-{n}") for n in range(2, MOST_GATEWAYS + 1)]
+    return [path, *others]
+
+
+def _first_free(path: Path) -> Path:
+    """Find a name, and remove the socket of a gateway that was killed; never that of a live one."""
+    for candidate in numbered(path):
+        if not candidate.is_socket():
+            return candidate
         with socket.socket(socket.AF_UNIX) as probe:
             try:
-                probe.connect(str(self.path))
+                probe.connect(str(candidate))
             except ConnectionRefusedError:
-                self.path.unlink(missing_ok=True)
-                return
-        raise ControlError(f"control socket {self.path}: another gateway listens there")
+                candidate.unlink(missing_ok=True)
+                return candidate
+    raise ControlError(f"control socket {path}: {MOST_GATEWAYS} gateways listen there already")
 
 
 def socket_path(name: str) -> Path:
-    """Return where the socket of a kind of gateway is.
+    """Return where a kind of gateway makes its socket.
 
     Parameters
     ----------
@@ -178,8 +214,11 @@ def socket_path(name: str) -> Path:
     Returns
     -------
     Path
-        In the user's runtime folder, or in the state folder where there is none.
+        In the folder that systemd made for a service, in the user's runtime folder, or in the state
+        folder where there is none.
     """
+    if service := os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(service.split(":")[0]) / f"{name}.sock"
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     state = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser()
     return (Path(runtime) if runtime else state) / "mavgate" / f"{name}.sock"
@@ -193,7 +232,7 @@ def request(
     Parameters
     ----------
     path : Path
-        See `socket_path`.
+        See `control_finder.find_socket`.
     verb : str
         What to do.
     params : dict, optional
@@ -220,22 +259,12 @@ def request(
             with link.makefile("rb") as lines:
                 answer = msgspec.json.decode(lines.readline(), type=_Answer)
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        starter = STARTERS.get(path.stem, "the gateway")
-        text = f"nothing runs that could do this: start {starter} first (no socket {path})"
-        raise ControlError(text) from error
+        raise ControlError(f"nobody listens at the socket {path}") from error
     except (OSError, msgspec.DecodeError) as error:
         raise ControlError(f"no answer on {path}: {error}") from error
     if not answer.ok:
         raise ControlError(answer.error)
     return answer.result
-
-
-def _is_allowed(writer: asyncio.StreamWriter) -> bool:
-    """Check by the kernel's word who is at the other end; the folder's rights alone may be lax."""
-    link = writer.get_extra_info("socket")
-    data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    _, user, _ = _CREDENTIALS.unpack(data)
-    return user in (0, os.getuid())
 
 
 def _plain(value: object) -> object:

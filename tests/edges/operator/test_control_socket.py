@@ -1,6 +1,7 @@
 """The control socket: its rights, its words, and what it says to nonsense."""
 
 import asyncio
+import os
 import socket
 import stat
 from collections.abc import AsyncIterator
@@ -10,6 +11,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from gateway.edges.operator import control_finder, control_socket
+from gateway.edges.operator.control_finder import find_socket
 from gateway.edges.operator.control_socket import (
     MAX_CONNECTIONS,
     MAX_LINE,
@@ -112,10 +115,72 @@ async def test_too_many_connections_are_turned_away(server: ControlServer) -> No
         await writer.wait_closed()
 
 
-async def test_a_second_gateway_is_refused(server: ControlServer) -> None:
-    with pytest.raises(ControlError, match="another gateway"):
-        await ControlServer(server.path).start()
+async def test_gateways_of_one_user_have_a_socket_each(server: ControlServer) -> None:
+    second, third = ControlServer(server.path), ControlServer(server.path)
+    await second.start()
+    await third.start()
+    names = [made.path.name for made in (server, second, third)]
+    assert names == ["run.sock", "run-2.sock", "run-3.sock"]
     assert await ask(server, "verbs")
+    assert await ask(second, "verbs") == ["verbs"]
+    second.close()
+    third.close()
+    assert await ask(server, "verbs"), "closing another's socket leaves this one"
+
+
+@pytest.mark.parametrize(
+    ("user", "groups", "in_service", "is_answered"),
+    [
+        (0, (), False, True),
+        (1, (), False, True),
+        (2, (7,), False, False),
+        (2, (7,), True, True),
+        (2, (8,), True, False),
+    ],
+)
+async def test_only_its_owner_root_and_a_services_group_are_answered(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    user: int,
+    groups: tuple[int, ...],
+    in_service: bool,
+    is_answered: bool,
+) -> None:
+    """Also where the folder's rights let others in."""
+    if in_service:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    server = ControlServer(tmp_path / "run.sock")
+    await server.start()
+    assert stat.S_IMODE(server.path.stat().st_mode) == (0o660 if in_service else 0o600)
+    monkeypatch.setattr(control_socket, "peer_of", lambda _: (user, groups))
+    monkeypatch.setattr(control_socket.os, "getuid", lambda: 1)
+    monkeypatch.setattr(control_socket.os, "getgid", lambda: 7)
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    writer.write(b'{"verb":"verbs"}\n')
+    try:
+        answered = bool(await reader.read(1))
+    except ConnectionResetError:
+        answered = False
+    writer.close()
+    server.close()
+    assert answered == is_answered
+
+
+async def test_the_kernel_tells_who_asks(
+    server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, tuple[int, ...]]] = []
+    peer_of = control_socket.peer_of
+
+    def noted(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
+        asked.append(peer_of(writer))
+        return asked[-1]
+
+    monkeypatch.setattr(control_socket, "peer_of", noted)
+    await ask(server, "verbs")
+    [(user, groups)] = asked
+    assert user == os.getuid()
+    assert os.getgid() in groups
 
 
 async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
@@ -129,16 +194,56 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
     assert not path.exists()
 
 
-def test_nobody_there_is_said_plainly(tmp_path: Path) -> None:
-    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
+def test_nobody_there_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    with pytest.raises(ControlError, match="nobody listens at the socket"):
         request(tmp_path / "run.sock", "status")
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
+        find_socket("run")
     with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
-        request(tmp_path / "play.sock", "status")
+        find_socket("play")
+
+
+async def test_a_command_finds_the_gateway_that_is_meant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    service = ControlServer(tmp_path / "service" / "run.sock")
+    await service.start()
+    assert find_socket("run") == service.path, "the service's, where the user has none"
+    first, second = ControlServer(socket_path("run")), ControlServer(socket_path("run"))
+    await first.start()
+    assert find_socket("run") == first.path, "before the service's"
+    await second.start()
+    with pytest.raises(ControlError, match=r"several run.*--socket.*run.sock.*run-2.sock"):
+        find_socket("run")
+    first.close()
+    assert find_socket("run") == second.path
+    for server in (second, service):
+        server.close()
+
+
+async def test_a_service_that_may_not_be_asked_tells_how(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    monkeypatch.setattr(control_finder.os, "access", lambda *_: False)
+    service = ControlServer(tmp_path / "service" / "run.sock")
+    await service.start()
+    with pytest.raises(ControlError, match="usermod -aG mavgate"):
+        find_socket("run")
+    service.close()
 
 
 def test_the_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     assert socket_path("run") == Path("/run/user/1/mavgate/run.sock")
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     monkeypatch.setenv("XDG_STATE_HOME", "/home/x/state")
     assert socket_path("play") == Path("/home/x/state/mavgate/play.sock")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/mavgate:/run/other")
+    assert socket_path("run") == Path("/run/mavgate/run.sock")

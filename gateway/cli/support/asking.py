@@ -1,0 +1,84 @@
+"""How a command asks a gateway that runs, and how it is told which one."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast
+
+import typer
+
+from gateway.cli.support.errors import refuse
+from gateway.edges.operator.control_finder import find_socket, live_sockets
+from gateway.edges.operator.control_socket import ControlError, request
+
+SocketOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--socket",
+        envvar="MAVGATE_SOCKET",
+        help="Control socket of the gateway that is meant, where several run.",
+    ),
+]
+Command = TypeVar("Command", bound=Callable[..., object])
+
+_named: ContextVar[Path | None] = ContextVar("socket", default=None)
+
+
+def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
+    """Ask the gateway (or the player) that runs; end the command if that fails.
+
+    Parameters
+    ----------
+    verb : str
+        See docs/control.md.
+    params : dict, optional
+        Its parameters.
+    of : str
+        `run` for the gateway, `play` for a player.
+    """
+    try:
+        return request(_named.get() or find_socket(of), verb, params)
+    except ControlError as error:
+        refuse(str(error))
+
+
+def is_running() -> bool:
+    """Tell whether there is a gateway of this user to ask."""
+    return _named.get() is not None or bool(live_sockets("run"))
+
+
+class AskingTyper(typer.Typer):
+    """A group whose commands all have the option `--socket`."""
+
+    def command(self, *args: Any, **named: Any) -> Callable[[Command], Command]:
+        """Add a command; see `with_socket`."""
+        register = super().command(*args, **named)
+
+        def add(function: Command) -> Command:
+            register(with_socket(function))
+            return function
+
+        return add
+
+
+def with_socket(function: Command) -> Command:
+    """Give a command the option `--socket`, which tells `ask` which gateway is meant."""
+    own = inspect.signature(function)
+    option = inspect.Parameter(
+        "socket", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=SocketOption
+    )
+
+    @functools.wraps(function)
+    def asking(*args: Any, socket: Path | None, **named: Any) -> object:
+        token = _named.set(socket)
+        try:
+            return function(*args, **named)
+        finally:
+            _named.reset(token)
+
+    asking.__signature__ = own.replace(  # type: ignore[attr-defined]
+        parameters=[*own.parameters.values(), option]
+    )
+    return cast(Command, asking)
