@@ -5,37 +5,22 @@ import sys
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.logging import RichHandler
 
 from gateway import __version__
-from gateway.cli.live import calibrate, clients, demo, panel, record, run, setup
-from gateway.cli.recorded import convert, fuse, info, play, report, sweep
+from gateway.cli.command_table import LazyGroup
 from gateway.edges.operator.log_limit import LogLimit
 from gateway.extensions import ExtensionError, load_extensions
 
 app = typer.Typer(
     name="mavgate",
+    cls=LazyGroup,
     help="A MAVLink telemetry gateway: shows a home-made UAV tracker on every ground station.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_show_locals=False,
-    rich_markup_mode="markdown",
+    rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-run.register(app)
-demo.register(app)
-panel.register(app)
-record.register(app)
-play.register(app)
-convert.register(app)
-fuse.register(app)
-calibrate.register(app)
-info.register(app)
-clients.register(app)
-setup.register(app)
-report.register(app)
-sweep.register(app)
 
 
 def _show_version(wanted: bool) -> None:
@@ -56,6 +41,9 @@ def _options(
     form = "%(asctime)s %(levelname)s %(message)s"
     handler: logging.Handler = logging.StreamHandler()
     if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.logging import RichHandler
+
         form = "%(message)s"
         handler = RichHandler(console=Console(stderr=True), show_path=False)
     handler.addFilter(LogLimit())

@@ -4,12 +4,12 @@ One compiled step serves the live sample and the offline array, so both give the
 filters start as if the first sample had stood for ever, so they have no start-up transient.
 """
 
+import math
 from collections.abc import Callable
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from gateway.compiled import compiled
 from gateway.records import Vec3
@@ -53,12 +53,16 @@ def design_lowpass(
     """
     if cutoff_hz >= 0.5 * rate_hz:
         return PASS_THROUGH
-    if kind == "butterworth":
-        b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
-    else:
-        b, a = signal.cheby1(2, ripple_db, cutoff_hz, fs=rate_hz)
-        b = b * (a.sum() / b.sum())
-    return (float(b[0]), float(b[1]), float(b[2]), float(a[1]), float(a[2]))
+    # Analogue prototype of cutoff 1 rad/s: w0^2 / (s^2 + damping s + w0^2).
+    damping, w0_sq = math.sqrt(2.0), 1.0
+    if kind == "chebyshev":
+        mu = 0.5 * math.asinh(1.0 / math.sqrt(10.0 ** (0.1 * ripple_db) - 1.0))
+        damping, w0_sq = math.sqrt(2.0) * math.sinh(mu), 0.5 * math.cosh(2.0 * mu)
+    k = math.tan(math.pi * cutoff_hz / rate_hz)
+    stiff = w0_sq * k * k
+    norm = 1.0 / (1.0 + damping * k + stiff)
+    b0 = stiff * norm
+    return (b0, 2.0 * b0, b0, 2.0 * (stiff - 1.0) * norm, (1.0 - damping * k + stiff) * norm)
 
 
 def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
@@ -78,8 +82,9 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
     """
     if not SLOWEST_HIGHPASS_HZ < cutoff_hz < 0.5 * rate_hz:
         return PASS_THROUGH
-    b, a = signal.butter(1, cutoff_hz, "highpass", fs=rate_hz)
-    return (float(b[0]), float(b[1]), 0.0, float(a[1]), 0.0)
+    k = math.tan(math.pi * cutoff_hz / rate_hz)
+    b0 = 1.0 / (1.0 + k)
+    return (b0, -b0, 0.0, (k - 1.0) * b0, 0.0)
 
 
 def gain_at_rest(c: Coefficients) -> float:

@@ -87,3 +87,19 @@ def test_empty_array() -> None:
     f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
     assert f.run(np.empty((0, 3))).shape == (0, 3)
     assert f.state is None
+
+
+@pytest.mark.parametrize("kind", ["butterworth", "chebyshev"])
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 1000.0])
+@pytest.mark.parametrize("share", [1e-4, 0.01, 0.1, 0.3, 0.49])
+def test_designs_are_those_of_scipy(kind: str, rate_hz: float, share: float) -> None:
+    cutoff_hz = share * rate_hz
+    if kind == "butterworth":
+        b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
+    else:
+        b, a = signal.cheby1(2, 0.7, cutoff_hz, fs=rate_hz)
+        b = b * (a.sum() / b.sum())
+    found = design_lowpass(kind, cutoff_hz, rate_hz, 0.7)
+    np.testing.assert_allclose(found, (*b, *a[1:]), rtol=1e-7)
+    b, a = signal.butter(1, cutoff_hz, "highpass", fs=rate_hz)
+    np.testing.assert_allclose(design_highpass(cutoff_hz, rate_hz), (*b, 0.0, a[1], 0.0), rtol=1e-9)

@@ -14,9 +14,13 @@ from rich import box
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from gateway.cli.live.run import ConfigOption, read_aircraft, read_settings
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import refusing
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    read_aircraft,
+    read_settings,
+)
 from gateway.cli.support.terminal import console_of
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock

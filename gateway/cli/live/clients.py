@@ -8,9 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.live.record import JsonOption
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
-from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, table_of
+from gateway.cli.support.terminal import NEGATIVE_NUMBERS, JsonOption, console_of, table_of
 from gateway.units import US_PER_S
 
 PANEL: Final = "A gateway that runs"

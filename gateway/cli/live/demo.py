@@ -13,17 +13,19 @@ from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.live.run import (
-    ConfigOption,
     EndpointOption,
     PlainOption,
-    load_settings,
-    or_refuse,
     serve,
     with_endpoints,
 )
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.firmware_bench import BenchError, firmware_line
 from gateway.cli.support.panel_process import PanelProcess, is_installed
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+)
 from gateway.cli.support.warm_up import compile_everything
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon

@@ -7,9 +7,12 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from gateway.cli.live.run import ConfigOption, read_settings
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.panel_process import HOW_TO_ADD, LINK
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    read_settings,
+)
 
 
 def register(app: typer.Typer) -> None:

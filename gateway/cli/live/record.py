@@ -7,11 +7,14 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from gateway.cli.live.run import ConfigOption, read_settings
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.asking import AskingTyper, ask, is_running
 from gateway.cli.support.errors import refuse
-from gateway.cli.support.recording_options import PANEL
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    read_settings,
+)
+from gateway.cli.support.terminal import JsonOption, console_of, table_of
 from gateway.edges.disk.recordings import (
     Recording,
     RecordingError,
@@ -21,7 +24,6 @@ from gateway.edges.disk.recordings import (
     rename_recording,
 )
 
-JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
 group = AskingTyper(
@@ -32,7 +34,7 @@ group = AskingTyper(
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.add_typer(group, name="record", rich_help_panel=PANEL)
+    app.add_typer(group, name="record", rich_help_panel=RECORDINGS)
 
 
 @group.command()

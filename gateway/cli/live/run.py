@@ -5,35 +5,31 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
 import typer
 from rich.live import Live
 
-from gateway.aircraft import AircraftSettings
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.panel_process import PanelProcess
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+    read_aircraft,
+)
 from gateway.cli.support.warm_up import compile_everything
-from gateway.config import ConfigError, GatewaySettings, load, load_aircraft
+from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.operator.live_view import LiveView, summary_line
-from gateway.pipeline import PipelineSettings
 
 log = logging.getLogger(__name__)
 
-USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
 VIEW_INTERVAL_S: Final = 0.5
 """Twice a second: drawing takes some milliseconds, in which no frame is passed on."""
 LOG_INTERVAL_S: Final = 10.0
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", "-c", help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}."
-    ),
-]
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines in place of the live view.")]
 EndpointOption = Annotated[
     list[str] | None,
@@ -72,41 +68,6 @@ def run_gateway(
     aircraft = read_aircraft(settings)
     page = PanelProcess(config) if panel or settings.panel.enabled else None
     asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
-
-
-def load_settings(file: Path | None) -> GatewaySettings:
-    """Load the settings that a command was given, the user's own, or the defaults."""
-    if file is None:
-        file = USER_CONFIG.expanduser()
-        if not file.exists():
-            return GatewaySettings()
-    return load(file)
-
-
-def or_refuse(read: Callable[[], GatewaySettings]) -> GatewaySettings:
-    """Read settings at the start of a command, which ends if they are wrong."""
-    try:
-        return read()
-    except ConfigError as error:
-        refuse(str(error))
-
-
-def read_settings(file: Path | None) -> GatewaySettings:
-    """Load the settings; end the command if they are wrong."""
-    return or_refuse(lambda: load_settings(file))
-
-
-def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Load what is different for single aircraft."""
-    try:
-        return load_aircraft(settings)
-    except ConfigError as error:
-        refuse(str(error))
-
-
-def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:
-    """Take what the pipeline needs, the single aircraft's files included."""
-    return PipelineSettings(settings.default_aircraft, read_aircraft(settings))
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:

@@ -7,7 +7,6 @@ import typer
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of, table_of
-from gateway.config import ConfigError, GatewaySettings, load, render
 from gateway.edges.receiver.serial_port import PortNotFoundError, find_port, list_serial_ports
 
 
@@ -39,6 +38,9 @@ def check_config(
     ] = None,
 ) -> None:
     """Check a settings file, or print all settings with their defaults and meanings."""
+    # Not above: the settings import every stage, and `ports` must not wait for that.
+    from gateway.config import ConfigError, GatewaySettings, load, render
+
     if file is None:
         print(render(GatewaySettings()), end="")
         return

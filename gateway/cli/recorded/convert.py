@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.live.run import ConfigOption, pipeline_settings, read_settings
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import (
     PANEL,
@@ -20,6 +19,11 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     read_moment,
     refusing,
+)
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    pipeline_settings,
+    read_settings,
 )
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import write_new

@@ -13,13 +13,17 @@ import numpy as np
 import typer
 
 from gateway.aircraft import AircraftSettings, make_fusion
-from gateway.cli.live.run import ConfigOption, pipeline_settings, read_settings
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     progress_of,
     read_column_map,
     refusing,
+)
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    pipeline_settings,
+    read_settings,
 )
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import FileKind, kind_of, write_new

@@ -12,10 +12,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gateway.cli.live.run import (
-    ConfigOption,
     EndpointOption,
-    pipeline_settings,
-    read_settings,
     with_endpoints,
 )
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
@@ -32,6 +29,11 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     read_moment,
     refusing,
+)
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    pipeline_settings,
+    read_settings,
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings

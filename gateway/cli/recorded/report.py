@@ -10,7 +10,6 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.sources import with_latency
-from gateway.cli.live.run import ConfigOption, load_settings, or_refuse
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import (
     FlightArgument,
@@ -21,6 +20,11 @@ from gateway.cli.support.loading import (
     load_flight,
 )
 from gateway.cli.support.recording_options import ColumnsOption, SettingsOption, refusing
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+)
 from gateway.cli.support.terminal import console_of
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")

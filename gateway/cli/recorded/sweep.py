@@ -5,9 +5,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from gateway.cli.live.run import ConfigOption, load_settings, or_refuse
 from gateway.cli.support.loading import FlightArgument, Loading, ReferenceOption, SystemOption
 from gateway.cli.support.recording_options import ColumnsOption, SettingsOption
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+)
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 

@@ -9,8 +9,10 @@ import typer
 
 from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
-from gateway.cli.live.run import pipeline_settings
 from gateway.cli.support.recording_options import progress_of, read_column_map, refusing
+from gateway.cli.support.settings_options import (
+    pipeline_settings,
+)
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flights.reading import FlightError, ReadOptions, SettingsChoice, aircraft_of, open_rows

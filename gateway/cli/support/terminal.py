@@ -1,7 +1,8 @@
 """Where the commands print to: a terminal, or a file or program that must get whole lines."""
 
-from typing import Final
+from typing import Annotated, Final
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -10,6 +11,7 @@ ENDLESS: Final = 1000
 """Width of what is no terminal: nobody wants a path or a table cut there."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 
 def console_of(*, stderr: bool = False) -> Console:

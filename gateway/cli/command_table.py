@@ -1,0 +1,146 @@
+"""Every command of `mavgate`, and the file that holds it: imported when it is called.
+
+A command imports what it needs, some of it large; to list all of them or to run a small one must
+not cost that. Summaries and panels stand here for the list and, as the first line of the command's
+own text, in its file.
+"""
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Final
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+RECORDINGS: Final = "Recordings"
+GATEWAY: Final = "A gateway that runs"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandEntry:
+    """Where a command is, and what the list says of it."""
+
+    module: str
+    """Below `gateway.cli`."""
+    summary: str
+    panel: str | None = None
+
+
+COMMANDS: Final[dict[str, CommandEntry]] = {
+    "run": CommandEntry(
+        "live.run", "Run the gateway on the receiver's serial port until interrupted."
+    ),
+    "demo": CommandEntry(
+        "live.demo", "Fly the simulated tracker, over and over, until interrupted."
+    ),
+    "panel": CommandEntry(
+        "live.panel",
+        "Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.",
+    ),
+    "calibrate": CommandEntry(
+        "live.calibrate",
+        "Calibrate an aircraft's sensors and save the result with its residuals.",
+    ),
+    "ports": CommandEntry("live.setup", "List the serial ports, and the one that `auto` takes."),
+    "check-config": CommandEntry(
+        "live.setup",
+        "Check a settings file, or print all settings with their defaults and meanings.",
+    ),
+    "report": CommandEntry(
+        "recorded.report",
+        "Make a page of figures and tables of a flight: the paper's own, and more.",
+    ),
+    "sweep": CommandEntry(
+        "recorded.sweep", "Try settings on a flight, and write the best as a settings file."
+    ),
+    "record": CommandEntry(
+        "live.record", "Start, stop, name, list and delete recordings.", RECORDINGS
+    ),
+    "play": CommandEntry(
+        "recorded.play",
+        "Play recordings to the ground stations, several at once if you like.",
+        RECORDINGS,
+    ),
+    "seek": CommandEntry("recorded.play", "Move the player to a moment.", RECORDINGS),
+    "player": CommandEntry("recorded.play", "Steer the player that runs.", RECORDINGS),
+    "convert": CommandEntry("recorded.convert", "Convert, trim and join recordings.", RECORDINGS),
+    "fuse": CommandEntry(
+        "recorded.fuse",
+        "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
+        RECORDINGS,
+    ),
+    "info": CommandEntry(
+        "recorded.info",
+        "Tell what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        RECORDINGS,
+    ),
+    "recover": CommandEntry(
+        "recorded.info",
+        "Write what is sound in a damaged recording to a new file, and tell what was left out.",
+        RECORDINGS,
+    ),
+    "status": CommandEntry(
+        "live.clients",
+        "Show how the gateway fares: receiver, nodes, aircraft, clients.",
+        GATEWAY,
+    ),
+    "clients": CommandEntry("live.clients", "List, add and remove clients and sources.", GATEWAY),
+    "mark": CommandEntry(
+        "live.clients",
+        "Mark a place: ground stations show distance and bearing to it. Without one, clear it.",
+        GATEWAY,
+    ),
+    "reload": CommandEntry(
+        "live.clients",
+        "Apply changed settings of the hub and of signing; clients that stay notice nothing.",
+        GATEWAY,
+    ),
+}
+
+
+def load_command(name: str) -> Any:
+    """Import the file of a command and make it.
+
+    Parameters
+    ----------
+    name : str
+        One of `COMMANDS`.
+    """
+    part = typer.Typer(rich_markup_mode="rich")
+    # With a callback it is a group, however few commands the file has.
+    part.callback()(lambda: None)
+    import_module(f"gateway.cli.{COMMANDS[name].module}").register(part)
+    group = typer.main.get_group(part)
+    return group.commands[name]
+
+
+class LazyGroup(TyperGroup):
+    """The commands of `COMMANDS`, each imported when it is called."""
+
+    _listing = False
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
+        """Return all names, in the order of the table."""
+        return [*COMMANDS]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """Return a command; only its summary while a list is made."""
+        entry = COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        if self._listing:
+            return TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
+        return load_command(cmd_name)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands without importing them."""
+        self._listing = True
+        super().format_help(ctx, formatter)
+        self._listing = False
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete a name without importing its command."""
+        self._listing = True
+        found = super().shell_complete(ctx, incomplete)
+        self._listing = False
+        return found

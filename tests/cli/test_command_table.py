@@ -1,0 +1,66 @@
+"""Commands are imported when they are called, and the list tells the truth about them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.command_table import COMMANDS, load_command
+
+CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
+LARGE = ("numba", "numpy", "scipy", "pandas", "pymavlink", "matplotlib", "nicegui")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_says_what_the_command_says(name: str) -> None:
+    command, entry = load_command(name), COMMANDS[name]
+    assert command.help is not None
+    assert " ".join(command.help.split("\n\n")[0].split()) == entry.summary
+    panel = getattr(command, "rich_help_panel", None)
+    assert (panel if isinstance(panel, str) else None) == entry.panel
+
+
+def test_every_command_of_every_file_is_listed() -> None:
+    files = [path for room in ("live", "recorded") for path in (CLI / room).glob("[!_]*.py")]
+    modules = {f"{path.parent.name}.{path.stem}" for path in files}
+    assert {entry.module for entry in COMMANDS.values()} == modules
+    for module in modules:
+        part = typer.Typer()
+        part.callback()(lambda: None)
+        __import__(f"gateway.cli.{module}")
+        sys.modules[f"gateway.cli.{module}"].register(part)
+        listed = {name for name, entry in COMMANDS.items() if entry.module == module}
+        assert set(typer.main.get_group(part).commands) == listed
+
+
+def test_help_lists_every_command() -> None:
+    found = CliRunner().invoke(app, ["--help"], terminal_width=200)
+    assert found.exit_code == 0
+    assert [name for name in COMMANDS if f" {name} " not in found.output] == []
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["status"], ["clients", "list"], ["mark", "1", "2"], ["ports"],
+              ["record", "status"], ["nonsense"]],
+    ids=" ".join,
+)  # fmt: skip
+def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -> None:
+    program = (
+        "import sys; from gateway.cli.app import main; sys.argv = ['mavgate', *sys.argv[1:]]\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        f"print(*(set({LARGE!r}) & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=CLI.parents[1],
+        env={"HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path), "PATH": "/usr/bin:/bin"},
+    )
+    assert done.stderr.splitlines()[-1] == ""
