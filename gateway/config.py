@@ -5,6 +5,7 @@ refused with all its errors at once, each with file, key, value and what is allo
 """
 
 import difflib
+import errno
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping, MutableMapping
@@ -18,6 +19,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.edges.receiver.serial_port import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.session import RecordingSettings
+from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
 from gateway.routing.hub_settings import HubSettings
 from gateway.sensing.chain import SensingSettings
@@ -132,17 +134,23 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
     Raises
     ------
     OSError
-        If the file cannot be written.
+        If the file cannot be written, or what is there is no TOML, which is left alone.
     """
     file = aircraft_file(settings, vehicle_id)
     file.parent.mkdir(parents=True, exist_ok=True)
-    document = tomlkit.parse(file.read_text(encoding="utf-8")) if file.exists() else None
+    try:
+        document = tomlkit.parse(file.read_text(encoding="utf-8")) if file.exists() else None
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "is no TOML: mend or remove it", str(file)) from error
     document = document or tomlkit.document()
-    default = msgspec.to_builtins(settings.default_aircraft)
-    _write_difference(document, default, msgspec.to_builtins(aircraft))
-    fresh = file.with_suffix(".new")
-    fresh.write_text(tomlkit.dumps(document), encoding="utf-8")
-    fresh.replace(file)
+    values = msgspec.to_builtins(aircraft)
+    try:
+        msgspec.convert(values, AircraftSettings)
+    except msgspec.ValidationError as error:
+        raise OSError(errno.EINVAL, f"would not be read again: {error}", str(file)) from error
+    _write_difference(document, msgspec.to_builtins(settings.default_aircraft), values)
+    # It may hold a passphrase, whatever the file had before.
+    write_new(file, [tomlkit.dumps(document).encode()], overwrite=True, rights=PRIVATE)
     return file
 
 

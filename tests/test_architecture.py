@@ -18,6 +18,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "units": set(),
     "settings": set(),
     "compiled": set(),
+    "output": set(),
     "geometry": {"records", "compiled"},
     "wire": FOUNDATION,
     "sensing": FOUNDATION,
@@ -30,11 +31,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
     "replay": FOUNDATION | STAGES | JOINED,
     "status": FOUNDATION | {"routing"},
-    "flights": FOUNDATION | STAGES | JOINED | {"replay", "edges"},
-    "edges": FOUNDATION | {"wire", "vehicle", "flightlog", "routing", "simulator", "status"},
-    "analysis": FOUNDATION | STAGES | JOINED | {"replay"},
+    "flights": FOUNDATION | STAGES | JOINED | {"replay", "edges", "output"},
+    "edges": FOUNDATION
+    | {"wire", "vehicle", "flightlog", "routing", "simulator", "status", "output"},
+    "analysis": FOUNDATION | STAGES | JOINED | {"replay", "output"},
     "panel": FOUNDATION | STAGES | {"status", "edges", "flights"},
-    "config": FOUNDATION | STAGES | JOINED | {"edges", "panel"},
+    "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "output"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
     "extensions": set(),
     "player": FOUNDATION | STAGES | JOINED | {"edges", "flights", "config"},
@@ -42,7 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"replay", "status", "edges", "flights", "config", "daemon", "player", "analysis"}
-    | {"extensions", "panel"},
+    | {"extensions", "panel", "output"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 

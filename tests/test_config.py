@@ -1,5 +1,6 @@
 """The settings file: strict in, documented out."""
 
+import stat
 from pathlib import Path
 
 import msgspec
@@ -16,6 +17,7 @@ from gateway.config import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -169,3 +171,36 @@ def test_a_setting_put_back_leaves_the_file(settings: GatewaySettings) -> None:
     save_aircraft(settings, 1, default)
     assert "accel_cutoff_hz" not in aircraft_file(settings, 1).read_text()
     assert load_aircraft(settings)[1] == default
+
+
+@pytest.mark.io
+def test_a_file_that_may_hold_a_passphrase_is_for_its_owner_alone(
+    settings: GatewaySettings,
+) -> None:
+    secret = VehicleSettings(signing_passphrase="correct horse")
+    aircraft = msgspec.structs.replace(settings.default_aircraft, vehicle=secret)
+    file = save_aircraft(settings, 3, aircraft)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    file.chmod(0o644)
+    save_aircraft(settings, 3, aircraft)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+@pytest.mark.io
+def test_what_would_not_be_read_again_is_not_saved(settings: GatewaySettings) -> None:
+    flat = NodeCalibration(gyro_bias_radps=(0.0, 99.0, 0.0))
+    aircraft = msgspec.structs.replace(settings.default_aircraft, calibration=flat)
+    with pytest.raises(OSError, match="would not be read again"):
+        save_aircraft(settings, 3, aircraft)
+    assert not aircraft_file(settings, 3).exists()
+
+
+@pytest.mark.io
+def test_a_file_that_is_broken_while_it_runs_is_left_alone(settings: GatewaySettings) -> None:
+    file = aircraft_file(settings, 3)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(b"[vehicle\xff")
+    with pytest.raises(OSError, match="mend or remove it"):
+        save_aircraft(settings, 3, settings.default_aircraft)
+    assert file.read_bytes() == b"[vehicle\xff"

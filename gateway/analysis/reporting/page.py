@@ -21,6 +21,7 @@ from gateway.analysis.reporting.style import (
     to_png,
     to_svg,
 )
+from gateway.output import write_new
 
 PAGE_NAME: Final = "index.html"
 
@@ -127,14 +128,14 @@ def write_report(
     folder.mkdir(parents=True, exist_ok=True)
     for section in report.sections:
         for table in section.tables:
-            table.frame.to_csv(folder / f"{table.name}.csv", index=False)
+            _write(folder / f"{table.name}.csv", table.frame.to_csv(index=False).encode())
     pictures = [picture for section in report.sections for picture in section.pictures]
     drawn = {}
     for picture in draw_all(pictures, folder, jobs or cores()):
         drawn[picture.name] = picture
         on_picture()
     page = folder / PAGE_NAME
-    page.write_text(render_page(report, drawn), encoding="utf-8")
+    _write(page, render_page(report, drawn).encode())
     return page
 
 
@@ -186,13 +187,17 @@ def _draw_one(index: int) -> Drawn:
     return _write_picture(pictures[index], folder)
 
 
+def _write(path: Path, content: bytes) -> None:
+    write_new(path, [content], overwrite=True)
+
+
 def _write_picture(picture: Picture, folder: Path) -> Drawn:
     with styled():
         wide = picture.draw(WIDE_IN)
         wide_svg = to_svg(wide)
-        (folder / f"{picture.name}.png").write_bytes(to_png(wide))
+        _write(folder / f"{picture.name}.png", to_png(wide))
         narrow_svg = to_svg(picture.draw(NARROW_IN))
-    (folder / f"{picture.name}.svg").write_text(stand_alone(wide_svg), encoding="utf-8")
+    _write(folder / f"{picture.name}.svg", stand_alone(wide_svg).encode())
     return Drawn(
         picture.name,
         Markup(for_page(wide_svg)),

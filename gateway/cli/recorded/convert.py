@@ -26,9 +26,9 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.edges.disk.recording_streams import write_new
 from gateway.flights.reading import ReadOptions
 from gateway.flights.writing import WRITERS, FlightToWrite
+from gateway.output import write_new
 
 
 def register(app: typer.Typer) -> None:
@@ -74,7 +74,8 @@ def convert(
         )
         limits = (read_moment(begin), read_moment(end))
         flight = FlightToWrite(files, options, limits=limits, title=out.stem, fuse=fuse)
-        size = write_new(out, write(flight), overwrite=force)
+        inputs = [*files, columns, config]
+        size = write_new(out, write(flight), overwrite=force, inputs=inputs)
     for remark in flight.remarks:
         console_of(stderr=True).print(remark, markup=False)
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)

@@ -16,6 +16,7 @@ from gateway.aircraft import AircraftSettings, make_fusion
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
+    ForceOption,
     progress_of,
     read_column_map,
     refusing,
@@ -26,7 +27,7 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.edges.disk.recording_streams import FileKind, kind_of, write_new
+from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.estimation.columns import (
     NAV_ALT,
     NAV_ATTITUDE_STD,
@@ -50,6 +51,7 @@ from gateway.flights.reading import (
     open_rows,
 )
 from gateway.flights.refusion import SETTLES
+from gateway.output import check_output, write_new
 from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import records_of
 from gateway.sensing.chain import SensorChain
@@ -92,7 +94,7 @@ def _known_estimator(name: str | None) -> str | None:
 def fuse_log(
     file: Annotated[Path, typer.Argument(help="Recording or log, gzipped or not.")],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write; it is overwritten.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write.")],
     estimator: Annotated[
         str | None,
         typer.Option("--estimator", help="In place of the settings'.", callback=_known_estimator),
@@ -106,6 +108,7 @@ def fuse_log(
         SettingsChoice, typer.Option("--settings", help="For recordings: those of then or today.")
     ] = "recorded",
     config: ConfigOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
 
@@ -114,7 +117,9 @@ def fuse_log(
     Without --config, the words gps_latency_s and declination_deg of such a file's # line count.
     """
     current = read_settings(config)
+    inputs = [file, columns, config]
     with progress_of([file]) as advance, refusing():
+        check_output(out, inputs, overwrite=force)
         facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
         options = ReadOptions(
             current=pipeline_settings(current),
@@ -132,7 +137,7 @@ def fuse_log(
             time_us, states = fuse(records, chain, running)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
-        write_new(out, _lines(time_us, states), overwrite=True)
+        write_new(out, _lines(time_us, states), overwrite=force, inputs=inputs)
     name = aircraft.estimation.estimator
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 

@@ -18,7 +18,6 @@ from gateway.edges.disk.recording_streams import (
     kind_of,
     read_batches,
     read_events,
-    write_new,
 )
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
 from gateway.flightlog.table.row import TableRow, row_to_line
@@ -34,6 +33,7 @@ from gateway.flightlog.table.table import (
 )
 from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flights.reading import NO_RECORDING, FlightError
+from gateway.output import write_new
 from gateway.records import FusionState
 from gateway.units import US_PER_S
 
@@ -80,7 +80,9 @@ def recover(
     left_out: list[str] = []
     with progress_of([file]) as advance, refusing():
         sound = _sound_records if kind_of(file) is FileKind.TLOG else _sound_lines
-        size = write_new(target, sound(file, advance, left_out.append), overwrite=force)
+        size = write_new(
+            target, sound(file, advance, left_out.append), overwrite=force, inputs=[file]
+        )
         before = file.stat().st_size
     for line in left_out[:SHOWN]:
         console.print(line, markup=False)

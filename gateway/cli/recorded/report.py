@@ -19,13 +19,19 @@ from gateway.cli.support.loading import (
     fusion_of,
     load_flight,
 )
-from gateway.cli.support.recording_options import ColumnsOption, SettingsOption, refusing
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    ForceOption,
+    SettingsOption,
+    refusing,
+)
 from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
     or_refuse,
 )
 from gateway.cli.support.terminal import console_of
+from gateway.output import check_folder
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
@@ -56,20 +62,20 @@ def report(
     system: SystemOption = None,
     settings: SettingsOption = "recorded",
     config: ConfigOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Make a page of figures and tables of a flight: the paper's own, and more.
 
     Without a flight the built-in simulated one is taken.
     """
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        install = f"{sys.executable} -m pip install {' '.join(missing)}"
-        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")
+    _refuse_without_packages()
     # These need what may be missing, and take a second to load.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
 
+    with refusing():
+        check_folder(output, overwrite=force)
     loading = Loading(
         or_refuse(lambda: load_settings(config)), settings, columns, system, reference
     )
@@ -100,3 +106,10 @@ def report(
         with refusing():
             page = write_report(made, output, advance)
     print(page)
+
+
+def _refuse_without_packages() -> None:
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        install = f"{sys.executable} -m pip install {' '.join(missing)}"
+        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")

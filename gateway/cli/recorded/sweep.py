@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from gateway.cli.support.loading import FlightArgument, Loading, ReferenceOption, SystemOption
-from gateway.cli.support.recording_options import ColumnsOption, SettingsOption
+from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
 from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
@@ -61,6 +61,7 @@ def sweep(
     system: SystemOption = None,
     settings: SettingsOption = "recorded",
     config: ConfigOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Try settings on a flight, and write the best as a settings file.
 
@@ -76,6 +77,6 @@ def sweep(
         flight,
         Loading(current, settings, columns, system, reference),
         SweepOptions(
-            named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table
+            named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
         ),
     )

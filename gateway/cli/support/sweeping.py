@@ -34,6 +34,7 @@ from gateway.cli.support.loading import Loading, load_flight
 from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.terminal import console_of
 from gateway.config import GatewaySettings, render
+from gateway.output import check_output, write_new
 
 SHOWN: Final = 10
 HEADINGS: Final = {
@@ -62,10 +63,15 @@ class SweepOptions:
     jobs: int | None
     output: Path
     table: Path | None
+    overwrite: bool
 
 
 def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
     """Try the settings, show the best, and write it as a settings file."""
+    with refusing():
+        for out in (options.output, options.table):
+            if out is not None:
+                check_output(out, [path], overwrite=options.overwrite)
     try:
         axes = _axes(options)
         flight = load_flight(path, loading)
@@ -88,13 +94,12 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
     _show(results, contest, options.metric)
     best = sweeping.best_of(trials, options.metric)
     with refusing():
-        options.output.write_text(
-            render(_merged(loading.settings, contest, best)), encoding="utf-8"
-        )
+        text = render(_merged(loading.settings, contest, best))
+        write_new(options.output, [text.encode()], overwrite=options.overwrite, inputs=[path])
         print(options.output)
         if options.table is not None:
-            with options.table.open("w", encoding="utf-8", newline="") as table:
-                results.to_csv(table, index=False)
+            rows = results.to_csv(index=False).encode()
+            write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
 
 
 def _axes(options: SweepOptions) -> list[Axis]:

@@ -17,9 +17,9 @@ from gateway.edges.disk.recordings import (
     free_name,
     list_recordings,
     rename_recording,
-    sync_folder,
 )
 from gateway.flightlog.session import part_stem
+from gateway.output import sync_folder
 
 RIGHTS: Final = 0o644
 

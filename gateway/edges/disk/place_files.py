@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.disk.recording_streams import write_new
 from gateway.edges.reasons import reason_of
+from gateway.output import write_new
 from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
 
 log = logging.getLogger(__name__)

@@ -1,8 +1,7 @@
-"""Recordings on the disk as streams: read in chunks, written without overwriting."""
+"""Recordings on the disk as streams: read in chunks."""
 
 import gzip
-import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Final, cast
@@ -118,45 +117,3 @@ def read_events(
     for data in read_chunks(path, progress):
         yield from reader.feed(data)
     yield from reader.feed(b"", final=True)
-
-
-def write_new(path: Path, pieces: Iterable[bytes], *, overwrite: bool = False) -> int:
-    """Write a file in full or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        Must not be there yet unless it may be overwritten.
-    pieces : iterable of bytes
-        What to write.
-    overwrite : bool
-        Put it in the place of what is there.
-
-    Returns
-    -------
-    int
-        Bytes written.
-
-    Raises
-    ------
-    OSError
-        FileExistsError if there is such a file, or what the disk does not like.
-    """
-    if not overwrite:
-        path.touch(exist_ok=False)
-    partial = path.with_name(path.name + ".partial")
-    size, done = 0, False
-    try:
-        with partial.open("wb") as file:
-            for piece in pieces:
-                size += file.write(piece)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-        done = True
-    finally:
-        if not done:
-            partial.unlink(missing_ok=True)
-            if not overwrite:
-                path.unlink(missing_ok=True)
-    return size

@@ -5,7 +5,6 @@ A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog`
 
 import contextlib
 import itertools
-import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.flightlog.session import NEWEST, check_name
+from gateway.output import sync_folder
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 
@@ -133,17 +133,6 @@ def delete_recording(folder: Path, name: str) -> Recording:
         path.unlink()
     sync_folder(folder)
     return recording
-
-
-def sync_folder(folder: Path) -> None:
-    """Make new names in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        # Some file systems (FAT among them) cannot; then there is nothing to be done.
-        with contextlib.suppress(OSError):
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _describe(name: str, paths: list[Path]) -> Recording:

@@ -16,9 +16,9 @@ from typing import BinaryIO, Final
 
 import msgspec
 
-from gateway.edges.disk.recordings import sync_folder
 from gateway.flightlog.table.table import HEADER_PREFIX, TableHeader, encode_header
 from gateway.flightlog.tlog.tlog import TlogScanner
+from gateway.output import sync_folder
 
 log = logging.getLogger(__name__)
 

@@ -33,7 +33,7 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
     out = log.with_name("out.csv")
     empty = log.with_name("defaults.toml")
     empty.write_text("")
-    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out), *arguments])
+    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out), "--force", *arguments])
     assert result.exit_code == 0, result.output
     with out.open() as file:
         return list(csv.DictReader(file))
@@ -91,3 +91,23 @@ def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["fuse", str(path), "-o", str(tmp_path / "out.csv")])
     assert result.exit_code == 2
     assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_a_recording_is_not_replaced_by_what_is_made_of_it(log: Path, force: list[str]) -> None:
+    before = log.read_bytes()
+    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(log), *force])
+    assert result.exit_code == 2
+    assert "is what the output is made of" in result.output
+    assert log.read_bytes() == before
+
+
+@pytest.mark.io
+def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
+    out = log.with_name("out.csv")
+    out.write_text("precious")
+    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out)])
+    assert result.exit_code == 2
+    assert "--force overwrites it" in result.output
+    assert out.read_text() == "precious"

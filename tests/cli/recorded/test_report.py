@@ -66,3 +66,11 @@ def test_a_folder_that_cannot_be_written_is_told(
     result = CliRunner().invoke(app, ["report", "-o", str(tmp_path / "page")])
     assert result.exit_code == 2
     assert f"{tmp_path / 'page'}: No space left" in result.output
+
+
+def test_a_folder_that_holds_something_is_not_written_into_unasked(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("mine")
+    result = CliRunner().invoke(app, ["report", "-o", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "--force overwrites it" in result.output
+    assert (tmp_path / "index.html").read_text() == "mine"

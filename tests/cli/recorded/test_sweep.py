@@ -68,7 +68,7 @@ def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) 
 
 def test_a_setting_that_changes_nothing_is_told(recording: Path, tmp_path: Path) -> None:
     idle = ["--vary", "dip_tolerance_deg=5.0,10.0"]
-    base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1"]
+    base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1", "--force"]
     result = CliRunner().invoke(app, [*base, "--beta", "0.1,0.9", *idle])
     assert result.exit_code == 0, result.output
     assert "estimation.compass.dip_tolerance_deg: changes nothing" in result.output
@@ -101,3 +101,13 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["sweep", str(tmp_path / "no.csv"), "--alpha", "0.1,0.2"])
     assert result.exit_code == 2
     assert "no.csv" in result.output
+
+
+def test_settings_that_are_there_are_not_replaced_unasked(recording: Path, tmp_path: Path) -> None:
+    best = tmp_path / "best.toml"
+    best.write_text("# mine")
+    arguments = ["--beta", "0.1,0.9", "-o", str(best), "--jobs", "1"]
+    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    assert result.exit_code == 2
+    assert "--force overwrites it" in result.output
+    assert best.read_text() == "# mine"

@@ -1,0 +1,118 @@
+"""One writer: nothing that exists is lost by mistake, and nothing half written stays."""
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.output import PRIVATE, check_folder, check_output, write_new
+
+pytestmark = pytest.mark.io
+
+
+def test_a_new_file_has_the_rights_of_the_user(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        assert write_new(tmp_path / "a", [b"12", b"3"]) == 3
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").read_bytes() == b"123"
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"old")
+    with pytest.raises(FileExistsError):
+        write_new(tmp_path / "a", [b"new"])
+    assert (tmp_path / "a").read_bytes() == b"old"
+    write_new(tmp_path / "a", [b"new"], overwrite=True)
+    assert (tmp_path / "a").read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("rights", [None, PRIVATE])
+def test_what_was_private_stays_so(tmp_path: Path, rights: int | None) -> None:
+    file = tmp_path / "1.toml"
+    file.write_bytes(b"old")
+    file.chmod(0o600 if rights is None else 0o644)
+    write_new(file, [b"new"], overwrite=True, rights=rights)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("kind", ["link", "broken link", "fifo", "folder", "device"])
+def test_only_regular_files_are_ever_replaced(tmp_path: Path, kind: str) -> None:
+    path = Path("/dev/null") if kind == "device" else tmp_path / "out"
+    (tmp_path / "other").write_bytes(b"kept")
+    if kind.endswith("link"):
+        path.symlink_to(tmp_path / ("other" if kind == "link" else "none"))
+    elif kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    before = path.lstat()
+    with pytest.raises(OSError, match="no regular file"):
+        write_new(path, [b"new"], overwrite=True)
+    assert os.path.samestat(before, path.lstat())
+    assert (tmp_path / "other").read_bytes() == b"kept"
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("way", ["same", "hard link", "dots", "link"])
+def test_an_input_is_never_the_output(tmp_path: Path, way: str) -> None:
+    flight = tmp_path / "flight.csv"
+    flight.write_bytes(b"precious")
+    out = {"same": flight, "dots": tmp_path / "." / "flight.csv"}.get(way, tmp_path / "out")
+    if way == "hard link":
+        os.link(flight, out)
+    elif way == "link":
+        out.symlink_to(flight)
+    with pytest.raises(OSError, match="made of"):
+        write_new(out, [b"new"], overwrite=True, inputs=[None, flight])
+    assert flight.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, old: bytes | None) -> None:
+    def broken() -> Iterator[bytes]:
+        yield b"half"
+        raise KeyboardInterrupt
+
+    if old is not None:
+        (tmp_path / "a").write_bytes(old)
+    with pytest.raises(KeyboardInterrupt):
+        write_new(tmp_path / "a", broken(), overwrite=True)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == ([] if old is None else [old])
+
+
+def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(tmp_path: Path) -> None:
+    def slow() -> Iterator[bytes]:
+        with pytest.raises(FileExistsError):
+            write_new(tmp_path / "a", [b"other"])
+        yield b"first"
+
+    write_new(tmp_path / "a", slow())
+    assert (tmp_path / "a").read_bytes() == b"first"
+
+
+def test_a_file_of_the_user_beside_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.partial").write_bytes(b"mine")
+    write_new(tmp_path / "a", [b"1"])
+    assert (tmp_path / "a.partial").read_bytes() == b"mine"
+
+
+def test_a_folder_that_holds_something_is_asked_about(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new")
+    check_folder(tmp_path)
+    (tmp_path / "a").touch()
+    with pytest.raises(FileExistsError):
+        check_folder(tmp_path)
+    check_folder(tmp_path, overwrite=True)
+    with pytest.raises(OSError, match="no folder"):
+        check_folder(tmp_path / "a", overwrite=True)
+
+
+def test_an_output_is_checked_before_the_work(tmp_path: Path) -> None:
+    check_output(tmp_path / "a")
+    assert not (tmp_path / "a").exists()
