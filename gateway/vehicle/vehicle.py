@@ -16,6 +16,7 @@ from gateway.records import (
     NodeStatus,
 )
 from gateway.settings import Settings
+from gateway.units import US_PER_S
 from gateway.vehicle import identity
 from gateway.vehicle.actions import Action, Answer, Reply, Request, SettingsChange
 from gateway.vehicle.dialect import (
@@ -48,6 +49,9 @@ from gateway.vehicle.vehicle_settings import VehicleSettings
 
 OWN_SECTION: Final = "vehicle"
 HOME_SECTION: Final = "home"
+REFUSALS_AT_ONCE: Final = 3
+REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
+"""All hear that somebody was refused: enough to be warned, too little to be drowned by it."""
 
 
 class Service(Protocol):
@@ -119,7 +123,7 @@ class Vehicle:
         self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
         # On its own, so that strangers cannot use up what is kept for events.
-        self._refusal_texts = Announcer()
+        self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
         self.places = PlaceService(
             self.vehicle_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
         )

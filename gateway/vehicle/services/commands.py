@@ -178,7 +178,8 @@ class CommandService:
         if not self._knows(message_id):
             return UNSUPPORTED, []
         messages = self._build(message_id, now_us)
-        everybody = whole(command.height_m) == RESPOND_TO_ALL
+        # What a stranger asks for is nobody else's business, and may not fill anybody's radio.
+        everybody = whole(command.height_m) == RESPOND_TO_ALL and command.request.may_change
         answers: list[Answer] = [
             Reply(m, None if everybody else command.request.client_id) for m in messages
         ]

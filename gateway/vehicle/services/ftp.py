@@ -23,9 +23,16 @@ from gateway.vehicle.actions import Answer, Reply, Request
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251
 MAX_DATA: Final = PAYLOAD_BYTES - HEADER.size
-MAX_SESSIONS: Final = 16
+MAX_SESSIONS: Final = 255
+MAX_SESSIONS_OF_ONE: Final = 4
+"""A client reads one file after the other; its oldest session gives way, and nobody else's."""
+MAX_REMEMBERED: Final = 512
+"""Clients whose last answer is kept."""
 BURST: Final = 10
 BURST_INTERVAL_US: Final = 10_000
+"""Of these so many packets, whoever and however many wait for them."""
+MIN_BURST_DATA: Final = 64
+"""A burst of single bytes would cost both sides sixty times as much."""
 
 ACK: Final = 128
 NAK: Final = 129
@@ -71,6 +78,7 @@ class FtpError(IntEnum):
 
     INVALID_DATA_SIZE = 3
     INVALID_SESSION = 4
+    NO_SESSIONS = 5
     EOF = 6
     UNKNOWN_COMMAND = 7
     FILE_PROTECTED = 9
@@ -121,6 +129,7 @@ def decode_packet(payload: bytes) -> Packet:
 @dataclass(slots=True)
 class _Session:
     client_id: int
+    may_change: bool
     content: bytes
 
 
@@ -146,7 +155,8 @@ class FtpService:
         self._files = dict(files)
         self._sessions: dict[int, _Session] = {}
         self._bursts: dict[int, _Burst] = {}
-        self._due_us: int | None = None
+        """By session; whose turn it is comes first."""
+        self._due_us = 0
         self._last: dict[int, tuple[Packet, Reply]] = {}
         self._handlers: dict[int, Callable[[Request, Packet], bytes]] = {
             Opcode.NONE: lambda *_: b"",
@@ -182,18 +192,18 @@ class FtpService:
         return [reply]
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send the next packets of every burst."""
-        if self._due_us is None or now_us < self._due_us:
+        """Send the next packets of the bursts, in turns."""
+        if not self._bursts or now_us < self._due_us:
             return []
         answers: list[Answer] = []
-        for number, burst in list(self._bursts.items()):
-            answers += self._continue_burst(number, burst)
-        self._due_us = now_us + BURST_INTERVAL_US if self._bursts else None
+        while self._bursts and len(answers) < BURST:
+            answers.append(self._continue_burst(next(iter(self._bursts))))
+        self._due_us = now_us + BURST_INTERVAL_US
         return answers
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to send."""
-        return self._due_us
+        return self._due_us if self._bursts else None
 
     def forget_client(self, client_id: int) -> None:
         """Close the sessions of a client that has gone."""
@@ -218,12 +228,23 @@ class FtpService:
 
     def _open(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         content = self._content(packet)
-        if len(self._sessions) >= MAX_SESSIONS:
-            # Clients vanish without closing; the oldest session gives way.
-            self._drop(next(iter(self._sessions)))
+        self._make_room(request)
         number = next(n for n in range(MAX_SESSIONS) if n not in self._sessions)
-        self._sessions[number] = _Session(request.client_id, content)
+        self._sessions[number] = _Session(request.client_id, request.may_change, content)
         return number, struct.pack("<I", len(content))
+
+    def _make_room(self, request: Request) -> None:
+        """Close sessions that were left open: one's own, or a stranger's for a trusted client."""
+        own = [n for n, s in self._sessions.items() if s.client_id == request.client_id]
+        if len(own) >= MAX_SESSIONS_OF_ONE:
+            self._drop(own[0])
+        if len(self._sessions) < MAX_SESSIONS:
+            return
+        strangers = (n for n, s in self._sessions.items() if not s.may_change)
+        leaver = next(strangers, None) if request.may_change else None
+        if leaver is None:
+            raise _RefusedError(FtpError.NO_SESSIONS)
+        self._drop(leaver)
 
     def _terminate(self, request: Request, packet: Packet) -> bytes:
         self._session(request, packet)
@@ -264,27 +285,25 @@ class FtpService:
             raise _RefusedError(FtpError.EOF)
         first = replace(packet, sequence=(packet.sequence + 1) & 0xFFFF)
         self._bursts[packet.session] = _Burst(request, first)
-        self._due_us = now_us
         return self.poll(now_us)
 
-    def _continue_burst(self, number: int, burst: _Burst) -> list[Answer]:
-        content = self._sessions[number].content
-        size = min(burst.packet.size or MAX_DATA, MAX_DATA)
-        answers: list[Answer] = []
-        for _ in range(BURST):
-            packet = burst.packet
-            data = content[packet.offset : packet.offset + size]
-            end = packet.offset + len(data)
-            last = end >= len(content)
-            answer = Packet(
-                packet.sequence, number, ACK, len(data), packet.opcode, last, packet.offset, data
-            )
-            answers.append(_reply(burst.request, answer))
+    def _continue_burst(self, number: int) -> Reply:
+        """Take the next packet of a burst, which then goes behind the others."""
+        burst = self._bursts.pop(number)
+        content, packet = self._sessions[number].content, burst.packet
+        size = min(max(packet.size or MAX_DATA, MIN_BURST_DATA), MAX_DATA)
+        data = content[packet.offset : packet.offset + size]
+        end = packet.offset + len(data)
+        last = end >= len(content)
+        if not last:
             burst.packet = replace(packet, sequence=(packet.sequence + 1) & 0xFFFF, offset=end)
-            if last:
-                del self._bursts[number]
-                break
-        return answers
+            self._bursts[number] = burst
+        return _reply(
+            burst.request,
+            Packet(
+                packet.sequence, number, ACK, len(data), packet.opcode, last, packet.offset, data
+            ),
+        )
 
     def _session(self, request: Request, packet: Packet) -> _Session:
         session = self._sessions.get(packet.session)
@@ -299,7 +318,7 @@ class FtpService:
         return make()
 
     def _remember(self, client_id: int, packet: Packet, reply: Reply) -> None:
-        if client_id not in self._last and len(self._last) >= MAX_SESSIONS:
+        if client_id not in self._last and len(self._last) >= MAX_REMEMBERED:
             self._last.pop(next(iter(self._last)))
         self._last[client_id] = (packet, reply)
 

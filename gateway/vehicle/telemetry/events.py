@@ -45,11 +45,20 @@ class _Topic:
 
 
 class Announcer:
-    """Texts about changes of state, limited in rate."""
+    """Texts about changes of state, limited in rate.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    bucket : int, optional
+        Most single events at once.
+    refill_us : int, optional
+        Time after which one more may be told.
+    """
+
+    def __init__(self, bucket: int = BUCKET, refill_us: int = REFILL_US) -> None:
         self._topics: dict[str, _Topic] = {}
-        self._tokens = BUCKET
+        self._bucket = self._tokens = bucket
+        self._refill_us = refill_us
         self._refilled_us = 0
         self._next_id = 0
 
@@ -110,10 +119,10 @@ class Announcer:
         return self._next_id
 
     def _refill(self, now_us: int) -> None:
-        fresh = (now_us - self._refilled_us) // REFILL_US
+        fresh = (now_us - self._refilled_us) // self._refill_us
         if fresh > 0:
-            self._tokens = min(BUCKET, self._tokens + fresh)
-            self._refilled_us += fresh * REFILL_US
+            self._tokens = min(self._bucket, self._tokens + fresh)
+            self._refilled_us += fresh * self._refill_us
 
 
 def chunks(text: StatusText, number: int = 1) -> list[Any]:

@@ -1,7 +1,8 @@
 """The parameter protocol: list, read, set, and every answer that goes missing asked for again.
 
 The list goes to the one who asked, a few at a time, so that a client's receive buffer and a slow
-link survive it; a change goes to all, so that every ground station's table stays true.
+link survive it, and in turns where several have asked, so that the gateway does; a change goes to
+all, so that every ground station's table stays true.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,8 @@ from gateway.vehicle.services.parameters.parameters import Parameter, ParameterT
 
 BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
-MAX_LISTENERS: Final = 16
+"""Of these so many, whoever and however many wait for them."""
+MAX_LISTENERS: Final = 512
 BY_NAME: Final = -1
 
 WRITE: Final = 1
@@ -66,7 +68,8 @@ class ParameterService:
         self._own = own or {}
         self._vehicle_id = vehicle_id
         self._lists: dict[int, int] = {}
-        self._due_us: int | None = None
+        """The next parameter of each list that is under way; whose turn it is comes first."""
+        self._due_us = 0
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the request is to set one."""
@@ -88,26 +91,25 @@ class ParameterService:
             return self._read(request)
         if request.client_id in self._lists or len(self._lists) < MAX_LISTENERS:
             self._lists[request.client_id] = 0
-            self._due_us = now_us
         return self.poll(now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send the next few of every list that is under way."""
-        if self._due_us is None or now_us < self._due_us:
+        """Send the next few of the lists that are under way, in turns."""
+        if not self._lists or now_us < self._due_us:
             return []
         answers: list[Answer] = []
-        for client_id, start in list(self._lists.items()):
-            batch = self.table.parameters[start : start + BATCH]
-            answers += [Reply(self._value(parameter), client_id) for parameter in batch]
-            self._lists[client_id] = start + BATCH
-            if start + BATCH >= len(self.table.parameters):
-                del self._lists[client_id]
-        self._due_us = now_us + BATCH_INTERVAL_US if self._lists else None
+        while self._lists and len(answers) < BATCH:
+            client_id = next(iter(self._lists))
+            index = self._lists.pop(client_id)
+            answers.append(Reply(self._value(self.table.parameters[index]), client_id))
+            if index + 1 < len(self.table.parameters):
+                self._lists[client_id] = index + 1
+        self._due_us = now_us + BATCH_INTERVAL_US
         return answers
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to send."""
-        return self._due_us
+        return self._due_us if self._lists else None
 
     def forget_client(self, client_id: int) -> None:
         """Stop a list whose client has gone."""
