@@ -2,7 +2,8 @@
 
 Some ground stations answer PING, others only TIMESYNC; both are asked. The questions come from a
 component of their own (the MAVLink id of a UDP bridge), so they leave no gap in the sequence
-numbers of the vehicle and no answer meant for the vehicle is mistaken.
+numbers of the vehicle and no answer meant for the vehicle is mistaken. Those of another gateway are
+answered by that component too, and go no further: what they measure is this one link.
 """
 
 from typing import Final
@@ -12,13 +13,23 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.routing.routing_table import Origin
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import message_id_of, restamp
+from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, target_of
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to anything older is none."""
 NS_PER_US: Final = 1000
 NOBODY: Final = 0
+MEASURING: Final = frozenset({dialect.MAVLINK_MSG_ID_PING, dialect.MAVLINK_MSG_ID_TIMESYNC})
+
+
+def is_of_probe(frame: bytes) -> bool:
+    """Return whether a frame is one by which another gateway measures a link."""
+    return (
+        origin_of(frame)[1] == PROBE_COMPONENT
+        and message_id_of(frame) in MEASURING
+        and target_of(frame) == (0, 0)
+    )
 
 
 class RoundTrip:
@@ -56,15 +67,13 @@ class RoundTrip:
             Frames and their message ids.
         """
         self._sender.srcSystem = system
-        questions = []
-        for message in (
-            dialect.MAVLink_ping_message(now_us, self._sender.seq, 0, 0),
-            dialect.MAVLink_timesync_message(0, now_us * NS_PER_US),
-        ):
-            frame = bytes(message.pack(self._sender))
-            questions.append((self._seal(frame, self._sender.seq), message.id))
-            self._sender.seq = (self._sender.seq + 1) % 256
-        return questions
+        return [
+            self._numbered(message)
+            for message in (
+                dialect.MAVLink_ping_message(now_us, self._sender.seq, 0, 0),
+                dialect.MAVLink_timesync_message(0, now_us * NS_PER_US),
+            )
+        ]
 
     def read(self, frame: bytes, now_us: int) -> int | None:
         """Return the round trip in microseconds if a frame answers a question of ours."""
@@ -83,6 +92,40 @@ class RoundTrip:
             return None
         round_trip_us: int = now_us - sent_us
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None
+
+    def answer(self, frame: bytes, system: int, now_us: int) -> tuple[bytes, int] | None:
+        """Answer a question that another gateway asks this one.
+
+        Parameters
+        ----------
+        frame : bytes
+            Any frame.
+        system : int
+            One of our vehicles, as whose part the gateway speaks.
+        now_us : int
+            Gateway time.
+
+        Returns
+        -------
+        tuple of bytes and int, or None
+            Frame and message id; None if that is no such question.
+        """
+        asked = self._decode(frame) if is_of_probe(frame) else None
+        if asked is None:
+            return None
+        if asked.get_msgId() == dialect.MAVLINK_MSG_ID_PING:
+            message = dialect.MAVLink_ping_message(asked.time_usec, asked.seq, *origin_of(frame))
+        elif asked.tc1 == 0:
+            message = dialect.MAVLink_timesync_message(now_us * NS_PER_US, asked.ts1)
+        else:
+            return None
+        self._sender.srcSystem = system
+        return self._numbered(message)
+
+    def _numbered(self, message: dialect.MAVLink_message) -> tuple[bytes, int]:
+        frame = self._seal(bytes(message.pack(self._sender)), self._sender.seq)
+        self._sender.seq = (self._sender.seq + 1) % 256
+        return frame, message.get_msgId()
 
     def _decode(self, frame: bytes) -> dialect.MAVLink_message | None:
         try:

@@ -1,7 +1,8 @@
 """Which clients are links to one and the same peer.
 
-Two links to one peer bring the same bytes, each by its own way. Whoever is known to be such a pair
-is answered on both, and what is sent to one in a stream of its own is sent to the other: then both
+Two links to one peer bring the same bytes, each by its own way. What we pass on may come back and
+looks the same, so only frames that go no further count. Whoever is known to be such a pair is
+answered on both, and what is sent to one in a stream of its own is sent to the other: then both
 links carry the same numbers, and the peer can tell copies by their bytes in its turn. Two ground
 stations that share an id and were started at the same moment look alike, and are served alike: each
 gets the answer to what only one of them was heard to ask.

@@ -27,7 +27,10 @@ MAX_ORIGINS: Final = 256
 ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A way on which a system has spoken so lately is preferred to ways on which it fell silent."""
 MEMORY_US: Final = US_PER_S
-"""Copies come within a radio's delay; most links take longer to use up the sequence numbers."""
+"""Copies come within a radio's delay."""
+MEMORY_OF_ONE: Final = 224
+"""Frames of a component; 256 later one of the same content has the same number and so the same
+bytes."""
 MEMORY_FRAMES: Final = 8192
 """Per generation: a second of a fast link, at most 2.3 MB."""
 
@@ -180,17 +183,23 @@ class LoopGuard:
     """Remember the frames of the last second and tell copies."""
 
     def __init__(self) -> None:
-        self._recent: dict[bytes, tuple[int, int]] = {}
-        self._older: dict[bytes, tuple[int, int]] = {}
+        self._recent: dict[bytes, tuple[int, int, int]] = {}
+        self._older: dict[bytes, tuple[int, int, int]] = {}
+        """When a frame came first, by whom, and as which of its component's."""
+        self._counts: dict[Origin, int] = {}
         self._turned_us = 0
 
-    def first_way(self, frame: bytes, client_id: int, since_us: int, now_us: int) -> int | None:
+    def first_way(
+        self, frame: bytes, origin: Origin, client_id: int, since_us: int, now_us: int
+    ) -> int | None:
         """Note a frame; return who has brought the same bytes before.
 
         Parameters
         ----------
         frame : bytes
             A complete frame.
+        origin : tuple of int
+            Whose it is.
         client_id : int
             Who brings it.
         since_us : int
@@ -206,8 +215,12 @@ class LoopGuard:
         if now_us - self._turned_us >= MEMORY_US or len(self._recent) >= MEMORY_FRAMES:
             self._older, self._recent = self._recent, {}
             self._turned_us = now_us
+            if len(self._counts) > MEMORY_FRAMES:
+                self._counts.clear()
         known = self._recent.get(frame) or self._older.get(frame)
-        if known is not None and known[0] >= since_us:
+        count = self._counts.get(origin, 0)
+        if known is not None and known[0] >= since_us and count - known[2] < MEMORY_OF_ONE:
             return known[1]
-        self._recent[frame] = (now_us, client_id)
+        self._recent[frame] = (now_us, client_id, count)
+        self._counts[origin] = count + 1
         return None

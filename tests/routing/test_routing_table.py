@@ -112,16 +112,16 @@ class TestBounds:
 
 
 def is_new(guard: LoopGuard, frame: bytes, since_us: int, now_us: int) -> bool:
-    return guard.first_way(frame, 5, since_us, now_us) is None
+    return guard.first_way(frame, (9, 1), 5, since_us, now_us) is None
 
 
 class TestLoopGuard:
     def test_a_copy_is_known_wherever_it_comes_from(self) -> None:
         guard = LoopGuard()
-        assert guard.first_way(b"frame", 5, 0, 0) is None
-        assert guard.first_way(b"frame", 6, 0, 10) == 5
-        assert guard.first_way(b"frame", 5, 0, 20) == 5
-        assert guard.first_way(b"other", 6, 0, 20) is None
+        assert guard.first_way(b"frame", (9, 1), 5, 0, 0) is None
+        assert guard.first_way(b"frame", (9, 1), 6, 0, 10) == 5
+        assert guard.first_way(b"frame", (9, 1), 5, 0, 20) == 5
+        assert guard.first_way(b"other", (9, 1), 6, 0, 20) is None
 
     def test_a_newcomer_repeats_nothing(self) -> None:
         guard = LoopGuard()
@@ -137,6 +137,15 @@ class TestLoopGuard:
         assert not is_new(guard, b"frame", 0, 2 * MEMORY_US + 1)
         is_new(guard, b"third", 0, 3 * MEMORY_US)
         assert is_new(guard, b"frame", 0, 3 * MEMORY_US)
+
+    def test_the_same_content_under_the_same_number_is_new_when_the_numbers_are_used_up(
+        self,
+    ) -> None:
+        guard = LoopGuard()
+        for n in range(3 * 256):
+            frame = bytes((n % 256,))
+            assert guard.first_way(frame, (9, 1), 5, 0, n) is None
+            assert guard.first_way(frame, (9, 1), 6, 0, n) == 5
 
     def test_memory_is_bounded(self) -> None:
         guard = LoopGuard()

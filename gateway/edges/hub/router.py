@@ -13,7 +13,7 @@ from gateway.edges.hub.client import Client
 from gateway.edges.hub.express import Express, GuardedExpress
 from gateway.records import Incoming
 from gateway.routing.fanout import Fanout
-from gateway.routing.probe import RoundTrip
+from gateway.routing.probe import RoundTrip, is_of_probe
 from gateway.routing.redundancy import RedundantLinks
 from gateway.routing.request_queue import RequestQueue
 from gateway.routing.routing_table import ROUTE_FRESH_US, LoopGuard, Origin, RoutingTable
@@ -152,13 +152,17 @@ class Router:
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
             return
-        if (
+        is_copy = (
             client.trusted
             and table.is_shared(origin, now_us)
             and self._is_copy(client, origin, frame)
-        ):
+        )
+        if is_of_probe(frame):
+            # Of each link on its own, copies or not, and no further.
+            self._ask(client, frame, forwarded=False)
+        elif is_copy:
             return
-        if target_of(frame)[0]:
+        elif target_of(frame)[0]:
             self._route_addressed(client, frame, now_us)
         else:
             self._route_broadcast(client, frame, table.is_station(origin), now_us)
@@ -186,16 +190,24 @@ class Router:
         """Note a frame of a system that is heard by several ways; return whether it was here."""
         client_id, now_us = client.client_id, self._now_us()
         since_us = self._table.since_us(client_id, origin)
-        first = self._guard.first_way(frame, client_id, since_us, now_us)
+        first = self._guard.first_way(frame, origin, client_id, since_us, now_us)
         if first is None:
             return False
         self.duplicates += 1
-        if first != client_id and self._links.note(first, client_id, now_us):
-            self._fanout.align(self._links.group(client_id))
-            if target_of(frame)[0] in self._vehicles.systems(now_us):
+        if first != client_id:
+            self._note_link(first, client, frame, now_us)
+        return True
+
+    def _note_link(self, first: int, client: Client, frame: bytes, now_us: int) -> None:
+        """Join two links that bring the same frame, if neither can have it from us."""
+        for_us = target_of(frame)[0] in self._vehicles.systems(now_us)
+        if not (for_us or is_of_probe(frame)):
+            return
+        if self._links.note(first, client.client_id, now_us):
+            self._fanout.align(self._links.group(client.client_id))
+            if for_us:
                 # What was asked first has been answered on one link only.
                 self._ask(client, frame, forwarded=False)
-        return True
 
     def _route_addressed(self, client: Client, frame: bytes, now_us: int) -> None:
         target = target_of(frame)
@@ -271,6 +283,20 @@ class Router:
         self._turn = loop.call_soon(self._serve)
         self._serving = incoming.client_id
         try:
-            self._on_frame(incoming)
+            if not self._answer_probe(incoming, now_us):
+                self._on_frame(incoming)
         finally:
             self._serving = None
+
+    def _answer_probe(self, incoming: Incoming, now_us: int) -> bool:
+        """Answer another gateway's question about this link; return whether it was one."""
+        client = self._clients.get(incoming.client_id)
+        systems = self._vehicles.systems(now_us)
+        if not is_of_probe(incoming.frame):
+            return False
+        if client is not None and systems:
+            answer = self._probe.answer(incoming.frame, systems[0], now_us)
+            if answer is not None:
+                self.charge(incoming.client_id, len(answer[0]))
+                client.transmit(*answer)
+        return True
