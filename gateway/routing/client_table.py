@@ -3,9 +3,12 @@
 A UDP port knows its clients only by what they send. A client is dropped after a silence; one that
 comes back on another port (a ground station that was started again) takes the place of its old
 self as soon as that has missed a few heartbeats, so that nobody is served twice; and a port never
-serves more than a bounded number, whoever knocks.
+serves more than a bounded number, whoever knocks. Whoever is silent makes room in a full port, and
+so does a machine that holds more than its share, for one that holds less.
 """
 
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,6 +16,10 @@ from gateway.units import US_PER_S
 
 SILENT_AFTER_US: Final = 3 * US_PER_S
 """Three missed heartbeats: a client so silent may be replaced."""
+SHARE: Final = 4
+"""One machine is left a quarter of the places when others want them,"""
+FEW: Final = 4
+"""and at least these: a ground station, a script and a display."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +147,12 @@ class ClientTable:
         """
         leaver = None
         if len(self._by_address) >= self.max_clients:
-            leaver = min(self._by_address.values(), key=lambda presence: presence.heard_us)
-            if now_us - leaver.heard_us < SILENT_AFTER_US:
-                self._full_until_us = leaver.heard_us + SILENT_AFTER_US
+            present = self._by_address.values()
+            leaver = who_leaves(present, address[0], self.max_clients, now_us)
+            if leaver is None:
+                if crowded_host(present, self.max_clients) is None:
+                    stalest = min(present, key=lambda presence: presence.heard_us)
+                    self._full_until_us = stalest.heard_us + SILENT_AFTER_US
                 return None, None
             self.remove(leaver)
         presence = Presence(client_id, address, now_us)
@@ -182,3 +192,40 @@ class ClientTable:
         if silent_us < SILENT_AFTER_US or presence.identity is None:
             return False
         return newest[presence.address[0], presence.identity] is not presence
+
+
+def who_leaves(
+    present: Collection[Presence], host: str, max_clients: int, now_us: int
+) -> Presence | None:
+    """Choose who makes room in a full port.
+
+    Parameters
+    ----------
+    present : collection of Presence
+        Everybody who is there, in the order in which they came.
+    host : str
+        Where the newcomer is.
+    max_clients : int
+        Most clients at once.
+    now_us : int
+        Gateway time.
+
+    Returns
+    -------
+    Presence or None
+        Who has been silent for longest, else the last who came from the machine that holds more
+        than its share; None if all are alive and none does, or only the newcomer's own.
+    """
+    stalest = min(present, key=lambda presence: presence.heard_us)
+    if now_us - stalest.heard_us >= SILENT_AFTER_US:
+        return stalest
+    crowded = crowded_host(present, max_clients)
+    if crowded in (None, host):
+        return None
+    return [presence for presence in present if presence.address[0] == crowded][-1]
+
+
+def crowded_host(present: Collection[Presence], max_clients: int) -> str | None:
+    """Return the machine with the most clients if those are more than its share."""
+    host, count = Counter(presence.address[0] for presence in present).most_common(1)[0]
+    return host if count > max(FEW, max_clients // SHARE) else None

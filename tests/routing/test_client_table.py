@@ -79,3 +79,32 @@ def test_a_silent_neighbour_of_another_identity_stays() -> None:
     assert other is not None
     other.identity = (254, 190)
     assert table.expire(6 * S) == []
+
+
+class TestShares:
+    """One machine may hold every place only as long as nobody else wants one."""
+
+    def full(self, hosts: list[str]) -> ClientTable:
+        table = ClientTable(len(hosts), 30 * S)
+        for client_id, host in enumerate(hosts):
+            assert table.admit((host, client_id), client_id, 0)[0]
+        return table
+
+    def test_a_machine_with_all_places_makes_room_for_others(self) -> None:
+        table = self.full(["10.0.0.6"] * 32)
+        for n in range(100):
+            table.admit(("10.0.0.6", 5000 + n), 100 + n, 1)
+        others = [table.admit((f"10.0.1.{n}", 9), 900 + n, 2)[0] for n in range(30)]
+        assert [presence is not None for presence in others] == [True] * 24 + [False] * 6
+        assert table.find(("10.0.0.6", 0)), "who came first stays"
+
+    def test_nobody_who_holds_his_share_makes_room_for_a_stranger(self) -> None:
+        table = self.full(["10.0.0.1", "10.0.0.1", *(f"10.0.2.{n}" for n in range(6))])
+        assert table.admit(("10.0.9.9", 9), 99, 1) == (None, None)
+        assert table.is_full(1)
+
+    def test_the_crowd_that_knocks_shuts_nobody_else_out(self) -> None:
+        table = self.full(["10.0.0.6"] * 8)
+        assert table.admit(("10.0.0.6", 99), 99, 1) == (None, None)
+        assert not table.is_full(1)
+        assert table.admit(("10.0.0.7", 99), 99, 1)[0]

@@ -81,6 +81,11 @@ class Client:
         """Do what is due a few times a second: connect again, expire."""
 
     @property
+    def host(self) -> str:
+        """The peer's machine, without a port."""
+        return self.remote.rpartition(":")[0].strip("[]")
+
+    @property
     def is_direct(self) -> bool:
         """Whether a frame may go to `write` without further ado."""
         return False

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US, Listener, Peer
+from gateway.routing.client_table import Presence, who_leaves
 from gateway.routing.endpoint import host_and_port
 from gateway.routing.outbox import Numbering, Outbox
 from gateway.wire.mavlink_splitter import MavlinkSplitter
@@ -252,11 +253,26 @@ class StreamListener(Listener[Peer]):
                 self._complain(error)
                 self._loop.remove_reader(sock)
                 return
-            if len(self._clients) >= self._context.settings.max_clients:
+            if not self._has_room(str(address[0])):
                 self.turned_away += 1
                 connection.close()
                 continue
             self._admit(connection, host_and_port(*address[:2]))
+
+    def _has_room(self, host: str) -> bool:
+        """Return whether there is room for a newcomer, or somebody who makes room."""
+        most = self._context.settings.max_clients
+        if len(self._clients) < most:
+            return True
+        present = [
+            Presence(client.client_id, (client.host, 0), client.heard_us or client.since_us)
+            for client in self._clients.values()
+        ]
+        leaver = who_leaves(present, host, most, self._context.now_us())
+        if leaver is None:
+            return False
+        self.leave(self._clients[leaver.client_id])
+        return True
 
     def _admit(self, connection: socket.socket, peer: str) -> None:
         """Make a client of a connection."""

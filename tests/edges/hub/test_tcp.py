@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from gateway.routing.client_table import SILENT_AFTER_US
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 
 pytestmark = pytest.mark.io
@@ -187,3 +188,23 @@ class TestSerial:
         os.close(near)
         await rig.until(lambda: hub.clients()[0].state == "unreachable")
         os.close(far)
+
+
+async def test_silent_readers_make_room_for_newcomers(rig: Any) -> None:
+    hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
+    (port,) = hub.listening_ports()
+    readers = [rig.station(port, socket.SOCK_STREAM) for _ in range(2)]
+    for count, reader in enumerate(readers, start=1):
+        reader.socket.connect_ex(reader.target)
+        await rig.until(lambda count=count: len(hub.clients()) == count)
+    early = rig.station(port, socket.SOCK_STREAM)
+    early.socket.connect_ex(early.target)
+    await rig.until(lambda: hub.listeners()[0].turned_away == 1)
+    rig.clock.us += SILENT_AFTER_US
+    readers[1].socket.send(readers[1].sender.heartbeat())
+    await rig.until(lambda: hub.clients()[1].received == 1)
+    late = rig.station(port, socket.SOCK_STREAM)
+    late.socket.connect_ex(late.target)
+    await rig.until(lambda: hub.clients()[-1].remote == f"127.0.0.1:{late.port}")
+    remotes = [client.remote for client in hub.clients()]
+    assert remotes == [f"127.0.0.1:{each.port}" for each in (readers[1], late)]
