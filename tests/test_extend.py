@@ -1,7 +1,9 @@
 """docs/extend.md: each example as it stands there, added from outside the package."""
 
+import asyncio
 import importlib
 import re
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,21 +15,32 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway import Outgoing, Pipeline, PipelineSettings
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import OTHER_FORMATS
+from gateway.edges.hub.hub import Hub
+from gateway.edges.hub.transports import CLIENTS
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.extensions import ExtensionError, load_extensions
 from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flights.reading import READERS, ReadOptions
 from gateway.flights.writing import WRITERS, FlightToWrite
-from gateway.records import ImuRaw, NavState
+from gateway.records import ImuRaw, Incoming, NavState
 from gateway.replay import header_for
+from gateway.routing.endpoint import ADDED_KINDS
+from gateway.routing.hub_settings import HubSettings
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"
-REGISTRIES: tuple[dict, ...] = (ADDED_MESSAGES, ESTIMATORS, WRITERS, READERS, OTHER_FORMATS)
+REGISTRIES: tuple[dict, ...] = (
+    ADDED_MESSAGES,
+    ESTIMATORS,
+    WRITERS,
+    READERS,
+    OTHER_FORMATS,
+    CLIENTS,
+)
 
 Install = Callable[[str, str], ModuleType]
 
@@ -60,6 +73,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     for registry, kept in zip(REGISTRIES, before, strict=True):
         registry.clear()
         registry.update(kept)
+    ADDED_KINDS.clear()
     for name in names:
         sys.modules.pop(name, None)
 
@@ -87,6 +101,32 @@ def test_a_message_is_sent_at_its_rate(install: Install) -> None:
     message = mavlink.MAVLink(None).parse_char(frames[-1])
     assert message.name == "load"
     assert message.value == pytest.approx(1.0, abs=0.1)
+
+
+async def test_an_endpoint_kind_sends_and_receives(install: Install, tmp_path: Path) -> None:
+    install("unix_endpoint", example("An endpoint kind"))
+    load_extensions()
+    station = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    station.settimeout(5.0)
+    station.bind(str(tmp_path / "station"))
+    taken: list[Incoming] = []
+    hub = Hub(HubSettings(endpoints=(), ping_interval_s=0.0), taken.append, lambda: 0)
+    hub.start()
+    hub.add(f"unix:{tmp_path / 'station'}?deny=RAW_IMU")
+    frame = mavlink.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, 1, 1))
+    hub.send(Outgoing(bytes(frame), mavlink.MAVLINK_MSG_ID_ATTITUDE))
+    data, address = station.recvfrom(1024)
+    assert message_id_of(data) == mavlink.MAVLINK_MSG_ID_ATTITUDE
+    asking = mavlink.MAVLink_param_request_list_message(1, 1)
+    station.sendto(bytes(asking.pack(mavlink.MAVLink(None, 255, 190))), address)
+    for _ in range(1000):
+        if taken or hub.clients()[0].received:
+            break
+        await asyncio.sleep(0.001)
+    (client,) = hub.clients()
+    assert (client.state, client.sent, client.received) == ("open", 1, 1)
+    hub.close()
+    station.close()
 
 
 def test_an_estimator_is_chosen_by_name(install: Install) -> None:

@@ -73,7 +73,7 @@ OPEN_TO_ALL: Final = frozenset(
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that speak within TLS."""
 COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "trusted"})
-OWN_OPTIONS: Final = {
+OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
     EndpointKind.WSS: frozenset({"path"}),
     EndpointKind.WS_LISTEN: frozenset({"origins"}),
@@ -87,6 +87,8 @@ HOSTED: Final = frozenset(
     | {EndpointKind.WS, EndpointKind.WS_LISTEN, EndpointKind.WSS, EndpointKind.WSS_LISTEN}
 )
 """Kinds whose frames go to hosts by their addresses, one by one."""
+ADDED_KINDS: Final[set[str]] = set()
+"""Kinds of other packages; what follows their word is theirs to read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +96,12 @@ class Endpoint:
     """One parsed endpoint URL."""
 
     url: str
-    kind: EndpointKind
+    kind: str
+    """An `EndpointKind`, or one of `ADDED_KINDS`."""
     host: str
-    """Address or name without brackets; the device of a serial port."""
+    """Address or name without brackets; device of a serial port; whole place of an added kind."""
     port: int
-    """Port number; the baud rate of a serial port."""
+    """Port number; the baud rate of a serial port; 0 of an added kind."""
     place: str
     """The URL in our own spelling and without options; no two endpoints share one."""
     name: str
@@ -120,8 +123,8 @@ class Endpoint:
     @property
     def address(self) -> str:
         """Where it is: `HOST:PORT`, or the device of a serial port."""
-        serial = self.kind is EndpointKind.SERIAL
-        return self.host if serial else host_and_port(self.host, self.port)
+        has_port = self.kind != EndpointKind.SERIAL and self.kind not in ADDED_KINDS
+        return host_and_port(self.host, self.port) if has_port else self.host
 
     def passes(self, message_id: int) -> bool:
         """Return whether the lists let a message out to this endpoint."""
@@ -193,16 +196,21 @@ def message_id_from(text: str) -> int:
         raise ValueError(f"no MAVLink message is called {text!r}") from None
 
 
-def _kind_and_place(address: str) -> tuple[EndpointKind, str]:
+def _kind_and_place(address: str) -> tuple[str, str]:
     if not address.isprintable():
         raise ValueError("it cannot be shown")
+    word, _, place = address.partition(":")
+    if word in ADDED_KINDS:
+        return word, place
     word, place = respell(address)
     if word not in set(EndpointKind):
-        raise ValueError(f"{word!r} is none of {', '.join(EndpointKind)}")
+        raise ValueError(f"{word!r} is none of {', '.join([*EndpointKind, *sorted(ADDED_KINDS)])}")
     return EndpointKind(word), place
 
 
-def _split_place(kind: EndpointKind, place: str) -> tuple[str, int]:
+def _split_place(kind: str, place: str) -> tuple[str, int]:
+    if kind in ADDED_KINDS:
+        return place, 0
     if kind is EndpointKind.SERIAL:
         device, colon, baud = place.rpartition(":")
         if not colon:
@@ -267,7 +275,7 @@ def stays_here(endpoint: Endpoint) -> bool:
     return endpoint.kind in HOSTED and is_loopback(endpoint.host)
 
 
-def _options(kind: EndpointKind, query: str) -> dict[str, str]:
+def _options(kind: str, query: str) -> dict[str, str]:
     """Read the options; each may be there once, or it would hang on the order which one holds."""
     known = COMMON_OPTIONS | OWN_OPTIONS.get(kind, frozenset())
     options: dict[str, str] = {}

@@ -11,9 +11,11 @@ from gateway.edges.hub.tcp import TcpClient, TcpListener
 from gateway.edges.hub.udp import UdpClient
 from gateway.edges.hub.udp_listen import UdpListener
 from gateway.edges.hub.web.websocket import WsClient, WsListener
-from gateway.routing.endpoint import Endpoint, EndpointKind
+from gateway.routing.endpoint import ADDED_KINDS, Endpoint, EndpointKind
 
-CLIENTS: Final[dict[EndpointKind, Callable[[HubContext, int, Endpoint], Client]]] = {
+ClientMaker = Callable[[HubContext, int, Endpoint], Client]
+
+CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,
     EndpointKind.UDP_MULTICAST: GroupClient,
@@ -22,9 +24,31 @@ CLIENTS: Final[dict[EndpointKind, Callable[[HubContext, int, Endpoint], Client]]
     EndpointKind.WSS: WsClient,
     EndpointKind.SERIAL: RadioClient,
 }
-LISTENERS: Final[dict[EndpointKind, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
+LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
     EndpointKind.WS_LISTEN: WsListener,
     EndpointKind.WSS_LISTEN: WsListener,
 }
+
+
+def add_endpoint_kind(word: str, make: ClientMaker) -> None:
+    """Let endpoint URLs begin with one more word.
+
+    Parameters
+    ----------
+    word : str
+        Before the URL's first colon; what follows, up to the options, is `Endpoint.host`.
+    make : callable
+        Makes the client of one endpoint from the hub, the client's id and the endpoint: a
+        subclass of `Client` is called just so.
+
+    Raises
+    ------
+    ValueError
+        If the word is taken.
+    """
+    if word in CLIENTS or word in LISTENERS:
+        raise ValueError(f"there is an endpoint kind {word!r} already")
+    ADDED_KINDS.add(word)
+    CLIENTS[word] = make
