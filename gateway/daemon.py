@@ -43,7 +43,7 @@ from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
-from gateway.vehicle.telemetry.events import NOTICE, WARNING, StatusText
+from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
 
 log = logging.getLogger(__name__)
 
@@ -219,7 +219,7 @@ class Daemon:
         self._announce(True, text)
 
     def _announce(self, is_trouble: bool, text: str) -> None:
-        status = StatusText(WARNING if is_trouble else NOTICE, text)
+        status = StatusText(WARNING if is_trouble else INFO, text)
         self._perform(self._pipeline.say(status, self.now_us()))
 
     async def _open_control(self) -> None:
@@ -302,11 +302,11 @@ class Daemon:
             status = StatusText(WARNING, f"Settings not saved: {error.strerror}")
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, file)
-            status = StatusText(NOTICE, f"Settings saved: {file.name}")
+            status = StatusText(INFO, f"Settings saved: {file.name}")
         self._announce_for(aircraft, status)
 
     def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
-        status = StatusText(NOTICE, "Mission, mark and home are kept again")
+        status = StatusText(INFO, "Mission, mark and home are kept again")
         if trouble is not None:
             status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
         self._announce_for(self._pipeline.find(vehicle_id), status)

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.records import Incoming, NavFlags, Outgoing
 from gateway.vehicle.home import Place
 from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.telemetry.events import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.samples import (
@@ -183,6 +184,17 @@ def test_link_and_nodes_are_told() -> None:
     alive = link(last_time_us=30 * ONE_S), link(GPS_NODE, last_time_us=30 * ONE_S)
     found = vehicle.on_link(report(*alive), 30 * ONE_S)
     assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"]
+
+
+def test_good_news_is_info() -> None:
+    """Stations speak a NOTICE and show it as trouble."""
+    vehicle = make()
+    said = fly(vehicle, 0, 2) + vehicle.on_link(report(link(), connected=False), ONE_S)
+    said += vehicle.on_link(report(link(last_time_us=30 * ONE_S)), 30 * ONE_S)
+    severities = {m.text: m.severity for m in decode(said) if m.get_type() == "STATUSTEXT"}
+    assert {"GPS fix", "Receiver connected: /dev/ttyUSB0"} <= severities.keys()
+    trouble = {text for text, severity in severities.items() if severity < INFO}
+    assert trouble == {"Receiver lost: /dev/ttyUSB0"}
 
 
 def test_a_node_that_restarts_is_told() -> None:

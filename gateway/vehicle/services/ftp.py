@@ -10,6 +10,7 @@ References
 """
 
 import binascii
+import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -35,6 +36,8 @@ MIN_BURST_DATA: Final = 64
 """A burst of single bytes would cost both sides sixty times as much."""
 
 ACK: Final = 128
+_SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
+"""What stands before the path in a URI of the component metadata."""
 NAK: Final = 129
 
 
@@ -329,8 +332,14 @@ def crc32(content: bytes) -> int:
 
 
 def _path(packet: Packet) -> str:
+    """Read a path, however the client writes it.
+
+    QGroundControl makes `//general.json` of `mftp:///general.json`, MAVSDK sends it without a
+    slash or as a URI with the component, MAVProxy lists `/`, an empty path or `.`.
+    """
     text = packet.data.split(b"\0", 1)[0].decode("utf-8", "replace")
-    return text if text.startswith("/") else f"/{text}"
+    path = _SCHEME.sub("", text.strip())
+    return "/" + "/".join(part for part in path.split("/") if part not in ("", "."))
 
 
 def _answer(packet: Packet, opcode: int, session: int, data: bytes) -> Packet:

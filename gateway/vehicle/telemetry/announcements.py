@@ -3,7 +3,7 @@
 from typing import Any, Final
 
 from gateway.records import LinkReport, NavFlags
-from gateway.vehicle.telemetry.events import CRITICAL, INFO, NOTICE, WARNING, Announcer, StatusText
+from gateway.vehicle.telemetry.events import CRITICAL, INFO, WARNING, Announcer, StatusText
 from gateway.vehicle.telemetry.health import Health
 
 FLAG_TEXTS: Final = (
@@ -35,7 +35,7 @@ FLAG_TEXTS: Final = (
     (
         NavFlags.SENSOR_FAULT,
         StatusText(CRITICAL, "Sensor fault"),
-        StatusText(NOTICE, "Sensors well again"),
+        StatusText(INFO, "Sensors well again"),
     ),
     (
         NavFlags.DEGRADED,
@@ -72,14 +72,14 @@ class Announcements:
     def on_fix(self, now_us: int) -> list[Any]:
         """Return whether GPS fixes come."""
         fixed = self._health.has_fix(now_us)
-        text = StatusText(NOTICE, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
+        text = StatusText(INFO, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
         """Announce the receiver's and the nodes' coming and going."""
         text = StatusText(CRITICAL, f"Receiver lost: {report.port}")
         if report.connected:
-            text = StatusText(NOTICE, f"Receiver connected: {report.port}")
+            text = StatusText(INFO, f"Receiver connected: {report.port}")
         found = self._announcer.track("link", report.connected, text, now_us)
         if not report.connected:
             # Without the receiver every node is silent; that need not be said.
@@ -87,7 +87,7 @@ class Announcements:
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
             name = self._health.node_name(node)
-            text = StatusText(NOTICE, f"{name} is back")
+            text = StatusText(INFO, f"{name} is back")
             if node in silent:
                 text = StatusText(CRITICAL, f"{name} silent")
             found += self._announcer.track(

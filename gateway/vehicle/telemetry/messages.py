@@ -31,6 +31,7 @@ MIN_COURSE_SPEED_MPS: Final = 0.5
 UT_PER_GAUSS: Final = 100.0
 MM: Final = 1e3
 CM: Final = 1e2
+CENTI_DOP: Final = 1e2
 DEGE5: Final = 1e5
 DEGE7: Final = 1e7
 MS_US: Final = 1000
@@ -199,20 +200,21 @@ def scaled_pressure(sample: BaroSample) -> Any:
 def gps_raw_int(fix: GpsFix) -> Any:
     """Encode a fix.
 
-    HDOP and VDOP are unknown: the receiver tells the position's DOP only, which is neither. The
-    accuracies are sent in metres. An extension field that is not known is 0.
+    The receiver tells the position's DOP alone, whose square is the sum of those of HDOP and VDOP;
+    it is parted by the accuracies, which grow with them. An extension field that is not known is 0.
     """
     north, east, _ = fix.vel_n_mps
     speed = math.hypot(north, east)
     moving = is_3d(fix) and speed >= MIN_COURSE_SPEED_MPS
+    hdop, vdop = dilutions(fix)
     return mavlink.MAVLink_gps_raw_int_message(
         time_usec=fix.time_us,
         fix_type=FIX_TYPES[fix.fix_type] if fix.fix_ok else mavlink.GPS_FIX_TYPE_NO_FIX,
         lat=fix.lat_dege7,
         lon=fix.lon_dege7,
         alt=fields.int32(fix.alt_amsl_m * MM),
-        eph=fields.UINT16_MAX,
-        epv=fields.UINT16_MAX,
+        eph=fields.uint16(hdop * CENTI_DOP),
+        epv=fields.uint16(vdop * CENTI_DOP),
         vel=fields.uint16(speed * CM) if is_3d(fix) else fields.UINT16_MAX,
         cog=fields.compass_cdeg(math.atan2(east, north)) if moving else fields.UINT16_MAX,
         satellites_visible=fields.uint8(fix.satellites),
@@ -222,6 +224,14 @@ def gps_raw_int(fix: GpsFix) -> Any:
         vel_acc=fields.uint32(fix.speed_acc_mps * MM),
         hdg_acc=fields.uint32(fix.course_acc_deg * DEGE5),
     )
+
+
+def dilutions(fix: GpsFix) -> tuple[float, float]:
+    """Tell HDOP and VDOP; NaN without a fix, or where the receiver does not tell enough."""
+    accuracy_m = math.hypot(fix.h_acc_m, fix.v_acc_m)
+    if not is_3d(fix) or not accuracy_m > 0.0:
+        return NAN, NAN
+    return fix.pdop * fix.h_acc_m / accuracy_m, fix.pdop * fix.v_acc_m / accuracy_m
 
 
 def gps_absent(now_us: int) -> Any:

@@ -94,6 +94,38 @@ def test_the_metadata_is_found_and_describes_every_parameter(ftp: Ftp, loss: flo
     assert parameters["VEH_TYPE"]["values"][1] == {"value": 1, "description": "fixed_wing"}
 
 
+@pytest.mark.parametrize(
+    "path",
+    [
+        b"/general.json",
+        b"//general.json",
+        b"///general.json",
+        b"general.json",
+        b"/./general.json",
+        b"mftp:///general.json",
+        b"mftp://general.json",
+        b"mftp://;comp=1/general.json",
+        b"mftp://[;comp=1]/general.json",
+        b"MFTP:///general.json",
+    ],
+)
+def test_every_way_to_write_a_path(ftp: Ftp, path: bytes) -> None:
+    assert ftp.ask(Opcode.OPEN_FILE_RO, path).opcode == ACK
+
+
+@pytest.mark.parametrize("path", [b"/", b"", b".", b"//", b"/.", b"./"])
+def test_every_way_to_write_the_folder(ftp: Ftp, path: bytes) -> None:
+    assert b"general.json" in ftp.ask(Opcode.LIST_DIRECTORY, path).data
+
+
+@pytest.mark.parametrize(
+    "path", [b"@PARAM/param.pck", b"/../general.json", b"/general.json/x", b"/general"]
+)
+def test_other_paths_are_not_there(ftp: Ftp, path: bytes) -> None:
+    refused = ftp.ask(Opcode.OPEN_FILE_RO, path)
+    assert (refused.opcode, refused.data[:1]) == (NAK, b"\x0a")
+
+
 def test_every_key_of_the_metadata_is_of_the_schema(ftp: Ftp) -> None:
     allowed = {
         "name", "type", "shortDesc", "longDesc", "units", "default", "decimalPlaces", "min", "max",

@@ -98,12 +98,28 @@ def test_scaled_pressure() -> None:
     assert found.temperature == -1234
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"pdop": math.nan},
+        {"h_acc_m": math.nan},
+        {"h_acc_m": 0.0, "v_acc_m": 0.0},
+        {"fix_ok": False},
+    ],
+)
+def test_dilutions_that_are_not_known(change: dict[str, Any]) -> None:
+    found = through_the_wire(messages.gps_raw_int(replace(FIX, **change)))
+    assert (found.eph, found.epv) == (65535, 65535)
+
+
 def test_gps_raw_int() -> None:
     found = through_the_wire(messages.gps_raw_int(FIX))
     assert found.fix_type == mavlink.GPS_FIX_TYPE_3D_FIX
     assert (found.lat, found.lon, found.alt) == (471_234_567, -87_654_321, 520_250)
     assert found.alt_ellipsoid == 567_750
-    assert (found.eph, found.epv) == (65535, 65535)
+    # A PDOP of 1.6, parted as 1.25 m to 2.5 m.
+    assert (found.eph, found.epv) == (72, 143)
+    assert math.hypot(found.eph, found.epv) == pytest.approx(160, abs=1)
     assert found.vel == 500
     assert found.cog == round(math.degrees(math.atan2(-4.0, 3.0)) * 100) % 36000
     assert found.satellites_visible == 11
