@@ -59,7 +59,7 @@ class SettingsChanged:
     vehicle_id: int
 
 
-Recorded = FusedSample | BaroRaw | GpsFix | SettingsChanged
+Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
 Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
 """Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
 
@@ -159,7 +159,7 @@ class Aircraft:
                 self._estimator.update_gps(record)
                 return self._recorded(record, self.vehicle.on_gps(record, now_us), now_us)
             case NodeStatus():
-                return self.perform(self.vehicle.on_node_status(record, now_us), now_us)
+                return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
 
     def _filter(self, imu: ImuCalibrated) -> ImuSample:
         return self._chain.imu_si(
@@ -178,7 +178,10 @@ class Aircraft:
         return self._recorded(fused, self.vehicle.on_state(self.state, sample, now_us), now_us)
 
     def _recorded(
-        self, record: FusedSample | BaroRaw | GpsFix, wanted: Iterable[VehicleAction], now_us: int
+        self,
+        record: FusedSample | BaroRaw | GpsFix | NodeStatus,
+        wanted: Iterable[VehicleAction],
+        now_us: int,
     ) -> list[Action]:
         """Put what is recorded behind the frames, which it may not delay, but before a change."""
         actions = self.perform(wanted, now_us)

@@ -35,6 +35,7 @@ from gateway.records import (
     FusedSample,
     GpsFix,
     Incoming,
+    NodeStatus,
     Outgoing,
 )
 from gateway.replay import header_for
@@ -287,7 +288,7 @@ class Daemon:
                     self._places.save(action.vehicle_id, action.places)
                 case RecordingRequest():
                     (self._recorder.record if action.start else self._recorder.stop)()
-                case FusedSample() | BaroRaw() | GpsFix():
+                case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
                     self._recorder.flight(action)
                 case SettingsChanged():
                     self._recorder.settings_changed(action.vehicle_id)

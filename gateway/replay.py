@@ -19,6 +19,7 @@ from gateway.records import (
     ImuCalibrated,
     ImuRaw,
     NavState,
+    NodeStatus,
 )
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
@@ -46,12 +47,14 @@ class Replay:
         self.refused: list[str] = []
         """Why states of the file were not gone on from: it then settles like a cold start."""
 
-    def take(self, row: TableRow | TableHeader | FusionState) -> Iterator[tuple[int, Action]]:
+    def take(
+        self, row: TableRow | TableHeader | FusionState | NodeStatus
+    ) -> Iterator[tuple[int, Action]]:
         """Take one row, a change of settings, or a state to go on from.
 
         Parameters
         ----------
-        row : TableRow, TableHeader or FusionState
+        row : TableRow, TableHeader, FusionState or NodeStatus
             The next of the file.
 
         Yields
@@ -66,7 +69,7 @@ class Replay:
         if isinstance(row, FusionState):
             self.restore(row)
             return
-        for record in records_of(row):
+        for record in [row] if isinstance(row, NodeStatus) else records_of(row):
             yield from self._wait(record.time_us)
             now_us = self._now_us if self._now_us is not None else record.time_us
             for action in self._pipeline.take(record, now_us):

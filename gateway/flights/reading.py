@@ -39,6 +39,7 @@ from gateway.records import (
     ImuRaw,
     NavFlags,
     NavState,
+    NodeStatus,
 )
 from gateway.replay import header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
@@ -57,7 +58,7 @@ SettingsChoice = Literal["recorded", "current"]
 Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 
 
-Line = TableRow | TableHeader | TableMark | FusionState
+Line = TableRow | TableHeader | TableMark | FusionState | NodeStatus
 
 
 NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
@@ -225,6 +226,8 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
         yield row
     elif isinstance(row, TableMark):
         yield TableMark(row.time_us + shift_us, row.text)
+    elif isinstance(row, NodeStatus):
+        yield replace(row, time_us=row.time_us + shift_us)
     elif isinstance(row, TableRow):
         yield TableRow(
             row.time_us + shift_us,

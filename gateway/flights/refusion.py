@@ -25,7 +25,7 @@ from gateway.flights.reading import (
     open_rows,
 )
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, Outgoing
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus, Outgoing
 from gateway.replay import InterpolatedPosition, Replay, header_for
 
 SETTLES: Final = "what was remembered at the begin is left aside: {}; the estimator settles anew"
@@ -101,6 +101,8 @@ class Refusion:
             if isinstance(row, TableMark):
                 yield row
                 continue
+            if isinstance(row, NodeStatus):
+                yield row
             if isinstance(row, TableHeader) and self._recorded:
                 yield row
             for _, action in self._replay.take(row):

@@ -10,14 +10,11 @@ import msgspec
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import (
     TableHeader,
-    TableMark,
     encode_head,
-    encode_header,
-    encode_mark,
-    encode_state,
+    encode_line,
 )
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
 from gateway.flights.reading import (
@@ -33,7 +30,6 @@ from gateway.flights.reading import (
     recorded_frames,
 )
 from gateway.flights.refusion import Refusion
-from gateway.records import FusionState
 
 LINES: Final = 1000
 """Lines of a table that are written at once."""
@@ -143,15 +139,7 @@ def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
     yield encode_head(table.header).encode()
     lines: list[str] = []
     for row in table.rows:
-        match row:
-            case TableRow():
-                lines.append(row_to_line(row))
-            case TableHeader():
-                lines.append(encode_header(row))
-            case TableMark():
-                lines.append(encode_mark(row))
-            case FusionState():
-                lines.append(encode_state(row))
+        lines.append(encode_line(row))
         if len(lines) == LINES:
             yield "".join(lines).encode()
             lines.clear()

@@ -32,14 +32,17 @@ def software_version(version: str) -> int:
     return major << 24 | minor << 16 | patch << 8 | kind
 
 
-def autopilot_version(system_id: int) -> Any:
-    """Encode AUTOPILOT_VERSION; the uid tells the vehicles of one gateway apart."""
+def autopilot_version(system_id: int, firmware: int = 0) -> Any:
+    """Encode AUTOPILOT_VERSION; the uid tells the vehicles of one gateway apart.
+
+    The nodes' firmware stands where an operating system's version does.
+    """
     nothing = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
         capabilities=CAPABILITIES,
         flight_sw_version=software_version(__version__),
         middleware_sw_version=0,
-        os_sw_version=0,
+        os_sw_version=firmware,
         board_version=0,
         flight_custom_version=nothing,
         middleware_custom_version=nothing,

@@ -113,7 +113,7 @@ class Vehicle:
         self.vehicle_id = system_id if vehicle_id is None else vehicle_id
         self.refusals = 0
         """Requests to change something that were refused."""
-        self.health = Health(self.vehicle_id, settings.node_silent_s)
+        self.health = Health(self.vehicle_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = SigningClock(unix_us_at_zero)
         self._encoder = Encoder(system_id)
@@ -144,7 +144,7 @@ class Vehicle:
         self._recording = RecordingService(self._explain)
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
-                self.system_id
+                self.system_id, self.health.boards.firmware
             ),
             MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: identity.protocol_version(),
             MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(),
@@ -216,15 +216,17 @@ class Vehicle:
         found += self._replies(self._announcements.on_fix(now_us))
         return self._finish(found)
 
-    def on_node_status(self, status: NodeStatus, _now_us: int) -> list[Action]:
+    def on_node_status(self, status: NodeStatus, now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
-        self.health.on_node_status(status)
-        return []
+        findings = self.health.on_node_status(status)
+        found = self.telemetry.on_node_status(status)
+        return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
         """Take in the state of the serial link and of all radio links."""
-        self.health.on_link(report)
-        return self._finish(self._replies(self._announcements.on_link(report, now_us)))
+        findings = self.health.on_link(report)
+        found = self._announcements.on_link(report, now_us)
+        return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Answer one frame of a client; one that is not for this vehicle is left alone.
@@ -322,6 +324,7 @@ class Vehicle:
 
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
+        self.health.boards.supply_low_v = settings.supply_low_v
         self.telemetry.reconfigure(settings)
         self._sign_by(settings.signing_passphrase)
 

@@ -38,6 +38,7 @@ class RateSettings(Settings, frozen=True):
     home_position_hz: Annotated[float, _rate("HOME_POSITION")] = 1.0
     mission_current_hz: Annotated[float, _rate("MISSION_CURRENT")] = 1.0
     radio_status_hz: Annotated[float, _rate("RADIO_STATUS")] = 1.0
+    battery_status_hz: Annotated[float, _rate("BATTERY_STATUS of each node")] = 1.0
 
 
 class VehicleSettings(Settings, frozen=True):
@@ -71,6 +72,16 @@ class VehicleSettings(Settings, frozen=True):
             le=60.0,
         ),
     ] = 2.0
+    supply_low_v: Annotated[
+        float,
+        setting(
+            "A node whose supply falls below this is told to the ground stations, as its radio and "
+            "sensors fail soon after; 0 tells none.",
+            "V",
+            ge=0.0,
+            le=12.0,
+        ),
+    ] = 3.0
     home_accuracy_m: Annotated[
         float,
         setting(

@@ -20,21 +20,16 @@ from gateway.edges.disk.recording_streams import (
     read_events,
 )
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
-from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import (
     TableFault,
     TableHeader,
-    TableMark,
     TableReader,
     encode_head,
-    encode_header,
-    encode_mark,
-    encode_state,
+    encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flights.reading import NO_RECORDING, FlightError
 from gateway.output import write_new
-from gateway.records import FusionState
 from gateway.units import US_PER_S
 
 SHOWN: Final = 8
@@ -150,17 +145,10 @@ def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
             if reader.header is None:
                 tell("the head is lost: settings and calibration of today will take its place")
             yield encode_head(reader.header or TableHeader()).encode()
-        match event:
-            case TableRow():
-                yield row_to_line(event).encode()
-            case TableHeader():
-                yield encode_header(event).encode()
-            case FusionState():
-                yield encode_state(event).encode()
-            case TableMark():
-                yield encode_mark(event).encode()
-            case TableFault():
-                tell(f"line {event.line}: {event.size} bytes: {event.reason}")
+        if isinstance(event, TableFault):
+            tell(f"line {event.line}: {event.size} bytes: {event.reason}")
+        else:
+            yield encode_line(event).encode()
     if not begun:
         raise FlightError(f"{file}: holds no row that can be read")
 

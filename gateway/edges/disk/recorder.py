@@ -38,7 +38,7 @@ from gateway.flightlog.session import (
 from gateway.flightlog.table.part import PENDING_LIMIT, Part
 from gateway.flightlog.table.table import TableHeader, TableMark
 from gateway.flightlog.tlog.stamps import CivilClock
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
@@ -216,7 +216,7 @@ class Recorder:
         if self._part is not None and self._settings.tlog:
             self._part.add_frame(frame, self._clock())
 
-    def flight(self, record: BaroRaw | GpsFix | FusedSample) -> None:
+    def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
         """Keep what the estimator took, and the state that it made of it."""
         if isinstance(record, GpsFix) and record.utc_us is not None:
             self._civil.hear_gps(record.node.vehicle_id, record.utc_us, record.time_us)

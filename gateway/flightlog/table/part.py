@@ -12,11 +12,12 @@ from gateway.flightlog.table.table import (
     encode_head,
     encode_header,
     encode_mark,
+    encode_node,
     encode_state,
 )
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
 PENDING_LIMIT: Final = 16 << 20
 """Bytes that wait for a slow disk: minutes of telemetry. More is given up, not piled up."""
@@ -87,8 +88,15 @@ class Part:
         """
         self._tables[header.vehicle_id] = _Table(header, state)
 
-    def add_flight(self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample) -> None:
-        """Gather what the estimator took, for a table that was prepared."""
+    def add_flight(
+        self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample | NodeStatus
+    ) -> None:
+        """Gather what came of an aircraft, for a table that was prepared."""
+        if isinstance(record, NodeStatus):
+            # It begins no table: the first row tells what the fusion begins with.
+            if self._tables[vehicle_id].begun:
+                self.add(table_ending(vehicle_id), encode_node(record).encode())
+            return
         self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
 
     def change_settings(self, header: TableHeader) -> None:

@@ -6,12 +6,14 @@
     # state: {"vehicle_id": …, "fits": …, "sensing": …, "estimation": …}
     12000,0,…
     # mark: {"time_us": 12345, "text": "…"}
+    # node: {"time_us": 12345, "supply_mv": 3290, "bus_errors": 0, …}
     # header: {…}
 
-A second header tells that the rows behind it were fused with other settings. A state is what
-filters and estimator remembered there, so that a file that begins in flight can be fused again
-from its first row. Lines that begin with `#` hold JSON; spreadsheets and pandas (`comment="#"`)
-step over them. An empty cell means not known, or nothing new.
+A node tells once a second how its board fares. A second header tells that the rows behind it were
+fused with other settings. A state is what filters and estimator remembered there, so that a file
+that begins in flight can be fused again from its first row. Lines that begin with `#` hold JSON;
+spreadsheets and pandas (`comment="#"`) step over them. An empty cell means not known, or nothing
+new.
 """
 
 from dataclasses import dataclass
@@ -19,13 +21,14 @@ from typing import Any, Final
 
 import msgspec
 
-from gateway.flightlog.table.row import COLUMNS, TableRow, row_from_cells
-from gateway.records import FusionState
+from gateway.flightlog.table.row import COLUMNS, TableRow, row_from_cells, row_to_line
+from gateway.records import FusionState, NodeStatus
 
 FORMAT_LINE: Final = "# mavgate table 1"
 HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
 MARK_PREFIX: Final = "# mark: "
+NODE_PREFIX: Final = "# node: "
 
 MAX_LINE: Final = 1 << 20
 """Longer than any settings; a disk's zeros without a line's end must not fill the memory."""
@@ -67,7 +70,7 @@ class TableFault:
     reason: str
 
 
-TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState
+TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
 """A header here is one behind rows: the settings were changed."""
 
 
@@ -89,6 +92,26 @@ def encode_state(state: FusionState) -> str:
 def encode_mark(mark: TableMark) -> str:
     """Write a mark as a line of its own."""
     return f"{MARK_PREFIX}{msgspec.json.encode(mark).decode()}\n"
+
+
+def encode_node(status: NodeStatus) -> str:
+    """Write a node's report as a line of its own."""
+    return f"{NODE_PREFIX}{msgspec.json.encode(status).decode()}\n"
+
+
+def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeStatus) -> str:
+    """Write anything that may stand behind the head."""
+    match event:
+        case TableRow():
+            return row_to_line(event)
+        case TableHeader():
+            return encode_header(event)
+        case FusionState():
+            return encode_state(event)
+        case TableMark():
+            return encode_mark(event)
+        case NodeStatus():
+            return encode_node(event)
 
 
 class TableReader:
@@ -120,7 +143,7 @@ class TableReader:
 
         Returns
         -------
-        list of TableRow, TableMark, TableFault, TableHeader or FusionState
+        list of TableEvent
             In the order of the file.
         """
         *lines, rest = (self._rest + data).split(b"\n")
@@ -150,9 +173,11 @@ class TableReader:
         except (ValueError, msgspec.DecodeError) as error:
             return TableFault(self.lines, size, str(error))
 
-    def _take_comment(self, text: str) -> TableMark | TableHeader | FusionState | None:
+    def _take_comment(self, text: str) -> TableMark | TableHeader | FusionState | NodeStatus | None:
         if text.startswith(MARK_PREFIX):
             return msgspec.json.decode(text.removeprefix(MARK_PREFIX), type=TableMark)
+        if text.startswith(NODE_PREFIX):
+            return msgspec.json.decode(text.removeprefix(NODE_PREFIX), type=NodeStatus)
         if text.startswith(STATE_PREFIX):
             return msgspec.json.decode(text.removeprefix(STATE_PREFIX), type=FusionState)
         if text.startswith(HEADER_PREFIX):

@@ -1,10 +1,12 @@
 """The events of one aircraft, as texts: link, nodes, GPS and what the estimator says of itself."""
 
+from collections.abc import Iterable
 from typing import Any, Final
 
 from gateway.records import LinkReport, NavFlags
 from gateway.vehicle.telemetry.events import CRITICAL, INFO, WARNING, Announcer, StatusText
 from gateway.vehicle.telemetry.health import Health
+from gateway.vehicle.telemetry.node_health import Finding
 
 FLAG_TEXTS: Final = (
     (
@@ -74,6 +76,13 @@ class Announcements:
         fixed = self._health.has_fix(now_us)
         text = StatusText(INFO, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
+
+    def on_boards(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
+        """Tell how the boards fare, where that changed."""
+        found = []
+        for one in findings:
+            found += self._announcer.track(one.topic, one.is_bad, one.text, now_us, initially=False)
+        return found
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
         """Announce the receiver's and the nodes' coming and going."""

@@ -18,6 +18,7 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.home import is_3d
 from gateway.vehicle.telemetry import fields
+from gateway.vehicle.telemetry.node_health import Finding, NodeHealth
 
 GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
 ACCEL: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -46,8 +47,9 @@ BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 class Health:
     """What was heard last of every sensor of one aircraft, and whether it is well."""
 
-    def __init__(self, vehicle_id: int, silent_s: float) -> None:
+    def __init__(self, vehicle_id: int, silent_s: float, supply_low_v: float = 0.0) -> None:
         self.vehicle_id = vehicle_id
+        self.boards = NodeHealth(vehicle_id, supply_low_v)
         self.silent_us = round(silent_s * US_PER_S)
         self.recording = False
         self._seen_us: dict[int, int] = {}
@@ -87,8 +89,8 @@ class Health:
         self._seen_us[GPS] = fix.time_us
         self._fix = fix
 
-    def on_node_status(self, status: NodeStatus) -> None:
-        """Note what a node tells of its own sensors."""
+    def on_node_status(self, status: NodeStatus) -> list[Finding]:
+        """Note what a node tells of itself; returns how its board fares."""
         failed = 0
         for bit, sensors in NODE_SENSORS:
             if status.sensors_failed & status.sensors_present & bit:
@@ -98,9 +100,10 @@ class Health:
         if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
+        return self.boards.take(status, self.node_name(status.node.node_id))
 
-    def on_link(self, report: LinkReport) -> None:
-        """Note the state of the radio links to this aircraft's nodes."""
+    def on_link(self, report: LinkReport) -> list[Finding]:
+        """Note the state of the radio links to this aircraft's nodes; returns how they fare."""
         self._nodes = tuple(
             link for link in report.nodes if link.node.vehicle_id == self.vehicle_id
         )
@@ -110,6 +113,7 @@ class Health:
         self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
         self._received, self._lost = received, lost
         self._noise_percent = report.receiver.noise_percent if report.receiver else None
+        return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
         """Return whether a sensor was heard of lately."""
@@ -161,8 +165,13 @@ class Health:
         return present, enabled, healthy
 
     def sys_status(self, now_us: int) -> Any:
-        """Encode SYS_STATUS; the battery, which nothing measures, is absent."""
+        """Encode SYS_STATUS; the boards' supplies are told by BATTERY_STATUS.
+
+        The four error counts are the nodes' bus errors, failed and repeated radio sends, and the
+        receiver's overruns.
+        """
         present, enabled, healthy = self.sensors(now_us)
+        bus, failed, retries, overruns = self.boards.error_counts()
         return mavlink.MAVLink_sys_status_message(
             present,
             enabled,
@@ -173,10 +182,10 @@ class Health:
             battery_remaining=-1,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
             errors_comm=fields.uint16(self._lost),
-            errors_count1=0,
-            errors_count2=0,
-            errors_count3=0,
-            errors_count4=0,
+            errors_count1=bus,
+            errors_count2=failed,
+            errors_count3=retries,
+            errors_count4=overruns,
         )
 
     def radio_status(self) -> Any:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import msgspec
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState
+from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState, NodeStatus
 from gateway.vehicle.home import Home, is_good_enough, place_of
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
@@ -65,6 +65,7 @@ class Telemetry:
         self._fix: GpsFix | None = None
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
+        self._batteries: dict[int, Stream] = {}
         self._unix_offset_us: int | None = None
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
         self._builders: dict[int, Builder] = {
@@ -84,6 +85,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
         }
         self._timed = [*TIMED_MESSAGES]
         self._take_added()
@@ -159,6 +161,15 @@ class Telemetry:
             if self.home is None:
                 found += self.set_home(Home(place_of(fix), fix.time_us))
         return found
+
+    def on_node_status(self, status: NodeStatus) -> list[Any]:
+        """Tell a node's supply with its report, if that is due."""
+        common_us = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS].interval_us
+        stream = self._batteries.setdefault(status.node.node_id, Stream(common_us))
+        if stream.interval_us != common_us:
+            stream.change(common_us)
+        message = self.health.boards.battery(status) if stream.offer(status.time_us) else None
+        return [] if message is None else [message]
 
     def set_home(self, home: Home) -> list[Any]:
         """Take on a home, and tell it at once."""

@@ -12,8 +12,10 @@ from gateway.flightlog.table.table import (
     TableMark,
     TableReader,
     encode_head,
+    encode_line,
     encode_mark,
 )
+from gateway.records import NodeId, NodeStatus
 from tests.flightlog.samples import make_flight
 
 HEADER = TableHeader(
@@ -56,6 +58,13 @@ def test_marks_stand_between_rows() -> None:
     mark = TableMark(1234, 'over the "gate", # 2')
     data = make_table(rows[:1]) + encode_mark(mark).encode() + row_to_line(rows[1]).encode()
     assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
+
+
+def test_what_a_node_told_of_itself_stands_between_rows() -> None:
+    rows = make_rows(2, 4)
+    status = NodeStatus(5, NodeId(3, 1), 4, (1, 2), 1, 8, 0, 3, 2, 1, 900, 5, 3290)
+    data = "".join(map(encode_line, [rows[0], status, rows[1]]))
+    assert repr(read(make_table([]) + data.encode())[1]) == repr([rows[0], status, rows[1]])
 
 
 def test_every_prefix_opens_and_loses_at_most_the_cut_line() -> None:

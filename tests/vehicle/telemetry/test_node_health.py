@@ -1,0 +1,157 @@
+"""How the boards fare: told when it gets worse, and in MAVLink's own fields."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus, PipeCounters, ReceiverStatus
+from gateway.vehicle.telemetry.events import INFO, WARNING
+from gateway.vehicle.telemetry.node_health import QUIET_REPORTS, NodeHealth
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from tests.vehicle.samples import decode
+
+SECOND_US = 1_000_000
+WELL = NodeStatus(
+    time_us=SECOND_US,
+    node=NodeId(1, 0),
+    node_time_us=SECOND_US,
+    firmware_version=(1, 4),
+    reset_cause=1,
+    sensors_present=0b0111,
+    sensors_failed=0,
+    bus_errors=65_534,
+    radio_failed=10,
+    radio_retries=300,
+    loop_max_us=900,
+    sample_rate_hz=100,
+    supply_mv=3300,
+)
+
+
+class Flying:
+    """A vehicle whose one node reports once a second."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.vehicle = Vehicle(VehicleSettings(**settings), 1)
+        self.status = WELL
+        self.told: list[tuple[int, str]] = []
+        self.messages = self._take()
+
+    def report(self, **changes: Any) -> list[Any]:
+        """Report once more, a second later."""
+        time_us = self.status.time_us + SECOND_US
+        changes.setdefault("node_time_us", self.status.node_time_us + SECOND_US)
+        self.status = replace(self.status, time_us=time_us, **changes)
+        return self._take()
+
+    def _take(self) -> list[Any]:
+        found = decode(self.vehicle.on_node_status(self.status, self.status.time_us))
+        self.told += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
+        return found
+
+    def link(self, overruns: int) -> None:
+        now_us = self.status.time_us
+        node = NodeLink(NodeId(1, 0), 2, 100, 0, 0, 0, 0, 100.0, now_us, 0.0)
+        pipes = (PipeCounters(0, 0, 0),) * 2 + (PipeCounters(1, 0, overruns),)
+        receiver = ReceiverStatus(now_us, now_us, 76, 4, 0, 1, pipes)
+        report = LinkReport(now_us, True, "port", 0, 0, 0, (), (node,), receiver)
+        found = decode(self.vehicle.on_link(report, now_us))
+        self.told += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
+
+
+@pytest.fixture
+def flying() -> Flying:
+    return Flying()
+
+
+def test_a_board_that_is_well_says_nothing(flying: Flying) -> None:
+    for _ in range(20):
+        flying.report()
+    assert flying.told == []
+
+
+def test_a_supply_that_sags_and_recovers(flying: Flying) -> None:
+    for supply_mv in (3000, 2980, 2960, 3050, 3090, 3000, 2990, *(3100,) * 6):
+        flying.report(supply_mv=supply_mv)
+    assert flying.told == [
+        (WARNING, "IMU node 0: supply low, 2.98 V"),
+        (INFO, "IMU node 0: supply well again, 3.10 V"),
+    ]
+
+
+def test_no_limit_and_no_measurement_tell_nothing() -> None:
+    unlimited = Flying(supply_low_v=0.0)
+    unlimited.report(supply_mv=1000)
+    blind = Flying()
+    assert not any(m.get_type() == "BATTERY_STATUS" for m in blind.report(supply_mv=0))
+    assert unlimited.told == blind.told == []
+
+
+def test_bus_errors_are_told_once_also_where_the_counter_begins_anew(flying: Flying) -> None:
+    for errors in (65_535, 0, 1, 2):
+        flying.report(bus_errors=errors)
+    assert flying.told == [(WARNING, "IMU node 0: bus errors, 65535 so far")]
+    for _ in range(QUIET_REPORTS):
+        flying.report()
+    assert flying.told[1:] == [(INFO, "IMU node 0: bus well again")]
+
+
+def test_a_radio_that_is_not_heard(flying: Flying) -> None:
+    flying.report(radio_failed=19)
+    assert flying.told == []
+    flying.report(radio_failed=42)
+    assert flying.told == [(WARNING, "IMU node 0: 23% of radio sends failed")]
+
+
+def test_a_restart_is_no_error(flying: Flying) -> None:
+    flying.report(node_time_us=5, bus_errors=0, radio_failed=0)
+    assert flying.told == []
+
+
+def test_overruns_of_the_receiver(flying: Flying) -> None:
+    # What was lost before the gateway came is no news.
+    flying.link(2)
+    flying.link(3)
+    assert flying.told == [
+        (INFO, "Receiver connected: port"),
+        (WARNING, "IMU node 0: receiver overrun, 3 so far"),
+    ]
+
+
+def test_battery_status_is_the_supply(flying: Flying) -> None:
+    (battery,) = flying.messages
+    assert (battery.id, battery.voltages[:2]) == (0, [3300, 65535])
+    assert battery.charge_state == mavlink.MAV_BATTERY_CHARGE_STATE_OK
+    low = flying.report(supply_mv=2900)[0]
+    assert low.charge_state == mavlink.MAV_BATTERY_CHARGE_STATE_LOW
+
+
+@pytest.mark.parametrize(("rate_hz", "count"), [(0.0, 0), (0.5, 5), (10.0, 10)])
+def test_it_comes_at_its_own_rate(rate_hz: float, count: int) -> None:
+    flying = Flying(rates=RateSettings(battery_status_hz=rate_hz))
+    found = [m for _ in range(10) for m in flying.report() if m.get_type() == "BATTERY_STATUS"]
+    assert len(found) == count
+
+
+def test_the_lowest_supply_answers_a_request() -> None:
+    boards = NodeHealth(1, 3.0)
+    assert boards.lowest() is None
+    boards.take(WELL, "IMU node 0")
+    boards.take(replace(WELL, node=NodeId(1, 1), supply_mv=3100), "GPS node 1")
+    assert boards.lowest().id == 1
+
+
+def test_counters_stand_in_sys_status(flying: Flying) -> None:
+    flying.link(7)
+    found = flying.vehicle.health.sys_status(flying.status.time_us)
+    counts = [getattr(found, f"errors_count{n}") for n in (1, 2, 3, 4)]
+    assert counts == [65_534, 10, 300, 7]
+
+
+def test_the_firmware_is_told_as_a_version(flying: Flying) -> None:
+    frames = decode(flying.vehicle.introduction()[:1])
+    (version,) = (m for m in frames if m.get_type() == "AUTOPILOT_VERSION")
+    assert version.os_sw_version == 1 << 24 | 4 << 16
