@@ -259,7 +259,8 @@ class Vehicle:
 
     def introduction(self) -> list[Action]:
         """Encode what a ground station's start asks for, whoever asks: version and parameters."""
-        known = [identity.autopilot_version(self.system_id), identity.protocol_version()]
+        asked = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, MAVLINK_MSG_ID_PROTOCOL_VERSION)
+        known = [message for number in asked for message in self._build(number, 0)]
         return self._finish([*self._replies(known), *self._parameters.values()])
 
     def poll(self, now_us: int) -> list[Action]:
