@@ -46,6 +46,8 @@ from gateway.vehicle.actions import (
     SettingsChange,
 )
 from gateway.vehicle.home import Home, Place
+from gateway.vehicle.signing import SigningClock
+from gateway.vehicle.stamp_book import StampBook
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.events import WARNING, StatusText
 from gateway.vehicle.vehicle import Vehicle
@@ -89,8 +91,10 @@ class Aircraft:
         In the frames of its nodes; MAVLink system id.
     settings : AircraftSettings
         Of all stages.
-    unix_us_at_zero : int
-        Civil time at the gateway clock's zero, as well as it is known.
+    clock : SigningClock, optional
+        Civil time.
+    stamps : StampBook, optional
+        The signing stamps that were taken before.
     stored : StoredPlaces, optional
         Missions, mark and home kept of an earlier run.
     correct : callable, optional
@@ -102,7 +106,8 @@ class Aircraft:
         vehicle_id: int,
         settings: AircraftSettings,
         *,
-        unix_us_at_zero: int = 0,
+        clock: SigningClock | None = None,
+        stamps: StampBook | None = None,
         stored: StoredPlaces | None = None,
         correct: Callable[[NavState], NavState] | None = None,
     ) -> None:
@@ -116,7 +121,8 @@ class Aircraft:
             settings.vehicle,
             vehicle_id,
             sections=sections,
-            unix_us_at_zero=unix_us_at_zero,
+            clock=clock,
+            stamps=stamps,
             stored=stored,
         )
         self._chain, self._estimator = make_fusion(settings)

@@ -19,6 +19,7 @@ from gateway.config import (
 from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.disk.place_files import PlaceFiles
 from gateway.edges.disk.recorder import Recorder
+from gateway.edges.disk.stamp_file import StampFile
 from gateway.edges.hub.hub import Hub
 from gateway.edges.operator.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.operator.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
@@ -83,10 +84,8 @@ class Daemon:
         self._settings = settings
         self._read = read
         self._places = PlaceFiles(aircraft_folder(settings), self._announce_places)
-        at_zero_us = unix_time_us() - self.now_us()
-        default, places = settings.default_aircraft, self._places.load()
-        self._broken_places = dict(self._places.broken)
-        self._pipeline = Pipeline(PipelineSettings(default, aircraft, at_zero_us, places=places))
+        self._stamps = StampFile(aircraft_folder(settings))
+        self._pipeline = self._make_pipeline(aircraft)
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
             settings.hub,
@@ -113,6 +112,15 @@ class Daemon:
         self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
+
+    def _make_pipeline(self, aircraft: Mapping[int, AircraftSettings]) -> Pipeline:
+        places, stamps = self._places.load(), self._stamps.load()
+        self._broken_places = dict(self._places.broken)
+        at_zero_us = unix_time_us() - self.now_us()
+        default = self._settings.default_aircraft
+        return Pipeline(
+            PipelineSettings(default, aircraft, at_zero_us, places=places, stamps=stamps)
+        )
 
     def _make_control(self) -> ControlServer:
         control = ControlServer(socket_path("run"))
@@ -182,6 +190,7 @@ class Daemon:
         self._control.close()
         self._recorder.close()
         self._places.close()
+        self._stamps.close(self._pipeline.newest_stamps())
         self._metrics.close()
         self._hub.close()
 
@@ -239,6 +248,8 @@ class Daemon:
         frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()
         self._budget.note(client_id, now_us, trusted=incoming.trusted)
         actions = self._pipeline.handle(incoming, now_us)
+        if (stamps := self._pipeline.stamps_to_keep()) is not None:
+            self._stamps.save(stamps)
         # A ground station's broadcast comes both to us and past us; of strangers only what came to
         # something is kept.
         kept = incoming.trusted or bool(actions)

@@ -18,6 +18,7 @@ from typing import Final
 from gateway.aircraft import Action, Aircraft, AircraftSettings, with_passphrase
 from gateway.records import (
     FusionState,
+    GpsFix,
     ImuCalibrated,
     Incoming,
     LinkReport,
@@ -28,8 +29,10 @@ from gateway.units import US_PER_S
 from gateway.vehicle.home import Place
 from gateway.vehicle.reader import BAD_SIGNATURE
 from gateway.vehicle.signing import SigningClock
+from gateway.vehicle.stamp_book import StampBook, Stamps
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.events import StatusText
+from gateway.wire.gps_time import GpsTime
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import Signer
 from gateway.wire.mavlink_splitter import origin_of, restamp
@@ -52,6 +55,8 @@ class PipelineSettings:
     """Changes the states before they are told: for a playback that knows what comes."""
     places: Mapping[int, StoredPlaces] = field(default_factory=dict)
     """Missions, marks and homes kept of an earlier run, by vehicle id."""
+    stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
+    """Signing stamps kept of an earlier run, by vehicle id; see `StampBook`."""
 
 
 class Pipeline:
@@ -68,6 +73,8 @@ class Pipeline:
         self._link = Link()
         self._signer = Signer()
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
+        self._stamps = {key: StampBook(kept) for key, kept in settings.stamps.items()}
+        self._gps_time = GpsTime()
         self._connected = False
         self._port = ""
         self._report_due_us = 0
@@ -87,6 +94,11 @@ class Pipeline:
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Take one raw record, from the link or from a recording."""
+        if isinstance(record, GpsFix) and record.utc_us is not None:
+            vehicle_id = record.node.vehicle_id
+            at_zero_us = self._gps_time.hear(vehicle_id, record.utc_us, record.time_us)
+            if at_zero_us is not None:
+                self._signing_clock.hear_gps(at_zero_us)
         is_new = record.node.vehicle_id not in self.aircraft
         self._heard_us[record.node.vehicle_id] = now_us
         aircraft = self._aircraft_of(record.node.vehicle_id)
@@ -106,7 +118,8 @@ class Pipeline:
         return Aircraft(
             vehicle_id,
             known.aircraft.get(vehicle_id, known.default),
-            unix_us_at_zero=known.unix_us_at_zero,
+            clock=self._signing_clock,
+            stamps=self._stamps.setdefault(vehicle_id, StampBook()),
             stored=known.places.get(vehicle_id),
             correct=known.correct,
         )
@@ -155,6 +168,16 @@ class Pipeline:
         for each in self._ever():
             actions += each.sign_by(own.get(each.vehicle_id, common), now_us)
         return actions
+
+    def stamps_to_keep(self) -> dict[int, Stamps] | None:
+        """Return the signing stamps of all aircraft if they must be written now."""
+        if not any(book.is_due for book in self._stamps.values()):
+            return None
+        return {key: book.to_keep() for key, book in self._stamps.items()}
+
+    def newest_stamps(self) -> dict[int, Stamps]:
+        """Return the signing stamps of all aircraft, for an orderly end."""
+        return {key: found for key, book in self._stamps.items() if (found := book.exact())}
 
     def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
         """Give a frame of ours that leaves its number, and a signature if its aircraft signs."""

@@ -7,8 +7,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
+from gateway.edges.clock import unix_time_us
 from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
+from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
+from gateway.vehicle.vehicle_settings import VehicleSettings
 
 PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
@@ -22,6 +25,30 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
     made = Daemon(settings, {}, lambda: settings)
     made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
     return made
+
+
+def signing_daemon(folder: Path) -> Daemon:
+    vehicle = VehicleSettings(signing_passphrase="correct horse")
+    settings = GatewaySettings(aircraft_folder=str(folder), vehicle=vehicle)
+    made = Daemon(settings, {}, lambda: settings)
+    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
+    return made
+
+
+@pytest.mark.parametrize("orderly", [True, False])
+def test_a_signed_frame_is_taken_once_whatever_restarts(tmp_path: Path, orderly: bool) -> None:
+    mav = mavlink.MAVLink(None, 255, 190)
+    mav.signing.secret_key = key_from_passphrase("correct horse")
+    mav.signing.sign_outgoing = True
+    mav.signing.timestamp = (unix_time_us() - EPOCH_2015_US) // 10
+    signed = Incoming(5, bytes(PING.pack(mav)), True)
+    first = signing_daemon(tmp_path)
+    first._on_frame(signed)
+    first._stamps.close(first._pipeline.newest_stamps() if orderly else {})
+    assert first._pipeline.forged == 0
+    second = signing_daemon(tmp_path)
+    second._on_frame(signed)
+    assert second._pipeline.forged == 1
 
 
 @pytest.fixture

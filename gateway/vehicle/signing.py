@@ -17,13 +17,14 @@ import hashlib
 import hmac
 from typing import Final
 
+from gateway.vehicle.stamp_book import StampBook, mark_of
+
 SIGNATURE_BYTES: Final = 13
 KEY_BYTES: Final = 32
 EPOCH_2015_US: Final = 1_420_070_400_000_000
 TICK_US: Final = 10
 NEW_STREAM_TICKS: Final = 60_000_000 // TICK_US
-MAX_STREAMS: Final = 256
-"""Only holders of the key make streams, so this is never reached by strangers."""
+GPS_TOLERANCE_US: Final = 2_000_000
 
 
 def key_from_passphrase(passphrase: str) -> bytes:
@@ -43,23 +44,40 @@ class SigningClock:
     def __init__(self, unix_us_at_zero: int) -> None:
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
+    def hear_gps(self, unix_us_at_zero: int) -> None:
+        """Take the time that GPS tells, where the machine's differs by more than the latency."""
+        offset_us = unix_us_at_zero - EPOCH_2015_US
+        if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
+            self._offset_us = offset_us
+
     def stamp(self, now_us: int) -> int:
         """Return the time in signing ticks."""
         return max(0, self._offset_us + now_us) // TICK_US
 
 
 class Verifier:
-    """Check the signatures of frames that clients send."""
+    """Check the signatures of frames that clients send.
 
-    def __init__(self, key: bytes, clock: SigningClock) -> None:
+    Parameters
+    ----------
+    key : bytes
+        32 bytes.
+    clock : SigningClock
+        Of the gateway.
+    book : StampBook, optional
+        What was taken before; notes what is taken from here on.
+    """
+
+    def __init__(self, key: bytes, clock: SigningClock, book: StampBook | None = None) -> None:
         if len(key) != KEY_BYTES:
             raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
         self._key = key
+        self._mark = mark_of(key)
         self._clock = clock
-        self._newest: dict[tuple[int, int, int], int] = {}
+        self._book = StampBook() if book is None else book
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
-        """Return whether a whole frame is signed by a holder of the key, and not a replay.
+        """Tell whether a whole frame is signed by a holder of the key, and not a replay.
 
         Parameters
         ----------
@@ -78,13 +96,13 @@ class Verifier:
             return False
         stream = (frame[-SIGNATURE_BYTES], frame[5], frame[6])
         stamp = int.from_bytes(frame[-12:-6], "little")
-        newest = self._newest.get(stream)
+        newest = self._book.newest(self._mark, stream)
         if newest is None:
             if stamp < self._clock.stamp(now_us) - NEW_STREAM_TICKS:
                 return False
-            if len(self._newest) >= MAX_STREAMS:
+            if not self._book.has_room(self._mark):
                 return False
         elif stamp <= newest:
             return False
-        self._newest[stream] = stamp
+        self._book.note(self._mark, stream, stamp)
         return True

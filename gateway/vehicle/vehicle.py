@@ -39,6 +39,7 @@ from gateway.vehicle.services.parameters.parameters import ParameterTable
 from gateway.vehicle.services.recording import RecordingService
 from gateway.vehicle.services.timing import TimingService
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
+from gateway.vehicle.stamp_book import StampBook
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.announcements import Announcements
 from gateway.vehicle.telemetry.events import INFO, NOTICE, Announcer, StatusText
@@ -88,7 +89,8 @@ class Vehicle:
         vehicle_id: int | None = None,
         *,
         sections: Mapping[str, Settings] | None = None,
-        unix_us_at_zero: int = 0,
+        clock: SigningClock | None = None,
+        stamps: StampBook | None = None,
         stored: StoredPlaces | None = None,
     ) -> None:
         """Begin with nothing known.
@@ -104,8 +106,10 @@ class Vehicle:
         sections : mapping of str to Settings, optional
             Other settings of this aircraft that ground stations may change as parameters, by the
             key under which the change comes back.
-        unix_us_at_zero : int, optional
-            Unix time when the gateway clock was zero; needed for signing only.
+        clock : SigningClock, optional
+            Civil time; needed for signing only.
+        stamps : StampBook, optional
+            The signing stamps that were taken before.
         stored : StoredPlaces, optional
             What was kept of an earlier run.
         """
@@ -115,7 +119,8 @@ class Vehicle:
         """Requests to change something that were refused."""
         self.health = Health(self.vehicle_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
-        self._clock = SigningClock(unix_us_at_zero)
+        self._clock = clock or SigningClock(0)
+        self._stamps = stamps or StampBook()
         self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
         self.signing_key: bytes | None = None
@@ -335,7 +340,7 @@ class Vehicle:
         if key == self.signing_key:
             return
         self.signing_key = key
-        self._reader.verifier = Verifier(key, self._clock) if key else None
+        self._reader.verifier = Verifier(key, self._clock, self._stamps) if key else None
 
     def _replies(self, messages: Iterable[Any]) -> list[Answer]:
         return [Reply(message) for message in messages]

@@ -8,11 +8,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.vehicle.signing import (
     EPOCH_2015_US,
     KEY_BYTES,
-    MAX_STREAMS,
     SigningClock,
     Verifier,
     key_from_passphrase,
 )
+from gateway.vehicle.stamp_book import MAX_KEYS, MAX_STREAMS, RESERVE_TICKS, StampBook
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
@@ -30,7 +30,7 @@ def ticks(unix_us: int) -> int:
 @pytest.fixture
 def vehicle() -> Vehicle:
     settings = VehicleSettings(signing_passphrase="correct horse")
-    return Vehicle(settings, 1, unix_us_at_zero=NOW_UNIX_US)
+    return Vehicle(settings, 1, clock=SigningClock(NOW_UNIX_US))
 
 
 def sign(station: GroundStation, key: bytes = KEY, at_us: int = NOW_UNIX_US) -> None:
@@ -147,3 +147,67 @@ def test_streams_are_bounded() -> None:
 def test_a_short_key_is_a_fault_of_the_caller() -> None:
     with pytest.raises(ValueError, match="31 bytes"):
         Verifier(bytes(31), SigningClock(0))
+
+
+def ping(at_us: int = NOW_UNIX_US, key: bytes = KEY) -> bytes:
+    mav = mavlink.MAVLink(None, 255, 190)
+    mav.signing.secret_key, mav.signing.sign_outgoing = key, True
+    mav.signing.timestamp = ticks(at_us)
+    return bytes(mavlink.MAVLink_ping_message(0, 0, 0, 0).pack(mav))
+
+
+@pytest.mark.parametrize("orderly", [True, False])
+def test_a_command_cannot_be_sent_again_after_a_restart(orderly: bool) -> None:
+    clock, book = SigningClock(NOW_UNIX_US), StampBook()
+    verifier, kept = Verifier(KEY, clock, book), book.to_keep()
+    taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
+    for frame in taken:
+        assert verifier.accepts(frame, 0)
+        if book.is_due:
+            kept = book.to_keep()
+    again = StampBook(book.exact() if orderly else kept)
+    verifier = Verifier(KEY, SigningClock(NOW_UNIX_US - 86_400_000_000), again)
+    assert not any(verifier.accepts(frame, 0) for frame in taken)
+    reserve_us = 0 if orderly else RESERVE_TICKS * 10
+    assert verifier.accepts(ping(NOW_UNIX_US + 10_000_000 + reserve_us), 0)
+
+
+def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
+    book = StampBook()
+    verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), book), 0
+    for n in range(600):
+        assert verifier.accepts(ping(NOW_UNIX_US + n * 100_000), 0)
+        if book.is_due:
+            written += 1
+            book.to_keep()
+    assert 12 <= written <= 13, "a minute"
+
+
+def test_another_passphrase_and_back_forgets_no_replay(station: GroundStation) -> None:
+    def change(passphrase: str) -> None:
+        settings = VehicleSettings(signing_passphrase=passphrase)
+        station.vehicle.take_settings("vehicle", settings)
+
+    sign(station)
+    frame = station.frame(SET)
+    assert changed(station.send_bytes(frame))
+    change("another horse")
+    change("correct horse")
+    assert station.send_bytes(frame) == []
+
+
+def test_a_recording_of_yesterday_is_old_once_gps_tells_the_day() -> None:
+    day_us = 86_400_000_000
+    clock = SigningClock(NOW_UNIX_US - day_us)
+    assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
+    clock.hear_gps(NOW_UNIX_US)
+    assert not Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
+    assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
+
+
+def test_keys_are_bounded_and_the_oldest_goes() -> None:
+    book = StampBook()
+    for n in range(2 * MAX_KEYS):
+        book.note(f"{n}", (0, 1, 1), n)
+    assert list(book.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
+    assert StampBook(book.to_keep()).newest(f"{MAX_KEYS}", (0, 1, 1)) == MAX_KEYS + RESERVE_TICKS
