@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "edges": FOUNDATION
     | {"wire", "vehicle", "flightlog", "routing", "simulator", "status", "output"},
     "analysis": FOUNDATION | STAGES | JOINED | {"replay", "output"},
-    "panel": FOUNDATION | STAGES | {"status", "edges", "flights"},
+    "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis"},
     "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "output"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
     "extensions": set(),

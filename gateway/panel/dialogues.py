@@ -8,19 +8,22 @@ import asyncio
 from collections.abc import Callable
 from typing import Any, Final
 
+from pymavlink.dialects.v20 import all as mavlink
+
 from gateway.edges.clock import GatewayClock
-from gateway.panel.state.calibration_run import CalibrationRun, CalibrationStep
-from gateway.panel.state.file_client import FileClient
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.parameter_client import ListState, ParameterClient
-from gateway.panel.state.parameter_meta import (
+from gateway.panel.state.dialogue.calibration_run import CalibrationRun, CalibrationStep
+from gateway.panel.state.dialogue.file_client import FileClient
+from gateway.panel.state.dialogue.parameter_client import AUTOPILOT, ListState, ParameterClient
+from gateway.panel.state.dialogue.parameter_meta import (
     GENERAL_PATHS,
     ParameterMeta,
     parameter_path,
     parse_parameters,
 )
+from gateway.panel.state.fleet_picture import FleetPicture
 
 POLL_S: Final = 0.05
+SAMPLES_US: Final = 20_000
 
 
 class Dialogue:
@@ -35,7 +38,6 @@ class Dialogue:
         """The newest one, be it over or not."""
         self.before: dict[str, float] = {}
         """All parameters as they were when it began."""
-        self._wanted: str | None = None
 
     def load(self, now_us: int) -> list[Any]:
         """Ask for the parameters and what they mean; returns what is to be sent."""
@@ -47,7 +49,21 @@ class Dialogue:
         """Begin a calibration; returns what is to be sent."""
         self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
         self.calibration = CalibrationRun(self.parameters.system_id, step, now_us)
-        return [self.calibration.start_message()]
+        return [*self.ask_for_samples(), self.calibration.start_message()]
+
+    def ask_for_samples(self) -> list[Any]:
+        """Have the sensors told often enough to be drawn and fused; returns what is to be sent."""
+        return [
+            mavlink.MAVLink_command_long_message(
+                self.parameters.system_id,
+                AUTOPILOT,
+                mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+                0,
+                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+                SAMPLES_US,
+                *(0.0,) * 5,
+            )
+        ]
 
     def take(self, message: Any, now_us: int) -> list[Any]:
         """Take in one message of the aircraft; returns what is to be sent."""
@@ -133,6 +149,10 @@ class Dialogues:
     def calibrate(self, system_id: int, step: CalibrationStep) -> None:
         """Begin a calibration."""
         self._send_all(self.of(system_id).calibrate(step, self._clock()))
+
+    def ask_for_samples(self, system_id: int) -> None:
+        """Have an aircraft's sensors told often enough to be fused."""
+        self._send_all(self.of(system_id).ask_for_samples())
 
     def cancel(self, system_id: int) -> None:
         """Break a calibration off."""

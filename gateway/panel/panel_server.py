@@ -30,6 +30,7 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.shell import build_page
 from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.sample_memory import SampleMemory
 from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, PanelParts
 
@@ -77,9 +78,13 @@ def run_panel(
     clock, fleet = GatewayClock(), FleetPicture()
     control = ControlClient(socket_path("run"))
     uplink = Uplink(connect, fleet, control, clock)
-    history, dialogues = FieldHistory(), Dialogues(fleet, uplink.send, clock)
+    history, samples = FieldHistory(), SampleMemory()
     fleet.listen(history.take)
-    parts = PanelParts(settings, recordings, clock, fleet, control, uplink, history, dialogues)
+    fleet.listen(samples.take)
+    dialogues = Dialogues(fleet, uplink.send, clock)
+    parts = PanelParts(
+        settings, recordings, clock, fleet, control, uplink, history, samples, dialogues
+    )
     app = make_app(parts)
     lock = PageLock(settings.password, settings.viewer_password)
     config = uvicorn.Config(

@@ -14,7 +14,13 @@ from nicegui.events import KeyEventArguments
 
 from gateway.panel.state.shown_units import ShownUnits
 from gateway.panel.view_context import PanelParts, Role, ViewContext
-from gateway.panel.views import flight_view
+from gateway.panel.views import (
+    calibration_view,
+    events_view,
+    flight_view,
+    plots_view,
+    tuning_view,
+)
 
 STATE_S: Final = 0.5
 SILENT_S: Final = 3.0
@@ -34,7 +40,13 @@ class View:
     build: Callable[[ViewContext], None]
 
 
-VIEWS: Final = (View("flight", "Flight", "flight", flight_view.build),)
+VIEWS: Final = (
+    View("flight", "Flight", "flight", flight_view.build),
+    View("calibration", "Calibration", "tune", calibration_view.build),
+    View("tuning", "Tuning", "settings", tuning_view.build),
+    View("plots", "Plots", "show_chart", plots_view.build),
+    View("events", "Events", "notifications", events_view.build),
+)
 """In the order of the rail, and of the keys 1 to 9."""
 
 
@@ -52,6 +64,7 @@ def build_page(parts: PanelParts, role: Role, version: str) -> None:
     """
     context = ViewContext(parts, role, ShownUnits(parts.settings.units))
     ui.add_head_html(f'<link rel="stylesheet" href="/web/panel.css?{version}">')
+    ui.add_head_html(f'<link rel="stylesheet" href="/web/tools.css?{version}">')
     ui.add_head_html(f'<script src="/web/telemetry_bus.js?{version}"></script>')
     _Page(context).build()
 
@@ -71,6 +84,7 @@ class _Page:
         """Make everything; a view is made when it is shown first."""
         with ui.element("div").classes("shell"):
             self._build_head()
+            events_view.build_banner(self._context)
             with ui.element("nav").classes("rail").props('aria-label="Views"'):
                 for number, view in enumerate(VIEWS, 1):
                     self._build_button(view, number)

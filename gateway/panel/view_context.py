@@ -40,6 +40,7 @@ from gateway.panel.dialogues import Dialogues
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.sample_memory import SampleMemory
 from gateway.panel.state.shown_units import ShownUnits
 from gateway.panel.state.vehicle_picture import VehiclePicture
 from gateway.panel.uplink import Uplink
@@ -71,6 +72,7 @@ class PanelParts:
     control: ControlClient
     uplink: Uplink
     history: FieldHistory
+    samples: SampleMemory
     dialogues: Dialogues
 
 

@@ -186,7 +186,8 @@ class ParameterClient:
     def _decoded(self, value: float, kind: int) -> float:
         if self.bytewise:
             return decode_value(value, kind)
-        return float(str(np.float32(value)))
+        # The zero takes off the sign that a rotation's zero may have.
+        return float(str(np.float32(value))) + 0.0
 
     def _set_message(self, entry: ParameterEntry, value: float) -> Any:
         code = INTEGER_CODES.get(entry.kind) if self.bytewise else None

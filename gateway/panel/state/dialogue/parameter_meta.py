@@ -117,4 +117,4 @@ def _text(item: Mapping[str, Any], key: str) -> str:
 
 
 def _number(value: Any, otherwise: float = NAN) -> float:
-    return float(value) if isinstance(value, int | float) else otherwise
+    return float(value) + 0.0 if isinstance(value, int | float) else otherwise

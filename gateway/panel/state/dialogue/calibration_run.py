@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.sphere_cover import CELLS, seen_cells
+from gateway.panel.state.dialogue.sphere_cover import CELLS, seen_cells
 from gateway.records import NAN
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.vehicle.services.calibrator import fit_sphere

@@ -1,0 +1,166 @@
+"""The last minutes fused once more by every estimator, with the tuning of this moment.
+
+It runs in a process of its own: the page must go on meanwhile.
+"""
+
+import asyncio
+import multiprocessing
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from gateway.analysis.flight_arrays import (
+    Flight,
+    FlightTrack,
+    FusionSettings,
+    IntArray,
+    fixes_of,
+    flight_of_records,
+)
+from gateway.analysis.fusion import fuse
+from gateway.analysis.metrics import euler_rad, rms
+from gateway.estimation.select import ESTIMATORS, EstimationSettings
+from gateway.flightlog.table.autopilot import AutopilotReader
+from gateway.geometry.geodesy import radii_m
+from gateway.panel.state.field_history import FloatArray
+from gateway.panel.state.sample_memory import TimedFrames
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings
+from gateway.vehicle.services.parameters.parameters import ParameterTable
+
+LEAST_S: Final = 20.0
+"""Shorter spans tell of settling alone."""
+LEAST_HZ: Final = 20.0
+SHOWN_HZ: Final = 5.0
+
+
+class ComparisonError(ValueError):
+    """There is not enough to fuse; the text says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What one estimator makes of the last minutes."""
+
+    name: str
+    time_us: IntArray
+    """On the panel's clock."""
+    roll_deg: FloatArray
+    pitch_deg: FloatArray
+    yaw_deg: FloatArray
+    alt_amsl_m: FloatArray
+    to_fixes_m: float
+    """RMS of the horizontal distance to the GPS fixes, NaN without any."""
+
+
+def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
+    """Fuse the frames with each estimator.
+
+    Parameters
+    ----------
+    frames : list of (int, bytes)
+        Of one aircraft, with the time of each in µs.
+    parameters : mapping of str to float
+        Its parameters; those of the estimators and filters are applied, others left aside.
+
+    Returns
+    -------
+    list of Estimate
+        One of each estimator, thinned to `SHOWN_HZ`.
+
+    Raises
+    ------
+    ComparisonError
+        If the frames are too few.
+    """
+    settings = settings_of(parameters)
+    flight, zero_us = _flight_of(frames, settings)
+    found = []
+    for name in ESTIMATORS:
+        chosen = replace(settings, estimation=replace(settings.estimation, estimator=name))
+        found.append(_estimate(name, flight, fuse(flight, chosen), zero_us))
+    return found
+
+
+def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
+    """Turn MAVLink parameters back into the settings of filters and estimators.
+
+    Parameters
+    ----------
+    parameters : mapping of str to float
+        By name; what is unknown or not allowed is left at its default.
+
+    Returns
+    -------
+    FusionSettings
+    """
+    table = ParameterTable({"sensing": SensingSettings(), "estimation": EstimationSettings()})
+    for name, value in parameters.items():
+        index = table.index.get(name)
+        if index is None:
+            continue
+        try:
+            table.change(table.parameters[index], value)
+        except ValueError:
+            # Another version's idea of the range; its default is as good a guess as any.
+            continue
+    sensing, estimation = table.sections["sensing"], table.sections["estimation"]
+    assert isinstance(sensing, SensingSettings)
+    assert isinstance(estimation, EstimationSettings)
+    return FusionSettings(sensing=sensing, estimation=estimation)
+
+
+async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
+    """Do `compare` in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(pool, compare, frames, dict(parameters))
+
+
+def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:
+    reader = AutopilotReader()
+    records = [record for time_us, frame in frames for record in reader.feed(frame, time_us)]
+    try:
+        flight = flight_of_records(
+            records, NodeCalibration(), name="the last minutes", story="", fusion=settings
+        )
+    except ValueError as error:
+        raise ComparisonError("no sensor samples came yet") from error
+    if flight.duration_s < LEAST_S or flight.rate_hz < LEAST_HZ:
+        raise ComparisonError(
+            f"{flight.duration_s:.0f} s of samples at {flight.rate_hz:.0f} Hz; "
+            f"{LEAST_S:.0f} s at {LEAST_HZ:.0f} Hz are needed"
+        )
+    return flight, reader.unix_us_at_zero or 0
+
+
+def _estimate(name: str, flight: Flight, track: FlightTrack, zero_us: int) -> Estimate:
+    step = max(round(flight.rate_hz / SHOWN_HZ), 1)
+    angles = np.degrees(euler_rad(track.q_nb[::step]))
+    return Estimate(
+        name=name,
+        time_us=track.time_us[::step] + zero_us,
+        roll_deg=angles[:, 0],
+        pitch_deg=angles[:, 1],
+        yaw_deg=angles[:, 2],
+        alt_amsl_m=track.alt_amsl_m[::step],
+        to_fixes_m=_to_fixes_m(flight, track),
+    )
+
+
+def _to_fixes_m(flight: Flight, track: FlightTrack) -> float:
+    """Compare each fix with where the estimator was when it was true, once it had settled."""
+    fixes = fixes_of(flight)
+    if not len(fixes):
+        return float("nan")
+    rows = np.clip(np.searchsorted(track.time_us, fixes.valid_us), 0, len(track.time_us) - 1)
+    meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))
+    north_m = np.radians(track.lat_deg[rows] - fixes.lat_deg) * meridian
+    turned_deg = (track.lon_deg[rows] - fixes.lon_deg + 180.0) % 360.0 - 180.0
+    away_m = np.hypot(north_m, np.radians(turned_deg) * parallel)
+    return rms(away_m[flight.scored[rows]])

@@ -1,0 +1,99 @@
+"""One parameter: its name, meaning, range and default, and the field that changes it."""
+
+import math
+from typing import Any
+
+from nicegui import ui
+
+from gateway.panel.dialogues import Dialogue
+from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+from gateway.panel.view_context import NotAllowedError, ViewContext
+
+
+class ParameterRow:
+    """A row, built where it is made.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    dialogue : Dialogue
+        With the aircraft.
+    meta : ParameterMeta
+        What the parameter means.
+    """
+
+    def __init__(self, context: ViewContext, dialogue: Dialogue, meta: ParameterMeta) -> None:
+        self._context = context
+        self._meta = meta
+        self._system_id = dialogue.parameters.system_id
+        self._shown: object = None
+        self._value = dialogue.parameters.entries[meta.name].value
+        with ui.element("div").classes("parameter").props(f"data-name={meta.name}") as self._row:
+            with ui.element("div"):
+                ui.label(meta.name).classes("name")
+                ui.label(meta.short).classes("meaning").tooltip(meta.long or meta.short)
+                ui.label(_range_of(meta)).classes("range")
+                self._trouble = ui.label().classes("trouble").props("role=alert")
+            self._field = self._build_field()
+
+    def refresh(self, dialogue: Dialogue) -> None:
+        """Show what the aircraft says now."""
+        name, parameters = self._meta.name, dialogue.parameters
+        value, trouble = parameters.entries[name].value, parameters.refused.get(name, "")
+        pending = name in parameters.pending
+        if (value, trouble, pending) == self._shown:
+            return
+        self._shown = (value, trouble, pending)
+        self._trouble.set_text("waiting for the answer …" if pending else trouble)
+        self._trouble.set_visibility(bool(trouble) or pending)
+        changed = math.isfinite(self._meta.default) and not math.isclose(
+            value, self._meta.default, rel_tol=1e-6, abs_tol=1e-12
+        )
+        self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
+        if not pending:
+            self._value = value
+            self._field.set_value(value)
+
+    def _build_field(self) -> Any:
+        field: Any
+        meta, may = self._meta, self._context.may_change
+        label = f'dense outlined aria-label="{meta.name}"'
+        if meta.choices:
+            options = dict(meta.choices)
+            options.setdefault(self._value, f"{self._value:g}")
+            field = ui.select(options, value=self._value, on_change=lambda e: self._set(e.value))
+            field.props(f"{label} options-dense")
+        else:
+            field = ui.number(value=self._value, suffix=meta.unit, format="%.7g")
+            field.props(f"{label} step=any hide-bottom-space")
+            # Only what was finished is sent: not each digit on the way to it.
+            field.on("keydown.enter", lambda: self._set(field.value))
+            field.on("blur", lambda: self._set(field.value))
+        field.set_enabled(may)
+        return field
+
+    def _set(self, value: float | None) -> None:
+        if value is None or value == self._value:
+            return
+        try:
+            self._context.check_may_change()
+            self._context.parts.dialogues.change(self._system_id, self._meta.name, float(value))
+        except (ValueError, NotAllowedError) as error:
+            ui.notify(str(error), type="negative")
+            return
+        self._shown = None
+
+
+def _range_of(meta: ParameterMeta) -> str:
+    parts = []
+    if math.isfinite(meta.low) or math.isfinite(meta.high):
+        low = f"{meta.low:g}" if math.isfinite(meta.low) else "any"
+        high = f"{meta.high:g}" if math.isfinite(meta.high) else "any"
+        parts.append(f"{low} to {high} {meta.unit}".strip())
+    elif meta.unit:
+        parts.append(meta.unit)
+    if math.isfinite(meta.default):
+        word = next((text for number, text in meta.choices if number == meta.default), None)
+        parts.append(f"default {word or f'{meta.default:g}'}")
+    return " · ".join(parts)

@@ -1,0 +1,101 @@
+"""How to lay the aircraft down, as a picture: one solid model in any attitude, drawn as SVG."""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from gateway.geometry.quaternion import from_euler, rotate
+from gateway.panel.state.field_history import FloatArray
+from gateway.records import Vec3
+
+WIDTH: Final = 140
+HEIGHT: Final = 112
+SCALE: Final = 28.0
+GROUND: Final = 96.0
+LIGHT: Final = np.array((-0.35, 0.3, -0.89))
+"""Towards the light, NED turned to the eye."""
+
+ATTITUDES: Final[dict[str, tuple[float, float]]] = {
+    "down": (0.0, 0.0),
+    "up": (180.0, 0.0),
+    "left": (-90.0, 0.0),
+    "right": (90.0, 0.0),
+    "front": (0.0, -90.0),
+    "back": (0.0, 90.0),
+}
+"""Roll and pitch in deg, by the side that lies below; see `calibration_run.SIDES`."""
+
+NAMES: Final = {
+    "down": "level",
+    "up": "upside down",
+    "left": "on its left side",
+    "right": "on its right side",
+    "front": "nose down",
+    "back": "tail down",
+}
+
+_BODY: Final = ((1.5, 0, 0), (0.5, 0.24, -0.1), (0.5, -0.24, -0.1), (0.5, 0, 0.28), (-1.2, 0, 0))
+_FACES: Final = (
+    # The hull, its nose marked by a face of its own.
+    ((_BODY[0], _BODY[1], _BODY[2]), "accent"),
+    ((_BODY[0], _BODY[3], _BODY[1]), "accent"),
+    ((_BODY[0], _BODY[2], _BODY[3]), "accent"),
+    ((_BODY[4], _BODY[2], _BODY[1]), "soft"),
+    ((_BODY[4], _BODY[1], _BODY[3]), "soft"),
+    ((_BODY[4], _BODY[3], _BODY[2]), "soft"),
+    # Wings, tailplane and fin are thin and seen from both sides.
+    (((0.45, 0, -0.04), (0.15, 1.5, -0.08), (-0.15, 1.5, -0.08), (-0.2, 0, -0.04)), "soft"),
+    (((0.45, 0, -0.04), (0.15, -1.5, -0.08), (-0.15, -1.5, -0.08), (-0.2, 0, -0.04)), "soft"),
+    (((-0.85, 0, -0.02), (-1.05, 0.55, -0.02), (-1.25, 0.55, -0.02), (-1.25, 0, -0.02)), "soft"),
+    (((-0.85, 0, -0.02), (-1.05, -0.55, -0.02), (-1.25, -0.55, -0.02), (-1.25, 0, -0.02)), "soft"),
+    (((-0.8, 0, -0.05), (-1.15, 0, -0.62), (-1.32, 0, -0.62), (-1.25, 0, 0)), "accent"),
+)
+"""Corners in body FRD, metres of a toy, and the colour's name in the style sheet."""
+
+
+def pose_svg(side: str) -> str:
+    """Draw the aircraft resting on one of its sides.
+
+    Parameters
+    ----------
+    side : str
+        Which side lies below, one of `ATTITUDES`.
+
+    Returns
+    -------
+    str
+        An SVG element, its colours those of the page.
+    """
+    roll_deg, pitch_deg = ATTITUDES[side]
+    q_nb = from_euler(math.radians(roll_deg), math.radians(pitch_deg), 0.0)
+    faces = [
+        (np.array([_to_eye(rotate(q_nb, c)) for c in corners]), ink) for corners, ink in _FACES
+    ]
+    lowest = max(float(face[:, 1].max()) for face, _ in faces)
+    faces.sort(key=lambda item: float(item[0][:, 2].mean()))
+    drawn = "".join(_polygon(face, ink, lowest) for face, ink in faces)
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="Aircraft {NAMES[side]}">'
+        f'<ellipse cx="{WIDTH / 2}" cy="{GROUND + 6}" rx="52" ry="9" fill="var(--line)"/>'
+        f"{drawn}</svg>"
+    )
+
+
+def _to_eye(place_n: Vec3) -> tuple[float, float, float]:
+    """Look from the front right and above: right, down, towards the eye."""
+    turn, down = math.radians(-145.0), math.radians(24.0)
+    x = place_n[0] * math.cos(turn) - place_n[1] * math.sin(turn)
+    y = place_n[0] * math.sin(turn) + place_n[1] * math.cos(turn)
+    z = place_n[2]
+    return (y, z * math.cos(down) - x * math.sin(down), -x * math.cos(down) - z * math.sin(down))
+
+
+def _polygon(face: FloatArray, ink: str, lowest: float) -> str:
+    normal = np.cross(face[1] - face[0], face[2] - face[0])
+    shine = abs(float(normal @ LIGHT)) / max(float(np.linalg.norm(normal)), 1e-9)
+    points = " ".join(
+        f"{WIDTH / 2 + x * SCALE:.1f},{GROUND + (y - lowest) * SCALE:.1f}" for x, y, _ in face
+    )
+    colour = f"color-mix(in srgb, var(--{ink}), var(--card) {30 + 50 * shine:.0f}%)"
+    return f'<polygon points="{points}" fill="{colour}" stroke="var(--ink)" stroke-width=".7"/>'

@@ -1,0 +1,281 @@
+"""View 5: each sensor calibrated step by step; nothing is stored without a yes."""
+
+import math
+from functools import partial
+from typing import Final
+
+from nicegui import ui
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.dialogues import Dialogue
+from gateway.panel.instruments.field_sphere import FieldSphere
+from gateway.panel.instruments.pose_picture import NAMES, pose_svg
+from gateway.panel.state.dialogue.calibration_run import (
+    SIDES,
+    CalibrationRun,
+    CalibrationStep,
+    RunState,
+)
+from gateway.panel.state.dialogue.parameter_client import ListState
+from gateway.panel.uplink import CommandFailedError
+from gateway.panel.view_context import ViewContext
+
+REFRESH_S: Final = 0.2
+STORE: Final = 1.0
+"""PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
+MIN_CELLS: Final = 60
+
+TITLES: Final = {
+    CalibrationStep.GYRO: ("Gyroscope", "360", "leave it at rest, 3 s"),
+    CalibrationStep.ACCEL: ("Accelerometer", "view_in_ar", "six positions"),
+    CalibrationStep.LEVEL: ("Level", "horizontal_rule", "as it flies, at rest, 3 s"),
+    CalibrationStep.MAG: ("Magnetometer", "explore", "turn it about all axes"),
+}
+WHAT_TO_DO: Final = {
+    CalibrationStep.GYRO: "Lay the aircraft down and do not touch it until this is done.",
+    CalibrationStep.ACCEL: "Rest it on each of its six sides in turn, for two seconds each, in any "
+    "order. A wall or a box helps; small tilts do no harm.",
+    CalibrationStep.LEVEL: "Set the aircraft as it flies straight and level, and let go of it.",
+    CalibrationStep.MAG: "Away from iron, turn it slowly about all its axes, upside down too, "
+    "until the sphere is covered.",
+}
+
+
+def build(context: ViewContext) -> None:
+    """Build the view."""
+    _CalibrationView(context).build()
+
+
+class _CalibrationView:
+    """The steps on the left, the guide to one of them on the right."""
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._step = CalibrationStep.GYRO
+        self._drawn: object = None
+        self._told: dict[CalibrationStep, tuple[str, str]] = {}
+
+    def build(self) -> None:
+        with ui.element("div").classes("calibration"):
+            self._steps = ui.element("div").classes("steps")
+            self._guide = ui.element("div").classes("card guide")
+        self._context.on_select(self._on_select)
+        self._context.every(REFRESH_S, self._refresh)
+        self._refresh()
+
+    @property
+    def _dialogue(self) -> Dialogue | None:
+        system_id = self._context.system_id
+        return None if system_id is None else self._context.parts.dialogues.of(system_id)
+
+    def _run(self) -> CalibrationRun | None:
+        """Return the newest calibration, if it is of the step that is shown."""
+        dialogue = self._dialogue
+        run = None if dialogue is None else dialogue.calibration
+        return run if run is not None and run.step is self._step else None
+
+    def _on_select(self) -> None:
+        self._told.clear()
+        self._drawn = None
+        self._refresh()
+
+    def _refresh(self) -> None:
+        """Draw anew what changed in kind; only move what changed in number."""
+        if self._context.system_id is not None:
+            self._context.parts.dialogues.load(self._context.system_id)
+        run, dialogue = self._run(), self._dialogue
+        if run is not None and run.state.is_over:
+            done = run.state is RunState.DONE
+            self._told[run.step] = ("done", "good") if done else ("failed", "bad")
+        ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
+        state = (self._step, run, run and run.state, ready, dict(self._told))
+        if state != self._drawn:
+            self._drawn = state
+            self._build_steps()
+            self._build_guide(run, ready=ready)
+        if run is not None:
+            self._move(run)
+
+    def _build_steps(self) -> None:
+        self._steps.clear()
+        with self._steps:
+            for step, (title, icon, short) in TITLES.items():
+                told, look = self._told.get(step, ("", ""))
+                card = (
+                    ui.element("button").classes("card step").on("click", partial(self._show, step))
+                )
+                if step is self._step:
+                    card.props("aria-current=step")
+                with card:
+                    ui.icon(icon)
+                    ui.html(f"<b>{title}</b>", sanitize=False)
+                    ui.label(told).classes(f"state {look}")
+                    ui.label(short).classes("soft")
+
+    def _show(self, step: CalibrationStep) -> None:
+        run = self._dialogue.calibration if self._dialogue else None
+        if run is not None and not run.state.is_over and step is not run.step:
+            ui.notify(f"{TITLES[run.step][0]}: cancel it first", type="warning")
+            return
+        self._step = step
+        self._refresh()
+
+    def _build_guide(self, run: CalibrationRun | None, *, ready: bool) -> None:
+        self._guide.clear()
+        with self._guide:
+            ui.html(f"<h2>{TITLES[self._step][0]}</h2>", sanitize=False)
+            self._now = ui.label(self._what_now(run, ready=ready)).classes("now")
+            if run is not None and run.state.is_over:
+                self._now.classes("good" if run.state is RunState.DONE else "bad")
+            self._progress = ui.linear_progress(0.0, show_value=False)
+            self._progress.props('aria-label="Progress" instant-feedback')
+            self._progress.set_visibility(run is not None and not run.state.is_over)
+            if self._step is CalibrationStep.ACCEL:
+                self._build_poses()
+            if self._step is CalibrationStep.MAG:
+                self._build_cloud()
+            self._build_buttons(run, ready=ready)
+            if run is not None and run.state is RunState.DONE:
+                self._build_residuals(run)
+
+    def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
+        if self._context.vehicle is None:
+            return "No aircraft is heard."
+        if run is None or run.state is RunState.ASKED:
+            waits = "" if ready else " Reading the parameters first, so that it can be undone …"
+            return WHAT_TO_DO[self._step] + waits
+        if run.state is RunState.FAILED:
+            return f"Not calibrated: {run.trouble}. Nothing has changed; try again."
+        if run.state is RunState.CHECKING:
+            return "Done. Measuring what is left; leave it as it is for a moment."
+        if run.state is RunState.DONE:
+            return "Calibrated, and in use until the gateway ends. Keep it for good?"
+        return WHAT_TO_DO[self._step]
+
+    def _build_poses(self) -> None:
+        self._poses = {}
+        with ui.element("div").classes("poses"):
+            for side in SIDES:
+                with ui.element("div").classes("pose").props(f"data-side={side}") as pose:
+                    ui.html(pose_svg(side), sanitize=False)
+                    ui.label(NAMES[side])
+                    state = ui.label("still to do").classes("state")
+                self._poses[side] = (pose, state)
+
+    def _build_cloud(self) -> None:
+        self._sent = -1
+        with ui.element("div").classes("cloud"):
+            self._sphere = FieldSphere()
+            self._figures = ui.html("", sanitize=False)
+
+    def _build_buttons(self, run: CalibrationRun | None, *, ready: bool) -> None:
+        may = self._context.may_change and self._context.vehicle is not None
+        with ui.element("div").classes("buttons"):
+            if run is not None and not run.state.is_over:
+                ui.button("Cancel", on_click=self._cancel).props("no-caps unelevated").classes(
+                    "quiet"
+                )
+                return
+            if run is not None and run.state is RunState.DONE:
+                ui.button("Store it", icon="save", on_click=self._store).props("no-caps unelevated")
+                undo = ui.button("Undo it", icon="undo", on_click=self._undo)
+                undo.props("no-caps unelevated").classes("quiet")
+            again = run is not None
+            start = ui.button(
+                "Again" if again else "Start", icon="play_arrow", on_click=self._start
+            )
+            start.props("no-caps unelevated").classes("quiet" if again else "")
+            start.set_enabled(may and ready)
+
+    def _build_residuals(self, run: CalibrationRun) -> None:
+        found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
+        found += [(name, old, new) for name, (old, new) in self._changes().items()]
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{_figure(old)}</td><td>{_figure(new)}</td></tr>"
+            for name, old, new in found
+        )
+        head = "<tr><th></th><th>before</th><th>after</th></tr>"
+        ui.html(f'<table class="residuals">{head}{rows}</table>', sanitize=False)
+
+    def _changes(self) -> dict[str, tuple[float, float]]:
+        """Tell the parameters that the calibration changed."""
+        dialogue = self._dialogue
+        if dialogue is None:
+            return {}
+        entries = dialogue.parameters.entries
+        return {
+            name: (old, entries[name].value)
+            for name, old in dialogue.before.items()
+            if name in entries and entries[name].value != old
+        }
+
+    def _move(self, run: CalibrationRun) -> None:
+        self._progress.set_value(run.progress / 100.0)
+        if run.step is CalibrationStep.ACCEL:
+            for side, (pose, state) in self._poses.items():
+                done = side in run.sides_done
+                now = side == run.side_now and not done and run.state is RunState.RUNNING
+                look = "done" if done else "now" if now else ""
+                pose.classes(replace=f"pose {look}".strip())
+                state.set_text("done ✓" if done else "hold still …" if now else "still to do")
+        if run.step is CalibrationStep.MAG:
+            self._move_cloud(run)
+
+    def _move_cloud(self, run: CalibrationRun) -> None:
+        points = run.field_points
+        if len(points) == self._sent:
+            return
+        self._sent = len(points)
+        (x, y, z), radius = run.sphere()
+        seen = run.cover()
+        if len(points) and math.isfinite(radius) and radius > 0.0:
+            self._sphere.show((points - (x, y, z)) / radius, seen)
+        left = len(seen) - sum(seen)
+        enough = "well covered" if sum(seen) >= MIN_CELLS else f"{left} directions uncovered"
+        self._figures.set_content(
+            f'<dl class="figures"><dt>Samples</dt><dd>{len(points)}</dd>'
+            f"<dt>Directions seen</dt><dd>{sum(seen)} of {len(seen)}, {enough}</dd>"
+            f"<dt>Centre (hard iron)</dt><dd>{x:.1f}, {y:.1f}, {z:.1f} µT</dd>"
+            f"<dt>Strength</dt><dd>{radius:.1f} µT</dd></dl>"
+        )
+
+    async def _start(self) -> None:
+        context, system_id = self._context, self._context.system_id
+        context.check_may_change()
+        if system_id is None:
+            return
+        context.parts.dialogues.calibrate(system_id, self._step)
+        self._refresh()
+
+    async def _cancel(self) -> None:
+        self._context.check_may_change()
+        self._context.parts.dialogues.cancel(self._context.system_id or 0)
+
+    async def _store(self) -> None:
+        """Write it to the vehicle's storage: this button is the yes."""
+        try:
+            await self._context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE)
+        except CommandFailedError as error:
+            ui.notify(f"Not stored: {error}", type="negative")
+            return
+        ui.notify(f"{TITLES[self._step][0]}: stored", type="positive")
+        self._end()
+
+    async def _undo(self) -> None:
+        self._context.check_may_change()
+        for name, (old, _) in self._changes().items():
+            self._context.parts.dialogues.change(self._context.system_id or 0, name, old)
+        self._told.pop(self._step, None)
+        ui.notify(f"{TITLES[self._step][0]}: as it was before", type="info")
+        self._end(told=False)
+
+    def _end(self, *, told: bool = True) -> None:
+        if self._dialogue is not None:
+            self._dialogue.calibration = None
+        if told:
+            self._told[self._step] = ("stored", "good")
+        self._refresh()
+
+
+def _figure(value: float) -> str:
+    return "—" if not math.isfinite(value) else f"{value:.4g}"

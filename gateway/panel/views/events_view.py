@@ -1,0 +1,126 @@
+"""View 8: what the aircraft says in words, with time and severity; and the page's banners."""
+
+import html
+from datetime import datetime
+from typing import Any, Final
+
+from nicegui import ui
+
+from gateway.edges.clock import unix_time_us
+from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
+from gateway.panel.state.status_texts import TimedText
+from gateway.panel.view_context import ViewContext
+
+REFRESH_S: Final = 0.5
+SEVERITIES: Final = (
+    "Emergency", "Alert", "Critical", "Error", "Warning", "Notice", "Info", "Debug",
+)  # fmt: skip
+"""By MAV_SEVERITY."""
+SHOWN: Final = {7: "everything", 5: "notice and graver", 4: "warning and graver", 2: "critical"}
+LOOKS: Final = ("bad", "bad", "bad", "bad", "warn", "info", "info", "soft")
+ICONS: Final = {"bad": "error", "warn": "warning", "info": "info", "soft": "bug_report"}
+"""Each kind has a sign of its own, for colour alone tells nothing to many."""
+
+
+def build(context: ViewContext) -> None:
+    """Build the view."""
+    _EventsView(context).build()
+
+
+def build_banner(context: ViewContext) -> None:
+    """Build the banners of what must not be missed; shown above every view."""
+    shown: list[Alert] = []
+    place = ui.element("div").classes("banners").props('role=alert aria-live="assertive"')
+
+    def refresh() -> None:
+        nonlocal shown
+        vehicle = context.vehicle
+        alerts = [] if vehicle is None else alerts_of(vehicle, context.now_us)
+        if alerts == shown:
+            return
+        shown = alerts
+        place.clear()
+        with place:
+            for alert in alerts:
+                _build_alert(alert)
+
+    ui.timer(REFRESH_S, refresh)
+
+
+def _build_alert(alert: Alert) -> None:
+    grave = alert.level is AlertLevel.CRITICAL
+    with ui.element("div").classes("banner bad" if grave else "banner warn"):
+        ui.icon("report" if grave else "warning")
+        ui.label(alert.title).classes("banner-title")
+        ui.label(alert.detail)
+
+
+class _EventsView:
+    """The log of one page."""
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._drawn: object = None
+
+    def build(self) -> None:
+        with ui.element("div").classes("tools"):
+            self._least = ui.select(SHOWN, value=7, on_change=self._refresh)
+            self._least.props('dense outlined options-dense aria-label="Severity"')
+            self._search = ui.input(placeholder="Search", on_change=self._refresh)
+            self._search.props('dense outlined clearable aria-label="Search in the texts"')
+            ui.element("div").classes("spring")
+            save = ui.button("Save as CSV", icon="table_view", on_click=self._save)
+            save.props("flat dense no-caps")
+        self._table = ui.html("", sanitize=False).classes("card events")
+        self._context.on_select(self._refresh)
+        self._context.every(REFRESH_S, self._refresh)
+        self._refresh()
+
+    def _chosen(self) -> list[TimedText]:
+        vehicle = self._context.vehicle
+        if vehicle is None:
+            return []
+        wanted = (self._search.value or "").casefold()
+        return [
+            text
+            for text in reversed(vehicle.texts.all)
+            if text.severity <= self._least.value and wanted in text.text.casefold()
+        ]
+
+    def _refresh(self, _: Any = None) -> None:
+        texts = self._chosen()
+        state = (self._context.system_id, [(text.number, len(text.text)) for text in texts])
+        if state == self._drawn:
+            return
+        self._drawn = state
+        rows = "".join(_row(text, self._when(text)) for text in texts)
+        empty = "" if rows else '<p class="empty">Nothing was said yet.</p>'
+        self._table.set_content(
+            '<table><thead><tr><th scope="col">Time</th><th scope="col">Severity</th>'
+            f'<th scope="col">Text</th></tr></thead><tbody>{rows}</tbody></table>{empty}'
+        )
+
+    def _when(self, text: TimedText) -> datetime:
+        unix_us = unix_time_us() - self._context.now_us + text.time_us
+        return datetime.fromtimestamp(unix_us / 1e6).astimezone()
+
+    def _save(self) -> None:
+        lines = ["time,severity,text"]
+        for text in reversed(self._chosen()):
+            quoted = text.text.replace('"', '""')
+            when = self._when(text).isoformat(timespec="milliseconds")
+            lines.append(f'{when},{_severity(text)},"{quoted}"')
+        ui.download.content("\n".join(lines) + "\n", "events.csv", "text/csv")
+
+
+def _severity(text: TimedText) -> str:
+    return SEVERITIES[min(max(text.severity, 0), len(SEVERITIES) - 1)]
+
+
+def _row(text: TimedText, when: datetime) -> str:
+    look = LOOKS[min(max(text.severity, 0), len(LOOKS) - 1)]
+    return (
+        f'<tr class="{look}"><td class="number">{when:%H:%M:%S}</td>'
+        f'<td><i class="q-icon material-icons" aria-hidden="true">{ICONS[look]}</i>'
+        f" {_severity(text)}</td><td>{html.escape(text.text)}</td></tr>"
+    )
