@@ -40,7 +40,7 @@ from gateway.records import (
     Outgoing,
 )
 from gateway.replay import header_for
-from gateway.simulator.receiver import TimedFrame
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings

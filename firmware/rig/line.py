@@ -6,8 +6,8 @@ from firmware.rig.boards import Setup
 from firmware.rig.build import build
 from firmware.rig.flight import FlightWorld
 from firmware.rig.tracker import Tracker
-from gateway.simulator.receiver import TimedFrame
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 
 
 def frames(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:

@@ -6,7 +6,7 @@ from typing import Final
 
 from firmware.rig.bench import PS_PER_S
 from firmware.rig.boards import Board, GpsNode, ImuNode, Receiver, Setup
-from gateway.simulator.receiver import TimedFrame
+from gateway.simulator.timed_frame import TimedFrame
 
 IMU_CLOCK_PPM: Final = 40.0
 GPS_CLOCK_PPM: Final = -30.0

@@ -22,6 +22,7 @@ from gateway.simulator.flight import START_UNIX_US, SimulatedAircraft
 from gateway.simulator.node import Node, Sent, nodes_of
 from gateway.simulator.samplers import Chance, DeviceClock, generator
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import encode_frame
 from gateway.wire.payloads import (
     PIPES,
@@ -60,17 +61,6 @@ POWER_ON: Final = 1
 UINT8: Final = 1 << 8
 UINT16: Final = 1 << 16
 UINT32: Final = 1 << 32
-
-
-@dataclass(frozen=True, slots=True)
-class TimedFrame:
-    """The bytes of one serial frame, delimiter included."""
-
-    time_s: float
-    """True time since the start at which its last bit leaves the receiver; never goes back."""
-    data: bytes
-    damaged: int = 0
-    """How many of its bytes are not what the receiver sent."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.cli.support.warm_up import compile_everything
+from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.routing.hub_settings import HubSettings
@@ -80,7 +80,7 @@ async def run(folder: Path, use: Callable[[int], Any]) -> Any:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    compile_everything()
+    make_ready("complementary")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path
 

@@ -13,8 +13,9 @@ import pytest
 import gateway
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
 from gateway.simulator.flight import fly
-from gateway.simulator.receiver import TimedFrame, damage, simulate
+from gateway.simulator.receiver import damage, simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame
 from gateway.wire.link import Link
 from gateway.wire.payloads import RadioFrame, ReceiverStatusFrame, decode_content

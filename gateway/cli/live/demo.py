@@ -26,15 +26,16 @@ from gateway.cli.support.settings_options import (
     load_settings,
     or_refuse,
 )
-from gateway.cli.support.warm_up import compile_everything
+from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.edges.disk.tracker_csv import FlightFileError, read_flight
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.receiver import TimedFrame, simulate
+from gateway.simulator.receiver import simulate
 from gateway.simulator.recorded import replay
+from gateway.simulator.timed_frame import TimedFrame
 
 
 def register(app: typer.Typer) -> None:
@@ -68,7 +69,7 @@ def demo(
         return with_endpoints(load_settings(config), endpoint)
 
     settings = or_refuse(read)
-    compile_everything()
+    make_ready(settings.estimation.estimator)
     try:
         if flight is not None:
             line, aircraft = recorded_line(settings, flight)

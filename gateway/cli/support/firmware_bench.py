@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from gateway.simulator.receiver import TimedFrame
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 
 CHECKOUT: Final = Path(__file__).resolve().parents[3]
 

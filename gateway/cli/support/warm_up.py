@@ -3,6 +3,7 @@
 import logging
 import signal
 import time
+from collections.abc import Iterator
 from typing import Final
 
 from gateway.aircraft import AircraftSettings
@@ -13,38 +14,40 @@ from gateway.estimation.eskf import eskf_live
 from gateway.estimation.paper import paper_kernels
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.simulator.flight import fly
-from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 
 log = logging.getLogger(__name__)
 
-REHEARSAL_S: Final = 2.0
+REHEARSAL_US: Final = 100_000
+SAMPLE_US: Final = 10_000
 STEPS: Final = (paper_kernels.step_live, complementary_live.imu_step, eskf_live.imu_step)
 
 
-def compile_everything() -> None:
-    """Let every estimator fuse two seconds of a simulated flight.
+def make_ready(estimator: str) -> None:
+    """Have the machine code of an estimator in this process, and that of all others on the disk.
 
-    The machine code is kept beside the source, so only the first call after an upgrade compiles,
-    later ones take about a second. All estimators are made ready, since a ground station may
-    choose another one in flight, when a stall would cost the horizon.
+    It is kept beside the source, so only the first start after an upgrade compiles. The others are
+    compiled too, since a ground station may choose one in flight, when the compiler would cost the
+    horizon seconds; to read one from the disk takes some hundredths of one.
+
+    Parameters
+    ----------
+    estimator : str
+        The one that the settings name.
     """
     if all(is_kept(step) for step in STEPS):
-        _rehearse_all()
+        _rehearse(estimator)
         return
     log.info("compiling the estimators, up to a minute; later starts take a second")
     begin = time.monotonic()
     if cores() > 1:
         # A process each; this one then finds the code that they have kept, or makes it itself.
         run_copies(_rehearse_apart, OWN_ESTIMATORS)
-    _rehearse_all()
-    log.info("compiled in %.0f s", time.monotonic() - begin)
-
-
-def _rehearse_all() -> None:
-    """Fuse with every estimator in this process."""
     for name in OWN_ESTIMATORS:
-        _rehearse(name)
+        if name != estimator:
+            _rehearse(name)
+    _rehearse(estimator)
+    log.info("compiled in %.0f s", time.monotonic() - begin)
 
 
 def _rehearse_apart(name: str) -> None:
@@ -54,8 +57,47 @@ def _rehearse_apart(name: str) -> None:
 
 
 def _rehearse(name: str) -> None:
-    flight = fly(SimulatorSettings(gps_first_fix_s=0.0), duration_s=REHEARSAL_S)
     settings = AircraftSettings(estimation=EstimationSettings(estimator=name))
     pipeline = Pipeline(PipelineSettings(settings))
-    for record in flight.records():
+    for record in _at_rest():
         pipeline.take(record, record.time_us)
+
+
+def _at_rest() -> Iterator[ImuRaw | BaroRaw | GpsFix]:
+    """Yield a fifth of a second of a node that lies still: each kind of record there is."""
+    node = NodeId(1, 1)
+    for time_us in range(REHEARSAL_US, 3 * REHEARSAL_US, SAMPLE_US):
+        yield ImuRaw(
+            time_us=time_us,
+            node=node,
+            node_time_us=time_us,
+            accel_raw=(0, 0, -4096),
+            gyro_raw=(0, 0, 0),
+            mag_raw=(230, 0, 440),
+            temperature_raw=0,
+            accel_range_g=8,
+            gyro_range_dps=1000,
+            mag_lsb_per_gauss=1090,
+            flags=ImuFlags.MAG_NEW,
+        )
+    yield BaroRaw(time_us, node, time_us, 101_325.0, 20.0)
+    yield GpsFix(
+        time_us=time_us,
+        node=node,
+        node_time_us=time_us,
+        itow_ms=0,
+        fix_type=GpsFixType.FIX_3D,
+        fix_ok=True,
+        satellites=9,
+        lat_dege7=473_977_418,
+        lon_dege7=85_455_938,
+        alt_amsl_m=488.0,
+        vel_n_mps=(0.0, 0.0, 0.0),
+        alt_ellipsoid_m=536.0,
+        h_acc_m=2.0,
+        v_acc_m=3.0,
+        speed_acc_mps=0.3,
+        course_acc_deg=30.0,
+        pdop=1.5,
+        utc_us=None,
+    )

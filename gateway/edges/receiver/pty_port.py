@@ -10,7 +10,7 @@ import tty
 from collections.abc import Iterator
 from typing import Final
 
-from gateway.simulator.receiver import TimedFrame
+from gateway.simulator.timed_frame import TimedFrame
 
 MAX_LATE_S: Final = 1.0
 """A loop held up for longer, as by a suspended machine, goes on where it was: making up for it

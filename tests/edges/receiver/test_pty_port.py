@@ -9,7 +9,7 @@ import pytest
 import serial
 
 from gateway.edges.receiver.pty_port import PtyPort
-from gateway.simulator.receiver import TimedFrame
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import Fault, Frame, FrameDecoder, encode_frame
 
 pytestmark = pytest.mark.io

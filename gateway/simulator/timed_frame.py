@@ -1,0 +1,14 @@
+"""A frame of the simulated receiver, and when it leaves."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class TimedFrame:
+    """The bytes of one serial frame, delimiter included."""
+
+    time_s: float
+    """True time since the start at which its last bit leaves the receiver; never goes back."""
+    data: bytes
+    damaged: int = 0
+    """How many of its bytes are not what the receiver sent."""
