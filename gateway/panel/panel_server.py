@@ -23,6 +23,7 @@ from gateway.edges.operator.control_socket import socket_path
 from gateway.panel import feed
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
+from gateway.panel.doors.rest_door import RestDoor
 from gateway.panel.feed import TelemetryFeed
 from gateway.panel.page_guard import ROLE, PageGuard
 from gateway.panel.page_lock import PageLock
@@ -108,7 +109,9 @@ def run_panel(
 
 def make_app(parts: PanelParts) -> FastAPI:
     """Build the page and what it fetches."""
-    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
+    for router in RestDoor(parts.uplink).routers():
+        app.include_router(router)
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
     @app.websocket(feed.PATH)

@@ -9,6 +9,7 @@ that was started anew is found anew.
 import asyncio
 import logging
 import os
+from collections.abc import Callable
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -34,6 +35,8 @@ HEARTBEAT_S: Final = 1.0
 SILENT_US: Final = 3 * US_PER_S
 ACK_TIMEOUT_S: Final = 1.5
 ATTEMPTS: Final = 3
+MAX_SENDERS: Final = 64
+"""Programs that send through the panel under ids of their own."""
 
 LOCAL_NAME: Final = "panel"
 LOCAL_URL: Final = f"udp-listen:127.0.0.1:0?name={LOCAL_NAME}"
@@ -74,6 +77,8 @@ class Uplink:
         self._hub = Hub(
             HubSettings(endpoints=endpoints), self._on_frame, clock, on_foreign=self._on_foreign
         )
+        self._senders: dict[tuple[int, int], Any] = {}
+        self._listeners: list[Callable[[Any], None]] = []
         self._heard: bytes | None = None
         self._heard_us = -SILENT_US
         self._local = ""
@@ -101,11 +106,30 @@ class Uplink:
         """Whether anything was heard in the last seconds."""
         return self._clock() - self._heard_us < SILENT_US
 
+    def listen(self, listener: Callable[[Any], None]) -> None:
+        """Have every decoded message of anybody handed on."""
+        self._listeners.append(listener)
+
     def send(self, message: Any) -> None:
         """Send one message; whoever it is for is in its own fields."""
-        frame = message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) % 256
-        self._hub.send(Outgoing(frame, message.get_msgId()))
+        self._send(message, self._mav)
+
+    def send_as(self, message: Any, system_id: int, component_id: int) -> int:
+        """Send one message for a program that has ids of its own.
+
+        Parameters
+        ----------
+        message : MAVLink_message
+            As pymavlink makes it.
+        system_id, component_id : int
+            Who sends; system 0 is the panel itself.
+
+        Returns
+        -------
+        int
+            Bytes sent.
+        """
+        return self._send(message, self._sender(system_id, component_id))
 
     async def command(self, system_id: int, number: int, *params: float) -> None:
         """Have a command carried out, and wait until it is acknowledged.
@@ -166,6 +190,23 @@ class Uplink:
             self._acks.pop((system_id, number), None)
         raise CommandFailedError(f"{name or number}: aircraft {system_id} does not answer")
 
+    def _send(self, message: Any, mav: Any) -> int:
+        frame = message.pack(mav)
+        mav.seq = (mav.seq + 1) % 256
+        self._hub.send(Outgoing(frame, message.get_msgId()))
+        return len(frame)
+
+    def _sender(self, system_id: int, component_id: int) -> Any:
+        """Return who numbers the frames of a program that sends through us."""
+        if not system_id:
+            return self._mav
+        key = (system_id, component_id)
+        if key not in self._senders:
+            if len(self._senders) >= MAX_SENDERS:
+                self._senders.clear()
+            self._senders[key] = mavlink.MAVLink(None, *key)
+        return self._senders[key]
+
     def _on_foreign(self, frame: bytes) -> None:
         # A broadcast comes both to us and past us.
         if frame is not self._heard:
@@ -187,6 +228,8 @@ class Uplink:
         if message.get_type() == "COMMAND_ACK":
             self._note_ack(message)
         self._fleet.take(message, now_us)
+        for listener in self._listeners:
+            listener(message)
 
     def _note_ack(self, message: Any) -> None:
         waiting = self._acks.get((message.get_srcSystem(), message.command))

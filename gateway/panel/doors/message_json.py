@@ -1,0 +1,218 @@
+"""One MAVLink message as JSON and back, in the form that mavlink2rest gave it.
+
+| field of MAVLink       | JSON                                                    |
+| ---------------------- | ------------------------------------------------------- |
+| of an enum             | `{"type": "MAV_TYPE_FIXED_WING"}`                       |
+| of a bitmask           | `{"bits": 81}`                                          |
+| text (an array of char) | an array of characters, filled up with NUL              |
+| another array          | an array of numbers                                     |
+| called `type`          | is called `mavtype`; `type` is the name of the message  |
+| a number that is none  | `null`                                                  |
+
+What comes in may also name a bitmask's flags (`"A | B"`), give a bare number for an enum or a
+bitmask, and a plain text for an array of characters. A value that an enum does not know goes out as
+a number.
+
+References
+----------
+.. [1] https://github.com/mavlink/mavlink2rest
+"""
+
+import inspect
+import math
+import struct
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+CLASSES: Final = {kind.msgname: kind for kind in mavlink.mavlink_map.values()}
+NUL: Final = "\0"
+BITMASK: Final = "bitmask"
+RENAMED: Final = {"type": "mavtype"}
+INTEGERS: Final = {
+    **{f"uint{bits}_t": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
+    **{f"int{bits}_t": (-1 << bits - 1, (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)},
+}
+"""Least and greatest value by type."""
+
+
+class BadMessageError(ValueError):
+    """What was given as a message is none; the text says why."""
+
+
+def to_json(message: Any) -> dict[str, Any]:
+    """Return a decoded message's fields.
+
+    Parameters
+    ----------
+    message : MAVLink_message
+        As pymavlink decodes it.
+
+    Returns
+    -------
+    dict
+        `type` with the message's name, then the fields in the order of the definition.
+    """
+    found: dict[str, Any] = {"type": message.msgname}
+    for name, kind in zip(message.fieldnames, message.fieldtypes, strict=True):
+        found[RENAMED.get(name, name)] = _out(message, name, kind)
+    return found
+
+
+def from_json(fields: Any) -> Any:
+    """Make a message of JSON.
+
+    Parameters
+    ----------
+    fields : dict
+        As `to_json` returns it; fields that a message got later (extensions) may be missing.
+
+    Returns
+    -------
+    MAVLink_message
+        To be packed.
+
+    Raises
+    ------
+    BadMessageError
+        If it is no such message; the text names the field.
+    """
+    if not isinstance(fields, dict):
+        raise BadMessageError("a message is an object with its name under 'type'")
+    kind = class_of(fields.get("type"))
+    given: dict[str, Any] = {}
+    for name, parameter in inspect.signature(kind).parameters.items():
+        key = RENAMED.get(name, name)
+        if key in fields:
+            try:
+                given[name] = _in(kind, name, fields[key])
+            except (ValueError, TypeError, OverflowError) as error:
+                raise BadMessageError(f"{kind.msgname}.{key}: {_words(error)}") from None
+        elif parameter.default is inspect.Parameter.empty:
+            raise BadMessageError(f"{kind.msgname}.{key} is missing")
+    return kind(**given)
+
+
+def template(name: str) -> dict[str, Any]:
+    """Return a message with nothing in it, to be filled in.
+
+    Raises
+    ------
+    BadMessageError
+        If no message has this name.
+    """
+    kind = class_of(name)
+    given: dict[str, Any] = {}
+    for field, form in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        length = _length(kind, field)
+        enum = kind.fieldenums_by_name.get(field)
+        value: float = 0.0 if form in ("float", "double") else 0
+        if enum is not None and not _is_bitmask(kind, field):
+            value = next(iter(mavlink.enums[enum]))
+        given[field] = (
+            bytes(not length) if form == "char" else [value] * length if length else value
+        )
+    return to_json(kind(**given))
+
+
+def class_of(name: Any) -> Any:
+    """Return pymavlink's class of a message.
+
+    Raises
+    ------
+    BadMessageError
+        If no message has this name.
+    """
+    if not isinstance(name, str) or name not in CLASSES:
+        raise BadMessageError(f"no MAVLink message is called {name!r}")
+    return CLASSES[name]
+
+
+def _out(message: Any, name: str, kind: str) -> Any:
+    value = getattr(message, name)
+    if kind == "char":
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        length = _length(message, name)
+        return list(text.ljust(length, NUL)) if length else text
+    if isinstance(value, list | tuple):
+        return [_scalar(message, name, item) for item in value]
+    return _scalar(message, name, value)
+
+
+def _scalar(message: Any, name: str, value: int | float) -> Any:
+    enum = message.fieldenums_by_name.get(name)
+    if enum is None:
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+    if _is_bitmask(message, name):
+        return {"bits": value}
+    entry = mavlink.enums[enum].get(value)
+    return value if entry is None else {"type": entry.name}
+
+
+def _in(kind: Any, name: str, value: Any) -> Any:
+    form = kind.fieldtypes[kind.fieldnames.index(name)]
+    length = _length(kind, name)
+    if form == "char":
+        text = "".join(value) if isinstance(value, list) else value
+        if not isinstance(text, str):
+            raise BadMessageError("is a text or an array of characters")
+        data = text.rstrip(NUL).encode()
+        if len(data) > max(length, 1):
+            raise BadMessageError(f"has more than {max(length, 1)} bytes")
+        return data if length else data.ljust(1, b"\0")
+    if length:
+        if not isinstance(value, list) or len(value) != length:
+            raise BadMessageError(f"is an array of {length} numbers")
+        return [_bounded(_of_enum(kind, name, item), form) for item in value]
+    return _bounded(_of_enum(kind, name, value), form)
+
+
+def _of_enum(kind: Any, name: str, value: Any) -> Any:
+    """Return the number that a word of an enum stands for; any other value as it is."""
+    enum = kind.fieldenums_by_name.get(name)
+    if enum is None:
+        return value
+    if isinstance(value, dict):
+        value = value.get("type", value.get("bits"))
+    if not isinstance(value, str):
+        return value
+    numbers = {entry.name: number for number, entry in mavlink.enums[enum].items()}
+    bits = 0
+    for word in filter(None, (part.strip() for part in value.split("|"))):
+        if word not in numbers:
+            raise BadMessageError(f"{word!r} is none of {enum}")
+        bits |= numbers[word]
+    return bits
+
+
+def _bounded(value: Any, form: str) -> int | float:
+    if form in ("float", "double"):
+        if value is None:
+            return math.nan
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise BadMessageError(f"{value!r} is no number")
+        if form == "float":
+            struct.pack("<f", value)
+        return float(value)
+    least, greatest = INTEGERS[form]
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise BadMessageError(f"{value!r} is no whole number")
+    if not least <= value <= greatest:
+        raise BadMessageError(f"{value} is not {least} to {greatest}")
+    return value
+
+
+def _length(kind: Any, name: str) -> int:
+    """Return how many elements an array has; 0 of what is none."""
+    length: int = kind.array_lengths[kind.ordered_fieldnames.index(name)]
+    return length
+
+
+def _is_bitmask(kind: Any, name: str) -> bool:
+    return bool(kind.fielddisplays_by_name.get(name) == BITMASK)
+
+
+def _words(error: Exception) -> str:
+    return str(error.args[0]) if error.args else str(error)

@@ -1,0 +1,194 @@
+"""MAVLink for scripts and pages: REST and JSON over WebSocket, compatible with mavlink2rest.
+
+All paths are there with `/v1` before them and without. Nobody who may only look may send.
+
+References
+----------
+.. [1] https://github.com/mavlink/mavlink2rest, README and `/docs`
+"""
+
+import asyncio
+import json
+import time
+from contextlib import suppress
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import APIRouter, Request, Response
+from starlette.responses import FileResponse
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from gateway import __version__
+from gateway.panel.doors.message_book import MessageBook
+from gateway.panel.doors.message_json import CLASSES, BadMessageError, from_json, template
+from gateway.panel.doors.message_stream import Follower, MessageStream, pretty
+from gateway.panel.doors.name_filter import EVERYTHING, NameFilters
+from gateway.panel.page_guard import ROLE
+from gateway.panel.uplink import Uplink
+from gateway.panel.view_context import WEB, Role
+
+API_VERSION: Final = 0
+"""Of the answers' form, as mavlink2rest counts it."""
+DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
+MAX_ID: Final = 255
+NOT_ALLOWED: Final = "whoever may only look may not send; log in as the operator"
+WS_INVALID: Final = 1007
+
+
+class RestDoor:
+    """Answers requests out of what an uplink hears, and sends through it.
+
+    Parameters
+    ----------
+    uplink : Uplink
+        The panel's MAVLink connection.
+    """
+
+    def __init__(self, uplink: Uplink) -> None:
+        self._uplink = uplink
+        self._book = MessageBook(time.time)
+        self._stream = MessageStream()
+        self._filters: NameFilters | None = None
+        uplink.listen(self._take)
+
+    def routers(self) -> list[APIRouter]:
+        """Return what is to be included in an application."""
+        service = APIRouter(tags=["service"])
+        service.add_api_route("/info", self.info)
+        service.add_api_route("/v1/info", self.info, include_in_schema=False)
+        service.add_api_route("/docs", _docs, include_in_schema=False)
+        return [service, self._router("/v1", shown=True), self._router("", shown=False)]
+
+    async def info(self) -> Response:
+        """Return which program this is."""
+        service = {
+            "name": "mavgate",
+            "version": __version__,
+            "sha": __version__.rpartition("+")[2] or __version__,
+            "build_date": "",
+            "authors": "",
+        }
+        return _json({"version": API_VERSION, "service": service})
+
+    async def read_all(self) -> Response:
+        """Return the newest message of each kind of every system and component."""
+        return self._read("")
+
+    async def read(self, path: str) -> Response:
+        """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
+        return self._read(path)
+
+    async def helper(self, name: str) -> Response:
+        """Return an empty message of a name, to be filled in and sent."""
+        try:
+            message = template(name)
+        except ValueError:
+            return _json("Invalid message name.", HTTPStatus.NOT_FOUND)
+        return _json({"header": DEFAULT_HEADER, "message": message})
+
+    async def write(self, request: Request) -> Response:
+        """Send a message, given as `{"header": {...}, "message": {"type": "COMMAND_LONG", ...}}`.
+
+        Its header tells who sends: a system and component of one's own, 255 and 0 for a script's.
+        """
+        if request.scope[ROLE] is not Role.OPERATOR:
+            return Response(NOT_ALLOWED, HTTPStatus.FORBIDDEN)
+        try:
+            self._send(await request.body())
+        except ValueError as error:
+            text = f"Failed to parse message, not a valid MAVLinkMessage: {error}"
+            return Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+        return Response("Ok.", media_type="application/json")
+
+    async def follow(self, socket: WebSocket) -> None:
+        """Send messages as they come, of names that a regular expression finds; take others."""
+        await socket.accept()
+        if self._filters is None:
+            self._filters = NameFilters(CLASSES)
+        pattern = socket.query_params.get("filter", EVERYTHING)
+        try:
+            names = await self._filters.matching(pattern)
+        except ValueError as error:
+            await socket.send_text(pretty({"error": str(error)}))
+            await socket.close(WS_INVALID)
+            return
+        with self._stream.follow(names) as follower:
+            sending = asyncio.create_task(_send_all(socket, follower))
+            try:
+                await self._take_all(socket, follower)
+            finally:
+                sending.cancel()
+
+    def _router(self, prefix: str, *, shown: bool) -> APIRouter:
+        router = APIRouter(prefix=prefix, tags=["mavlink"])
+        for path, answer, method in (
+            ("/mavlink", self.read_all, "GET"),
+            ("/mavlink/{path:path}", self.read, "GET"),
+            ("/mavlink", self.write, "POST"),
+            ("/helper/mavlink", self.helper, "GET"),
+        ):
+            router.add_api_route(path, answer, methods=[method], include_in_schema=shown)
+        router.add_api_websocket_route("/ws/mavlink", self.follow)
+        return router
+
+    def _read(self, path: str) -> Response:
+        try:
+            return _json(self._book.look_up(path))
+        except KeyError:
+            return Response(f"No valid path: {path}", HTTPStatus.NOT_FOUND)
+
+    async def _take_all(self, socket: WebSocket, follower: Follower) -> None:
+        is_operator = socket.scope[ROLE] is Role.OPERATOR
+        with suppress(WebSocketDisconnect, KeyError):
+            while True:
+                text = await socket.receive_text()
+                follower.push(self._answer(text) if is_operator else NOT_ALLOWED)
+
+    def _answer(self, text: str) -> str:
+        try:
+            return f"Ok({self._send(text)})"
+        except ValueError as error:
+            return f"Could not convert input message: {error}"
+
+    def _send(self, text: str | bytes) -> int:
+        """Send a message and return its size; raises ValueError if it is none."""
+        try:
+            given = json.loads(text)
+        except RecursionError:
+            raise BadMessageError("it is nested too deeply") from None
+        if not isinstance(given, dict):
+            raise BadMessageError("it is an object with 'header' and 'message'")
+        message = from_json(given.get("message"))
+        system_id, component_id = _sender(given.get("header"))
+        if self._book.knows(system_id, component_id):
+            # Who is heard cannot be sent for: the gateway takes that for a loop.
+            system_id = component_id = 0
+        return self._uplink.send_as(message, system_id, component_id)
+
+    def _take(self, message: Any) -> None:
+        self._book.take(message)
+        self._stream.take(message)
+
+
+async def _send_all(socket: WebSocket, follower: Follower) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            await socket.send_text(await follower.next())
+
+
+async def _docs() -> FileResponse:
+    return FileResponse(WEB / "rest.html")
+
+
+def _sender(header: Any) -> tuple[int, int]:
+    if not isinstance(header, dict):
+        raise BadMessageError("'header' is an object with system_id, component_id and sequence")
+    ids = [header.get(key, DEFAULT_HEADER[key]) for key in ("system_id", "component_id")]
+    for value in ids:
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
+            raise BadMessageError(f"header: {value!r} is not 0 to {MAX_ID}")
+    return ids[0], ids[1]
+
+
+def _json(value: Any, status: HTTPStatus = HTTPStatus.OK) -> Response:
+    return Response(pretty(value), status, media_type="application/json")
