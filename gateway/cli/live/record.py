@@ -1,8 +1,9 @@
 """`mavgate record …`: orders to the recorder of a gateway that runs."""
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -23,8 +24,11 @@ from gateway.edges.disk.recordings import (
     list_recordings,
     rename_recording,
 )
+from gateway.flights.glance import Glance, glance
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
+
+UNKNOWN: Final = "—"
 
 group = AskingTyper(
     help="Start, stop, name, list and delete recordings.",
@@ -114,7 +118,11 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     else:
         found = list_recordings(_folder(config))
     if json:
-        print(msgspec.json.encode(found, enc_hook=str).decode())
+        listed = [
+            msgspec.structs.asdict(look) | msgspec.to_builtins(recording, enc_hook=str)
+            for recording, look in _looked_at(found)
+        ]
+        print(msgspec.json.encode(listed).decode())
     else:
         _list(found)
 
@@ -146,14 +154,31 @@ def _show(status: dict[str, Any]) -> None:
     console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free", markup=False)
 
 
+def _looked_at(recordings: list[Recording]) -> Iterator[tuple[Recording, Glance]]:
+    return ((recording, glance(recording.files)) for recording in recordings)
+
+
 def _list(recordings: list[Recording]) -> None:
-    grid = table_of("recording", "files", "MB", "last written (UTC)")
-    for recording in recordings:
+    grid = table_of("recording", "length", "vehicles", "MB", "last written (UTC)", "path")
+    for recording, look in _looked_at(recordings):
         when = datetime.fromtimestamp(recording.modified_s, UTC)
         grid.add_row(
             recording.name,
-            str(len(recording.files)),
+            UNKNOWN if look.duration_s is None else _clock(look.duration_s),
+            " ".join(map(str, look.vehicles)) or UNKNOWN,
             f"{recording.size / 1e6:.2f}",
             f"{when:%Y-%m-%d %H:%M:%S}",
+            _path(recording),
         )
     console_of().print(grid)
+
+
+def _clock(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def _path(recording: Recording) -> str:
+    """Return what a shell makes all its files of."""
+    first = str(recording.files[0])
+    return first if len(recording.files) == 1 else f"{recording.files[0].parent / recording.name}_*"

@@ -1,11 +1,12 @@
 """`mavgate convert`: recordings into one another, into tables and maps."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from gateway.cli.support.errors import refuse
+from gateway.cli.support.named_recordings import Wanted, files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -29,6 +30,9 @@ from gateway.cli.support.terminal import console_of
 from gateway.flights.reading import ReadOptions
 from gateway.flights.writing import WRITERS, FlightToWrite
 from gateway.output import write_new
+
+FROM_TLOGS: Final = (".tlog", ".kml", ".gpx")
+"""What is made of a recording's tlogs: they hold all its vehicles, and what was said."""
 
 
 def register(app: typer.Typer) -> None:
@@ -63,6 +67,9 @@ def convert(
     write = WRITERS.get(out.suffix)
     if write is None:
         refuse(f"{out}: the output must end in {', '.join(WRITERS)}")
+    with refusing():
+        wanted: Wanted = "tables" if fuse or out.suffix not in FROM_TLOGS else "tlogs"
+        files = files_of(files, recordings_folder(config), wanted)
     with progress_of(files) as advance, refusing():
         options = ReadOptions(
             current=pipeline_settings(read_settings(config)),

@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from gateway.aircraft import AircraftSettings, make_fusion
+from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -28,54 +29,32 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.estimation.columns import (
-    NAV_ALT,
-    NAV_ATTITUDE_STD,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_POS_STD,
-    NAV_QUAT,
-    NAV_VEL,
-    NAV_VEL_STD,
-)
+from gateway.estimation.columns import NAV_COLUMNS
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.select import ESTIMATORS
+from gateway.flightlog.table.row import NAV_COLUMNS as NAV_NAMES
+from gateway.flightlog.table.table import FORMAT_LINE, TableHeader, encode_header
 from gateway.flights.reading import (
     FlightError,
     ReadOptions,
     RecordedTable,
     SettingsChoice,
     aircraft_of,
+    joined_rows,
     open_rows,
 )
 from gateway.flights.refusion import SETTLES
 from gateway.output import check_output, write_new
 from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
-from gateway.replay import records_of
+from gateway.replay import header_for, records_of
 from gateway.sensing.chain import SensorChain
-from gateway.units import US_PER_S
 
 Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 HEAD_LINES: Final = 20
 
-HEADER: Final = (
-    "time_s,qw,qx,qy,qz,lat_deg,lon_deg,alt_amsl_m,vn_mps,ve_mps,vd_mps,"
-    "attitude_std_north_rad,attitude_std_east_rad,attitude_std_down_rad,"
-    "vel_std_north_mps,vel_std_east_mps,vel_std_down_mps,"
-    "pos_std_north_m,pos_std_east_m,pos_std_down_m,flags\n"
-)
-PICK: Final = [
-    *range(NAV_QUAT, NAV_QUAT + 4),
-    *range(NAV_LAT, NAV_ALT + 1),
-    *range(NAV_VEL, NAV_VEL + 3),
-    *range(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3),
-    *range(NAV_VEL_STD, NAV_VEL_STD + 3),
-    *range(NAV_POS_STD, NAV_POS_STD + 3),
-]
 LINES: Final = 2000
 """Lines that are written at once."""
 
@@ -92,7 +71,7 @@ def _known_estimator(name: str | None) -> str | None:
 
 
 def fuse_log(
-    file: Annotated[Path, typer.Argument(help="Recording or log, gzipped or not.")],
+    file: Annotated[Path, typer.Argument(help="Recording, by name or file, or log; also gzipped.")],
     *,
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write.")],
     estimator: Annotated[
@@ -112,22 +91,25 @@ def fuse_log(
 ) -> None:
     """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
 
+    The columns are those of a recording's table, so every command takes the file as one.
     Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
     ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
     Without --config, the words gps_latency_s and declination_deg of such a file's # line count.
     """
     current = read_settings(config)
-    inputs = [file, columns, config]
-    with progress_of([file]) as advance, refusing():
+    with refusing():
+        files = files_of([file], recordings_folder(config), "tables")
+    inputs = [*files, columns, config]
+    with progress_of(files) as advance, refusing():
         check_output(out, inputs, overwrite=force)
-        facts = _facts_of(file) if kind_of(file) is FileKind.FOREIGN else {}
+        facts = _facts_of(files[0]) if kind_of(files[0]) is FileKind.FOREIGN else {}
         options = ReadOptions(
             current=pipeline_settings(current),
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,
         )
-        table = open_rows(file, options)
+        table = joined_rows([open_rows(part, options) for part in files])
         aircraft = _adjusted(
             aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
         )
@@ -137,7 +119,12 @@ def fuse_log(
             time_us, states = fuse(records, chain, running)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
-        write_new(out, _lines(time_us, states), overwrite=force, inputs=inputs)
+        header = header_for(aircraft, table.header.vehicle_id)
+        known = table.header
+        header = msgspec.structs.replace(
+            header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
+        )
+        write_new(out, _lines(header, time_us, states), overwrite=force, inputs=inputs)
     name = aircraft.estimation.estimator
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 
@@ -241,22 +228,15 @@ def _adjusted(
     return msgspec.structs.replace(aircraft, estimation=estimation)
 
 
-def _lines(time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
-    """Write the rows; what is not known is left blank."""
-    yield HEADER.encode()
+def _lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
+    """Write a table of states alone; what is not known is left blank."""
+    yield f"{FORMAT_LINE}\n{encode_header(header)}time_us,{','.join(NAV_NAMES)}\n".encode()
     for begin in range(0, len(time_us), LINES):
         chunk = slice(begin, begin + LINES)
-        yield "".join(
-            _line(when, values, int(flags))
-            for when, values, flags in zip(
-                time_us[chunk].tolist(),
-                states[chunk][:, PICK].tolist(),
-                states[chunk][:, NAV_FLAGS].tolist(),
-                strict=True,
-            )
-        ).encode()
+        yield "".join(map(_line, time_us[chunk].tolist(), states[chunk].tolist())).encode()
 
 
-def _line(time_us: int, values: list[float], flags: int) -> str:
-    cells = ["" if math.isnan(value) else f"{value:.10g}" for value in values]
-    return f"{time_us / US_PER_S:.6f},{','.join(cells)},{flags}\n"
+def _line(time_us: int, values: list[float]) -> str:
+    *figures, flags = values
+    cells = ["" if math.isnan(value) else repr(value) for value in figures]
+    return f"{time_us},{time_us},{','.join(cells)},{int(flags)}\n"

@@ -1,6 +1,7 @@
 """`mavgate info` and `mavgate recover`: what a recording holds, and what can be saved of it."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final
@@ -10,7 +11,16 @@ import typer
 from pymavlink.dialects.v20 import common as mavlink
 from rich.table import Table
 
-from gateway.cli.support.recording_options import PANEL, ForceOption, progress_of, refusing
+from gateway.cli.support.named_recordings import files_of, recordings_folder
+from gateway.cli.support.recording_options import (
+    PANEL,
+    ColumnsOption,
+    ForceOption,
+    progress_of,
+    read_column_map,
+    refusing,
+)
+from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
 from gateway.cli.support.terminal import console_of, table_of
 from gateway.edges.disk.recording_streams import (
     FileKind,
@@ -28,7 +38,7 @@ from gateway.flightlog.table.table import (
     encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flights.reading import NO_RECORDING, FlightError
+from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
 from gateway.output import write_new
 from gateway.units import US_PER_S
 
@@ -45,17 +55,30 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="Recording.", show_default=False)],
+    file: Annotated[
+        Path, typer.Argument(help="Recording, by its name or a file.", show_default=False)
+    ],
     *,
-    json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    columns: ColumnsOption = None,
+    json: Annotated[bool, typer.Option("--json", help="For programs: a line a file.")] = False,
+    config: ConfigOption = None,
 ) -> None:
-    """Tell what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
-    with progress_of([file]) as advance, refusing():
-        found = describe(file, advance)
-    if json:
-        print(msgspec.json.encode(found).decode())
-    else:
-        _show(file, found)
+    """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
+    with refusing():
+        files = files_of([file], recordings_folder(config), "all")
+    with progress_of(files) as advance, refusing():
+        options = ReadOptions(
+            pipeline_settings(read_settings(config)),
+            columns=read_column_map(columns),
+            progress=advance,
+        )
+        found = [(each, describe(each, options)) for each in files]
+    for number, (each, info_of_file) in enumerate(found):
+        if json:
+            print(msgspec.json.encode(info_of_file).decode())
+        else:
+            print(end="\n" if number else "")
+            _show(each, info_of_file)
 
 
 def recover(
@@ -87,15 +110,15 @@ def recover(
     console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
 
 
-def describe(file: Path, advance: Progress | None = None) -> FileInfo:
+def describe(file: Path, options: ReadOptions) -> FileInfo:
     """Sum up a recording.
 
     Parameters
     ----------
     file : Path
-        A tlog or a table.
-    advance : callable, optional
-        Called with how many more bytes were read.
+        A tlog, a table, or what can be read as one.
+    options : ReadOptions
+        Column map; its progress is called with how many more bytes were read.
 
     Returns
     -------
@@ -104,11 +127,11 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
     Raises
     ------
     FlightError
-        If it is neither.
+        If it is none of these.
     OSError
         If it cannot be read.
     """
-    kind, size = kind_of(file), file.stat().st_size
+    kind, size, advance = kind_of(file), file.stat().st_size, options.progress
     if kind is FileKind.TLOG:
         tlog = TlogSummary()
         for batch in read_batches(file, advance):
@@ -117,9 +140,12 @@ def describe(file: Path, advance: Progress | None = None) -> FileInfo:
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found
-    if kind in (FileKind.FOREIGN, FileKind.OTHER):
-        raise FlightError(f"{file}: is of another program; convert it to CSV first")
     table, reader = TableSummary(), TableReader()
+    if kind in (FileKind.FOREIGN, FileKind.OTHER):
+        foreign = open_rows(file, options)
+        for row in foreign.plain_rows:
+            table.add([row], foreign.header)
+        return replace(table.result(size), kind=kind.value, header=None)
     for event in read_events(file, reader, advance):
         table.add([event], reader.header)
     return table.result(size)

@@ -17,6 +17,7 @@ from gateway.cli.live.run import (
 )
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.errors import refuse
+from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -105,6 +106,7 @@ def play(
             read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused,
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
+        files = files_of(files, recordings_folder(config), "tlogs")
         today = pipeline_settings(read_settings(config))
         options = ReadOptions(today, settings, position, read_column_map(columns))
         with progress_of(files) as advance:

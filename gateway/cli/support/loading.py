@@ -9,18 +9,26 @@ import typer
 
 from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
+from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import progress_of, read_column_map, refusing
 from gateway.cli.support.settings_options import (
     pipeline_settings,
 )
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.flights.reading import FlightError, ReadOptions, SettingsChoice, aircraft_of, open_rows
+from gateway.flights.reading import (
+    FlightError,
+    ReadOptions,
+    SettingsChoice,
+    aircraft_of,
+    joined_rows,
+    open_rows,
+)
 
 FlightArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="A recording: our CSV, another program's CSV with --columns, or a tlog; "
+        help="A recording by its name, our CSV, another program's with --columns, or a tlog; "
         "by default the built-in simulated flight.",
         show_default=False,
     ),
@@ -64,13 +72,15 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
     settings = loading.settings
     if path is None:
         return simulated_flight(settings.simulator, fusion_of(settings))
-    files = [file for file in (path, loading.reference) if file is not None]
+    with refusing():
+        parts = files_of([path], folder_of(settings), "tables")
+    files = [*parts, loading.reference] if loading.reference is not None else parts
     with progress_of(files) as advance, refusing():
         options = _read_options(loading, advance)
-        table = open_rows(path, options)
+        table = joined_rows([open_rows(part, options) for part in parts])
         aircraft = aircraft_of(table, options)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
-        story = STORIES[kind_of(path)]
+        story = STORIES[kind_of(parts[0])]
         try:
             flight = flight_of_rows(
                 table.plain_rows, aircraft.calibration, fusion, name=path.name, story=story

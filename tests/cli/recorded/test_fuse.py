@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import encode_head, encode_state
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import TableReader, encode_head, encode_state
 from gateway.replay import header_for
 from tests.test_replay import fly_from_the_middle
 
@@ -35,8 +35,8 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
     empty.write_text("")
     result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out), "--force", *arguments])
     assert result.exit_code == 0, result.output
-    with out.open() as file:
-        return list(csv.DictReader(file))
+    lines = out.read_text().splitlines()
+    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 @pytest.mark.io
@@ -45,12 +45,12 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
     rows = run(log, "--estimator", estimator)
     assert len(rows) == 500
     last = rows[-1]
-    assert float(last["time_s"]) == pytest.approx(4.99)
-    assert float(last["lat_deg"]) == pytest.approx(47.0, abs=1e-6)
-    assert float(last["alt_amsl_m"]) == pytest.approx(500.0, abs=0.5)
-    yaw = 2.0 * math.atan2(float(last["qz"]), float(last["qw"]))
+    assert int(last["time_us"]) == 4_990_000
+    assert float(last["nav_lat_deg"]) == pytest.approx(47.0, abs=1e-6)
+    assert float(last["nav_alt_amsl_m"]) == pytest.approx(500.0, abs=0.5)
+    yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
     assert math.degrees(yaw) == pytest.approx(10.0, abs=0.5)
-    known = last["pos_std_north_m"] != ""
+    known = last["nav_pos_std_north_m"] != ""
     assert known == (estimator == "eskf")
 
 
@@ -64,15 +64,25 @@ def test_a_recording_gives_its_own_states_also_from_its_middle(
     path.write_text(head + "".join(map(row_to_line, rows)))
     recorded = [row.state for row in rows if row.state]
     again = run(path)
-    assert [row["qw"] for row in again] == [f"{known.q_nb[0]:.10g}" for known in recorded]
-    assert [row["lat_deg"] for row in again] == [f"{known.lat_deg:.10g}" for known in recorded]
+    assert [row["nav_q_w"] for row in again] == [repr(known.q_nb[0]) for known in recorded]
+    assert [row["nav_lat_deg"] for row in again] == [repr(known.lat_deg) for known in recorded]
+
+
+@pytest.mark.io
+def test_what_it_writes_is_a_table(log: Path) -> None:
+    run(log)
+    reader = TableReader()
+    events = reader.feed(log.with_name("out.csv").read_bytes(), final=True)
+    assert reader.header is not None
+    assert [type(event) for event in events] == [TableRow] * 500
+    assert all(event.state is not None for event in events if isinstance(event, TableRow))
 
 
 @pytest.mark.io
 def test_blank_before_anything_is_known(log: Path) -> None:
     first = run(log, "--estimator", "complementary")[0]
-    assert first["lat_deg"] == ""
-    assert first["qw"] != ""
+    assert first["nav_lat_deg"] == ""
+    assert first["nav_q_w"] != ""
 
 
 @pytest.mark.io
@@ -80,7 +90,7 @@ def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
     last = run(log, "--estimator", "complementary", "--config", str(config))[-1]
-    yaw = 2.0 * math.atan2(float(last["qz"]), float(last["qw"]))
+    yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
     assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
 
 

@@ -1,0 +1,118 @@
+"""What `record list` shows is taken by every command on recordings."""
+
+import gzip
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.support.named_recordings import files_of
+from gateway.config import GatewaySettings
+from gateway.flightlog.table.row import row_to_line
+from gateway.flightlog.table.table import encode_head
+from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.glance import END_BYTES, glance
+from gateway.flights.reading import FlightError
+from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
+from tests.test_replay import fly, make_flight, read
+
+pytestmark = pytest.mark.io
+
+COUNT = 4000
+
+
+@pytest.fixture
+def config(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Recordings `alps` (tlog and tables of two parts) and `lake` (a tlog of system 7)."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    (folder / "alps_01.tlog").write_bytes(make_tlog(make_records(COUNT)))
+    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 12))[0])
+    header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
+    half = len(rows) // 2
+    for number, some in ((1, rows[:half]), (2, rows[half:])):
+        text = encode_head(header) + "".join(map(row_to_line, some))
+        (folder / f"alps_{number:02d}_v1.csv").write_text(text)
+    (folder / "lake_01.tlog").write_bytes(make_tlog(make_records(30, system_id=7)))
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'[recording]\nfolder = "{folder}"\n')
+    return file
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_list_tells_length_vehicles_size_and_path(config: Path) -> None:
+    lines = run("record", "list", "--config", config).splitlines()
+    (alps,) = (line.split() for line in lines if line.strip().startswith("alps"))
+    assert alps[1:3] == ["0:01:20", "1"]
+    assert alps[-1] == str(config.parent / "recordings" / "alps_*")
+    (lake,) = (line.split() for line in lines if line.strip().startswith("lake"))
+    assert lake[1:3] == ["0:00:01", "7"]
+    assert lake[-1].endswith("lake_01.tlog")
+    listed = {one["name"]: one for one in json.loads(run("record", "list", "--json", "-c", config))}
+    assert listed["lake"]["vehicles"] == [7]
+    assert listed["alps"]["duration_s"] == pytest.approx((COUNT - 1) * STEP_US / 1e6)
+
+
+@pytest.mark.parametrize("name", ["alps", "last"])
+def test_every_command_takes_the_name(config: Path, tmp_path: Path, name: str) -> None:
+    for file in (config.parent / "recordings").glob("lake*"):
+        file.unlink()
+    found = run("info", name, "--config", config)
+    assert found.count("part 1, by mavgate") + found.count("tlog, ") >= 2
+    assert len(run("info", name, "--json", "--config", config).splitlines()) == 3
+    states = tmp_path / "states.csv"
+    run("fuse", name, "-o", states, "--config", config)
+    table = tmp_path / "again.csv"
+    run("convert", name, "-o", table, "--config", config)
+    assert sum(not line.startswith("#") for line in table.read_text().splitlines()) > 500
+    joined = tmp_path / "again.tlog"
+    run("convert", name, "-o", joined, "--config", config)
+    assert joined.stat().st_size == len(make_tlog(make_records(COUNT)))
+
+
+def test_a_name_that_is_none_is_refused(config: Path) -> None:
+    result = CliRunner().invoke(app, ["info", "sea", "--config", str(config)])
+    assert result.exit_code == 2
+    assert "record list" in result.output
+
+
+def test_a_path_stays_a_path(tmp_path: Path) -> None:
+    there = tmp_path / "a.tlog"
+    there.touch()
+    missing = tmp_path / "gone.tlog"
+    assert files_of([there, missing], tmp_path, "tables") == [there, missing]
+    with pytest.raises(FlightError, match=r"gone\.tlog: no such file"):
+        files_of([Path("gone.tlog")], tmp_path, "tables")
+
+
+def test_info_takes_another_programs_csv(tmp_path: Path) -> None:
+    lines = ["time_s,ax,ay,az,gx,gy,gz"]
+    lines += [f"{k / 100:.2f},0.0,0.0,-9.8,0.0,0.0,0.0" for k in range(501)]
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(gzip.compress("\n".join(lines).encode() + b"\n"))
+    found = json.loads(run("info", path, "--json"))
+    assert (found["kind"], found["records"], found["duration_s"]) == ("foreign", 501, 5.0)
+
+
+def test_a_glance_reads_the_ends_alone(tmp_path: Path) -> None:
+    records = make_records(COUNT)
+    for i in range(2000, 2010):
+        frame = records[i].frame
+        records[i] = TlogRecord(records[i].time_us, frame[:5] + b"\x09" + frame[6:])
+    path = tmp_path / "long_01.tlog"
+    path.write_bytes(make_tlog(records))
+    assert path.stat().st_size > 2 * END_BYTES
+    assert glance([path]).vehicles == (1,)
+    assert glance([path]).duration_s == pytest.approx((COUNT - 1) * STEP_US / 1e6)
+    empty = tmp_path / "empty_01.tlog"
+    empty.touch()
+    assert glance([empty, tmp_path / "gone.csv"]).duration_s is None
