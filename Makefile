@@ -1,9 +1,10 @@
 # make demo   the gateway on its built-in simulated receiver, until interrupted
 # make test   every test, the firmware's included
 # make lint   formatting, lint and types
+# make deb    a Debian package with the service, in dist/
 # make lock   write the lock files anew from pyproject.toml
 
-.PHONY: demo test lint lock firmware clean
+.PHONY: demo test lint deb lock firmware clean
 
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck
 
@@ -17,6 +18,9 @@ test: .venv/.dev
 
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
+
+deb: .venv/.run
+	tools/make_deb.sh dist
 
 lock: .venv/.dev
 	$(COMPILE) --extra panel --output-file requirements.lock pyproject.toml

@@ -103,12 +103,17 @@ def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
         As `load`.
     """
     default = msgspec.to_builtins(settings.default_aircraft)
-    found = {}
+    found, errors = {}, []
     for vehicle_id in VEHICLE_IDS:
         file = aircraft_file(settings, vehicle_id)
-        if file.exists():
-            table = _read(file, AircraftSettings)
-            found[vehicle_id] = msgspec.convert(_merged(default, table), AircraftSettings)
+        try:
+            if file.exists():
+                table = _read(file, AircraftSettings)
+                found[vehicle_id] = msgspec.convert(_merged(default, table), AircraftSettings)
+        except ConfigError as error:
+            errors.append(str(error))
+    if errors:
+        raise ConfigError("\n".join(errors))
     return found
 
 
@@ -227,17 +232,18 @@ def _write_difference(
 
 def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Iterator[str]:
     fields = {field.name: field for field in fields_of(kind)}
-    sound = True
+    sound = {}
     for key, value in table.items():
-        for error in _check_key(key, value, fields, prefix):
-            sound = False
-            yield error
-    if sound:
-        # Key by key it is right; what is left is a rule between several keys.
-        try:
-            msgspec.convert(table, kind)
-        except msgspec.ValidationError as error:
-            yield f"{prefix.rstrip('.')}: {str(error).partition(' - at `$')[0]}"
+        errors = list(_check_key(key, value, fields, prefix))
+        yield from errors
+        if not errors:
+            sound[key] = value
+    # Each of these is right by itself; what is left are rules between them and within their texts.
+    try:
+        msgspec.convert(sound, kind)
+    except msgspec.ValidationError as error:
+        for line in str(error).partition(" - at `$")[0].splitlines():
+            yield f"{prefix.rstrip('.')}: {line}"
 
 
 def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -> Iterator[str]:
@@ -262,7 +268,18 @@ def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
 
 def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationError) -> str:
     text = f"{path} = {tomlkit.item(value).as_string()}: {_uncapital(str(error))}"
-    return f"{text} ({_uncapital(field.meaning)})" if field.meaning else text
+    hints = [_choice_hint(value, field), _uncapital(field.meaning)]
+    hint = "; ".join(filter(None, hints))
+    return f"{text} ({hint})" if hint else text
+
+
+def _choice_hint(value: Any, field: Field) -> str:
+    """Tell what may be chosen, and what was probably meant."""
+    if not field.choices:
+        return ""
+    near = difflib.get_close_matches(str(value), field.choices, n=1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return f"{meant}allowed: {', '.join(field.choices)}"
 
 
 def _uncapital(text: str) -> str:

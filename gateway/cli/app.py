@@ -16,7 +16,6 @@ app = typer.Typer(
     cls=LazyGroup,
     help="A MAVLink telemetry gateway: shows a home-made UAV tracker on every ground station.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_show_locals=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},

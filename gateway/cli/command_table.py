@@ -44,7 +44,11 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "ports": CommandEntry("live.setup", "List the serial ports, and the one that `auto` takes."),
     "check-config": CommandEntry(
         "live.setup",
-        "Check a settings file, or print all settings with their defaults and meanings.",
+        "Check settings and those of the aircraft, or print all settings with their defaults.",
+    ),
+    "doctor": CommandEntry(
+        "live.doctor",
+        "Tell what is missing here, and what helps: rights, ports, latency, cache, time, disk.",
     ),
     "report": CommandEntry(
         "recorded.report",

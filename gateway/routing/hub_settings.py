@@ -81,12 +81,19 @@ class HubSettings(Settings, frozen=True):
     ] = 0
 
     def __post_init__(self) -> None:
-        """Refuse a wrong endpoint when the settings are read, not when they are used."""
+        """Refuse wrong endpoints when the settings are read, not when they are used."""
         places: set[str] = set()
+        errors = []
         for url in self.endpoints:
-            endpoint = parse_endpoint(url)
+            try:
+                endpoint = parse_endpoint(url)
+            except ValueError as error:
+                errors.append(str(error))
+                continue
             if endpoint.place in places:
-                raise ValueError(f"endpoint {endpoint.place!r} is there twice")
+                errors.append(f"endpoint {endpoint.place!r} is there twice")
             if endpoint.kind is EndpointKind.WSS_LISTEN and not self.tls_certificate:
-                raise ValueError(f"endpoint {endpoint.place!r} needs a tls_certificate")
+                errors.append(f"endpoint {endpoint.place!r} needs a tls_certificate")
             places.add(endpoint.place)
+        if errors:
+            raise ValueError("\n".join(errors))

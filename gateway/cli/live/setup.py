@@ -37,15 +37,27 @@ def check_config(
         Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
     ] = None,
 ) -> None:
-    """Check a settings file, or print all settings with their defaults and meanings."""
+    """Check settings and those of the aircraft, or print all settings with their defaults.
+
+    All that is wrong is told at once, each with what is allowed.
+    """
     # Not above: the settings import every stage, and `ports` must not wait for that.
-    from gateway.config import ConfigError, GatewaySettings, load, render
+    from gateway.config import (
+        ConfigError,
+        GatewaySettings,
+        aircraft_folder,
+        load,
+        load_aircraft,
+        render,
+    )
 
     if file is None:
         print(render(GatewaySettings()), end="")
         return
     try:
-        load(file)
+        settings = load(file)
+        aircraft = load_aircraft(settings)
     except ConfigError as error:
         refuse(str(error))
-    print(f"{file}: all settings are right")
+    others = f", and of {len(aircraft)} aircraft in {aircraft_folder(settings)}" if aircraft else ""
+    print(f"{file}: all settings are right{others}")

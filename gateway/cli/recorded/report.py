@@ -1,6 +1,5 @@
 """`mavgate report`: figures and tables of a flight as one page."""
 
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,7 +9,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.sources import with_latency
-from gateway.cli.support.errors import refuse
+from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.loading import (
     FlightArgument,
     Loading,
@@ -111,5 +110,5 @@ def report(
 def _refuse_without_packages() -> None:
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        install = f"{sys.executable} -m pip install {' '.join(missing)}"
-        refuse(f"a report needs {' and '.join(missing)}; this installs what is missing:\n{install}")
+        needed = " and ".join(missing)
+        refuse(f"a report needs {needed}, the extra mavgate[plot]:\n{how_to_add('plot')}")

@@ -1,5 +1,6 @@
 """How a command says that it cannot do what was asked."""
 
+import sys
 from typing import NoReturn
 
 import typer
@@ -18,3 +19,8 @@ def refuse(text: str) -> NoReturn:
     console = console_of(stderr=True)
     console.print(text, style="red", markup=False, emoji=False)
     raise typer.Exit(2)
+
+
+def how_to_add(extra: str) -> str:
+    """Return the command line that installs an optional part."""
+    return f"{sys.executable} -m pip install 'mavgate[{extra}]'"

@@ -48,8 +48,8 @@ def test_what_must_be_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(report, "find_spec", without)
     result = CliRunner().invoke(app, ["report"])
     assert result.exit_code == 2
-    assert "needs jinja2;" in result.output
-    assert "-m pip install jinja2\n" in result.output
+    assert "needs jinja2, the extra mavgate[plot]" in result.output
+    assert "-m pip install 'mavgate[plot]'\n" in result.output
 
 
 def test_a_folder_that_cannot_be_written_is_told(

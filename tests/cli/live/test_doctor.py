@@ -1,0 +1,159 @@
+"""`mavgate doctor`: every check finds what is wrong, and says what helps."""
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from msgspec.structs import replace
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.support import checkup
+from gateway.cli.support.checkup import Diagnosis, Grade
+from gateway.config import GatewaySettings
+from gateway.edges.operator import control_finder
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GatewaySettings:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(checkup, "TTY", tmp_path / "tty")
+    default = GatewaySettings(aircraft_folder=str(tmp_path / "aircraft"))
+    return replace(
+        default,
+        recording=replace(default.recording, folder=str(tmp_path / "recordings")),
+        serial=replace(default.serial, port=str(tmp_path / "ttyUSB7")),
+        hub=replace(default.hub, endpoints=("udp:127.0.0.1:14550",)),
+    )
+
+
+def one(check: checkup.Check, settings: GatewaySettings) -> Diagnosis:
+    [found] = check(settings)
+    return found
+
+
+def test_a_port_that_is_not_there(settings: GatewaySettings) -> None:
+    found = one(checkup.check_receiver, settings)
+    assert (found.grade, "`mavgate ports`" in found.text) == (Grade.WRONG, True)
+
+
+def test_a_port_that_may_not_be_opened(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path(settings.serial.port).touch()
+    assert one(checkup.check_receiver, settings).grade is Grade.GOOD
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    dialout = SimpleNamespace(gr_name="dialout", gr_mem=[])
+    monkeypatch.setattr(checkup.grp, "getgrgid", lambda _: dialout)
+    found = one(checkup.check_receiver, settings)
+    assert found.grade is Grade.WRONG
+    assert "sudo usermod -aG dialout" in found.text
+
+
+@pytest.mark.parametrize(("latency_ms", "grade"), [(1, Grade.GOOD), (16, Grade.WRONG)])
+def test_an_adapter_that_holds_bytes_back(
+    settings: GatewaySettings, tmp_path: Path, latency_ms: int, grade: Grade
+) -> None:
+    Path(settings.serial.port).touch()
+    device = tmp_path / "tty" / "ttyUSB7" / "device"
+    device.mkdir(parents=True)
+    (device / "latency_timer").write_text(f"{latency_ms}\n")
+    _, timer = checkup.check_receiver(settings)
+    assert timer.grade is grade
+    assert f"{latency_ms} ms" in timer.text
+
+
+def test_wrong_files_of_aircraft(settings: GatewaySettings) -> None:
+    folder = Path(settings.aircraft_folder)
+    folder.mkdir()
+    assert one(checkup.check_aircraft, settings).grade is Grade.GOOD
+    (folder / "3.toml").write_text("[vehicle]\nnope = 1\n")
+    found = one(checkup.check_aircraft, settings)
+    assert found.grade is Grade.WRONG
+    assert "3.toml: vehicle.nope" in found.text
+
+
+def test_folders_that_cannot_be_written(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert one(checkup.check_aircraft, settings).grade is Grade.WRONG
+    assert one(checkup.check_disk, settings).grade is Grade.WRONG
+
+
+@pytest.mark.parametrize(("room_mb", "grade"), [(300, Grade.WRONG), (500, Grade.GOOD)])
+def test_room_for_recordings(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, room_mb: int, grade: Grade
+) -> None:
+    free = (settings.recording.free_floor_mb + room_mb) * 1e6
+    monkeypatch.setattr(checkup, "free_bytes_near", lambda _: free)
+    assert one(checkup.check_disk, settings).grade is grade
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"), [("udp", socket.SOCK_DGRAM), ("tcp", socket.SOCK_STREAM)]
+)
+def test_a_port_that_another_program_has(
+    settings: GatewaySettings, kind: str, make: socket.SocketKind
+) -> None:
+    with socket.socket(socket.AF_INET, make) as other:
+        other.bind(("127.0.0.1", 0))
+        if make is socket.SOCK_STREAM:
+            other.listen()
+        url = f"{kind}-listen:127.0.0.1:{other.getsockname()[1]}"
+        taken = replace(settings, hub=replace(settings.hub, endpoints=(url,)))
+        found = one(checkup.check_ports, taken)
+        assert found.grade is Grade.WRONG
+        assert found.text == f"{url}: Address already in use"
+    assert one(checkup.check_ports, taken).grade is Grade.GOOD
+
+
+def test_a_gateway_that_runs_has_its_ports(
+    settings: GatewaySettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = tmp_path / "mavgate" / "run.sock"
+    monkeypatch.setattr(control_finder, "_listening", lambda: {running})
+    found = one(checkup.check_ports, settings)
+    assert (found.grade, found.what) == (Grade.GOOD, "gateway")
+
+
+@pytest.mark.parametrize(("said", "grade"), [("yes\n", Grade.GOOD), ("no\n", Grade.NOTE)])
+def test_the_clock(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, said: str, grade: Grade
+) -> None:
+    monkeypatch.setattr(checkup.shutil, "which", lambda _: "/usr/bin/timedatectl")
+    monkeypatch.setattr(checkup.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
+    assert one(checkup.check_clock, settings).grade is grade
+
+
+@pytest.mark.parametrize(("kept", "grade"), [(True, Grade.GOOD), (False, Grade.NOTE)])
+def test_compiled_estimators(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, kept: bool, grade: Grade
+) -> None:
+    monkeypatch.setattr(checkup, "is_kept", lambda _: kept)
+    assert one(checkup.check_cache, settings).grade is grade
+
+
+def test_missing_extras_are_named(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkup, "find_spec", lambda name: None if name == "nicegui" else name)
+    found = one(checkup.check_extras, settings)
+    assert (found.grade, "mavgate[panel]" in found.text) == (Grade.NOTE, True)
+
+
+@pytest.mark.parametrize("grade", list(Grade))
+def test_the_exit_code_tells_programs(monkeypatch: pytest.MonkeyPatch, grade: Grade) -> None:
+    def check(_: GatewaySettings) -> list[Diagnosis]:
+        return [Diagnosis(grade, "thing", "is so")]
+
+    checks: tuple[Callable[..., object], ...] = (check,)
+    monkeypatch.setattr(checkup, "CHECKS", checks)
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == (1 if grade is Grade.WRONG else 0)
+    assert result.output == f"{grade:5} thing: is so\n"

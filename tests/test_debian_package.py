@@ -1,0 +1,153 @@
+"""The Debian package, installed into a root of its own by dpkg."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gateway.config import aircraft_folder, load
+from gateway.edges.operator.control_socket import GROUP, SERVICE_FOLDER
+from gateway.edges.receiver.serial_port import KNOWN_ADAPTERS
+from tests.conftest import ROOT
+
+pytestmark = [
+    pytest.mark.io,
+    pytest.mark.slow,
+    pytest.mark.xdist_group("deb"),
+    pytest.mark.skipif(not shutil.which("dpkg-deb"), reason="needs Debian's dpkg-deb"),
+]
+UNIT = "usr/lib/systemd/system/mavgate.service"
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package without its dependencies, which are the same locked ones as here."""
+    folder = tmp_path_factory.mktemp("deb")
+    subprocess.run(
+        [ROOT / "tools" / "make_deb.sh", folder],
+        check=True,
+        env=os.environ | {"PYTHON": sys.executable, "LOCK": ""},
+    )
+    [made] = folder.glob("mavgate_*.deb")
+    return made
+
+
+@pytest.fixture(scope="module")
+def unpacked(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("root")
+    subprocess.run(["dpkg-deb", "--extract", package, root], check=True)
+    return root
+
+
+def dpkg(root: Path, *words: object) -> str:
+    """Run dpkg as for a system below `root`, with the scripts told so."""
+    command = ["dpkg", f"--root={root}", "--force-script-chrootless", "--force-depends"]
+    done = subprocess.run([*command, *map(str, words)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or not shutil.which("systemd-sysusers"),
+    reason="needs root, and systemd-sysusers",
+)
+def test_installed_and_purged(package: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    (root / "var/lib/dpkg/info").mkdir(parents=True)
+    (root / "var/lib/dpkg/updates").mkdir()
+    (root / "var/lib/dpkg/status").touch()
+    (root / "etc").mkdir()
+    dpkg(root, "--install", package)
+    assert "Status: install ok installed" in dpkg(root, "--status", "mavgate")
+    users = dict(line.split(":", 1) for line in (root / "etc/passwd").read_text().splitlines())
+    assert "/var/lib/mavgate" in users["mavgate"]
+    members = (root / "etc/group").read_text()
+    assert f"{GROUP}:" in members
+    assert any(line.startswith("dialout:") and "mavgate" in line for line in members.splitlines())
+    settings = root / "etc/mavgate/gateway.toml"
+    settings.write_text(settings.read_text() + "# my own\n")
+    flights = root / "var/lib/mavgate/recordings"
+    flights.mkdir(parents=True)
+    dpkg(root, "--remove", "mavgate")
+    assert "# my own" in settings.read_text(), "settings outlive a removal"
+    dpkg(root, "--purge", "mavgate")
+    assert not settings.exists()
+    assert flights.exists(), "flights outlive all"
+    assert not (root / "usr/lib/mavgate").exists()
+
+
+def test_the_program_starts_from_its_own_packages(unpacked: Path) -> None:
+    program = unpacked / "usr/bin/mavgate"
+    where = f"import runpy, sys; sys.argv[:] = [{str(program)!r}, '--version'];"
+    where += f"runpy.run_path({str(program)!r}, run_name='__main__')"
+    done = subprocess.run(
+        [sys.executable, "-c", where], capture_output=True, text=True, check=True, cwd=unpacked
+    )
+    assert done.stdout.startswith("mavgate ")
+    script = program.read_text()
+    assert script.startswith("#!/usr/bin/python3\n")
+    major, minor, *_ = sys.version_info
+    assert f'MADE_FOR = "{major}.{minor}"' in script
+
+
+def test_the_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None:
+    settings = load(unpacked / "etc/mavgate/gateway.toml")
+    unit = (unpacked / UNIT).read_text()
+    assert "StateDirectory=mavgate" in unit
+    assert "--config /etc/mavgate/gateway.toml" in unit
+    for folder in (aircraft_folder(settings), Path(settings.recording.folder)):
+        assert folder.is_relative_to("/var/lib/mavgate")
+
+
+def test_the_unit_starts_what_the_package_brings(unpacked: Path) -> None:
+    lines = (unpacked / UNIT).read_text().splitlines()
+    [start] = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
+    program = unpacked / start.split()[0].lstrip("/")
+    assert os.access(program, os.X_OK)
+    assert f"RuntimeDirectory={SERVICE_FOLDER.name}" in lines
+    assert "User=mavgate" in lines
+    [guide] = (line for line in lines if line.startswith("Documentation=file://"))
+    assert (unpacked / guide.removeprefix("Documentation=file:///")).is_file()
+    sysusers = (unpacked / "usr/lib/sysusers.d/mavgate.conf").read_text()
+    assert "u mavgate " in sysusers
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
+def test_systemd_understands_the_unit(unpacked: Path, tmp_path: Path) -> None:
+    """With a program in place of ours, which is not installed here."""
+    unit = tmp_path / "mavgate.service"
+    text = (unpacked / UNIT).read_text()
+    unit.write_text(text.replace("/usr/bin/mavgate", "/bin/true").replace("User=mavgate\n", ""))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", unit], capture_output=True, text=True, check=False
+    )
+    assert "mavgate" not in done.stderr, done.stderr
+
+
+def test_every_known_adapter_has_its_rule(unpacked: Path) -> None:
+    rules = (unpacked / "usr/lib/udev/rules.d/60-mavgate.rules").read_text()
+    for vendor, product in KNOWN_ADAPTERS:
+        ids = f'ATTR{{idVendor}}=="{vendor:04x}", ATTR{{idProduct}}=="{product:04x}"'
+        assert ids in rules
+    assert 'ATTR{latency_timer}="1"' in rules
+
+
+def test_documents_and_completion_come_along(unpacked: Path) -> None:
+    documents = unpacked / "usr/share/doc/mavgate"
+    shipped = {path.name for path in documents.glob("*.md")}
+    assert shipped >= {path.name for path in (ROOT / "docs").glob("*.md")}
+    for path in (
+        "bash-completion/completions/mavgate",
+        "zsh/vendor-completions/_mavgate",
+        "fish/vendor_completions.d/mavgate.fish",
+    ):
+        assert "_MAVGATE_COMPLETE" in (unpacked / "usr/share" / path).read_text()
+
+
+def test_nothing_tells_where_it_was_built(unpacked: Path) -> None:
+    names = [path for path in unpacked.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    texts = [path.read_bytes() for path in names]
+    assert not [name for name, text in zip(names, texts, strict=True) if bytes(ROOT) in text]
