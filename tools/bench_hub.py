@@ -1,4 +1,4 @@
-"""Measure how the hub forwards MAVLink over UDP, beside a plain blocking-socket forwarder.
+"""Measure how the hub forwards MAVLink over UDP and WebSocket, beside a plain UDP forwarder.
 
 A source sends frames of a foreign vehicle to the forwarder, which passes them to N clients, all on
 loopback. Three figures for each forwarder and N:
@@ -13,6 +13,9 @@ The plain forwarder receives with a blocking `recvfrom` and sends with a blockin
 client, looking at nothing. Forwarders take turns in short rounds, so that other load on the
 machine meets them alike. Such load only ever slows: the best round counts for the maximum and its
 CPU time, the median round for latencies.
+
+"WebSocket" is the hub with its clients at a listening WebSocket port. Their stamps are taken when
+this process reads, for the kernel stamps no bytes of a stream: so its wake-up is in their latencies.
 """
 
 import argparse
@@ -47,6 +50,8 @@ WINDOWS = (128, 32, 8)
 STALL_S = 0.5
 START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
+WEB = "WebSocket"
+"""The hub again, its clients at a WebSocket port."""
 
 PLAIN = """
 import socket, sys
@@ -74,6 +79,27 @@ async def main():
 
 asyncio.run(main())
 """
+
+WEB_HUB = """
+import asyncio, sys
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub.hub import Hub
+from gateway.routing.hub_settings import HubSettings
+
+async def main():
+    endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", f"ws-listen:127.0.0.1:{sys.argv[2]}")
+    hub = Hub(HubSettings(endpoints=endpoints, max_clients=500), lambda incoming: None,
+              GatewayClock())
+    hub.start()
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+HANDSHAKE = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
 
 Command = Callable[[int, list[int]], list[str]]
 
@@ -318,6 +344,73 @@ class Bench:
             return len(row) - before
 
 
+class WebBench(Bench):
+    """The hub with clients at its WebSocket port, which count frames in the messages."""
+
+    def __init__(self, clients: int, frames: list[bytes]) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._web_port: int = probe.getsockname()[1]
+        self._rests: list[bytes] = []
+        super().__init__(self._command, clients, frames)
+
+    def _command(self, port: int, clients: list[int]) -> list[str]:  # noqa: ARG002
+        return [sys.executable, "-c", WEB_HUB, str(port), str(self._web_port)]
+
+    def _wait_until_up(self) -> None:
+        """Put WebSockets in the place of the UDP sockets."""
+        for place, sink in enumerate(self._sinks):
+            self._poll.unregister(sink)
+            sink.close()
+            self._sinks[place] = self._open_web()
+        self._by_fd = {sink.fileno(): place for place, sink in enumerate(self._sinks)}
+        self._rests = [b""] * len(self._sinks)
+        for sink in self._sinks:
+            self._poll.register(sink, select.POLLIN)
+        super()._wait_until_up()
+
+    def _open_web(self) -> socket.socket:
+        limit = time.monotonic() + START_LIMIT_S
+        while True:
+            try:
+                sink = socket.create_connection(("127.0.0.1", self._web_port))
+                break
+            except ConnectionRefusedError:
+                if time.monotonic() > limit:
+                    raise
+                time.sleep(0.05)
+        sink.sendall(HANDSHAKE)
+        answer = b""
+        while not answer.endswith(b"\r\n\r\n"):
+            answer += sink.recv(1)
+        sink.setblocking(False)
+        return sink
+
+    def _read(self, place: int) -> int:
+        return len(self._messages(place))
+
+    def _read_stamps(self, place: int) -> int:
+        assert self._stamps is not None
+        count, now_ns = len(self._messages(place)), time.time_ns()
+        self._stamps[place] += [now_ns] * count
+        return count
+
+    def _messages(self, place: int) -> list[bytes]:
+        """Return the messages of one frame of ours each that have come."""
+        data = self._rests[place]
+        try:
+            while chunk := self._sinks[place].recv(65536):
+                data += chunk
+        except BlockingIOError:
+            pass
+        found, at = [], 0
+        while at + 2 <= len(data) and at + 2 + data[at + 1] <= len(data):
+            found.append(data[at + 2 : at + 2 + data[at + 1]])
+            at += 2 + data[at + 1]
+        self._rests[place] = data[at:]
+        return [message for message in found if len(message) == self._length]
+
+
 def lossless(bench: Bench, seconds: float) -> Throughput:
     """Return the fastest run without loss, or the last."""
     for window in WINDOWS:
@@ -350,7 +443,7 @@ def measure(
     }
     for _ in range(rounds):
         for name, command in forwarders.items():
-            bench = Bench(command, clients, frames)
+            bench = WebBench(clients, frames) if name == WEB else Bench(command, clients, frames)
             try:
                 found[name][0].append(asdict(lossless(bench, seconds)))
                 found[name][1].append(asdict(bench.latency(seconds, RATE_HZ)))
@@ -364,9 +457,7 @@ def measure(
 
 def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
     """Print the figures and how they compare."""
-    table = Table(
-        title="Forwarding MAVLink over UDP, 44-byte frames, loopback", box=box.SIMPLE_HEAD
-    )
+    table = Table(title="Forwarding MAVLink, 44-byte frames, loopback", box=box.SIMPLE_HEAD)
     for column in (
         "clients", "forwarder", "lossless/s", "x plain", "CPU µs/msg", f"p50 µs @{RATE_HZ}/s",
         "p99 µs", "x plain", "max µs", "CPU %", "lost",
@@ -422,7 +513,7 @@ def main() -> None:
     if options.memory:
         report["memory"] = watch_memory(options.memory)
     else:
-        forwarders = {"plain": python(PLAIN), "mavgate": python(HUB)}
+        forwarders = {"plain": python(PLAIN), "mavgate": python(HUB), WEB: python(WEB_HUB)}
         if options.mavlink_router:
             forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
         if options.mavproxy:

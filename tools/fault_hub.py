@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
-from bench_hub import Bench, Latency, source_frames
+from bench_hub import HANDSHAKE, Bench, Latency, source_frames
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -44,8 +44,9 @@ from gateway.edges.hub.hub import Hub
 from gateway.routing.hub_settings import HubSettings
 
 async def main():
-    port, tcp_port, closed_port, far, *clients = sys.argv[1:]
+    port, tcp_port, web_port, closed_port, far, *clients = sys.argv[1:]
     endpoints = (f"udp-listen:127.0.0.1:{port}", f"tcp-listen:127.0.0.1:{tcp_port}",
+                 f"ws-listen:127.0.0.1:{web_port}",
                  *(f"udp:127.0.0.1:{client}" for client in clients),
                  *([f"udp:{far}:14550"] if far else []))
     calm = HubSettings(endpoints=endpoints)
@@ -103,19 +104,24 @@ while True:
 
 
 class FaultBench(Bench):
-    """The hub with a TCP port too, and ways to trouble it."""
+    """The hub with a TCP and a WebSocket port too, and ways to trouble it."""
 
     def __init__(self, *, cable: bool) -> None:
         self._far = FAR_PLACE if cable else ""
-        with socket.socket() as probe, socket.socket(type=socket.SOCK_DGRAM) as closed:
-            probe.bind(("127.0.0.1", 0))
-            closed.bind(("127.0.0.1", 0))
+        with (
+            socket.socket() as probe,
+            socket.socket() as web,
+            socket.socket(type=socket.SOCK_DGRAM) as closed,
+        ):
+            for sock in (probe, web, closed):
+                sock.bind(("127.0.0.1", 0))
             self.tcp_port: int = probe.getsockname()[1]
+            self.web_port: int = web.getsockname()[1]
             self._closed_port: int = closed.getsockname()[1]
         super().__init__(self._command, HEALTHY, source_frames())
 
     def _command(self, port: int, clients: list[int]) -> list[str]:
-        ports = (port, self.tcp_port, self._closed_port, self._far, *clients)
+        ports = (port, self.tcp_port, self.web_port, self._closed_port, self._far, *clients)
         return [sys.executable, "-c", HUB, *map(str, ports)]
 
     @contextmanager
@@ -143,6 +149,18 @@ class FaultBench(Bench):
         with process(code, self.tcp_port) as client:
             time.sleep(0.3)
             os.kill(client.pid, signal.SIGSTOP)
+            yield
+
+    @contextmanager
+    def stalled(self) -> Iterator[None]:
+        """Have a page opened that is stopped with its WebSocket open."""
+        code = (
+            "import socket,sys\nlink = socket.create_connection(('127.0.0.1', int(sys.argv[1])))\n"
+            f"link.sendall({HANDSHAKE!r})\nwhile link.recv(4096): pass"
+        )
+        with process(code, self.web_port) as browser:
+            time.sleep(0.3)
+            os.kill(browser.pid, signal.SIGSTOP)
             yield
 
     @contextmanager
@@ -211,6 +229,7 @@ def main() -> None:
     faults: dict[str, Callable[[], AbstractContextManager[object]]] = {
         "client killed, again and again": bench.spoken("die"),
         "client stopped, TCP open": bench.stopped,
+        "browser stalled, WebSocket open": bench.stalled,
         "port refused": bench.refused,
         "1000 clients a second come and go": bench.visited,
         "datagrams of 0 and 65507 bytes": bench.spoken("odd"),
