@@ -14,8 +14,8 @@ client, looking at nothing. Forwarders take turns in short rounds, so that other
 machine meets them alike. Such load only ever slows: the best round counts for the maximum and its
 CPU time, the median round for latencies.
 
-"WebSocket" is the hub with its clients at a listening WebSocket port. Their stamps are taken when
-this process reads, for the kernel stamps no bytes of a stream: so its wake-up is in their latencies.
+"WebSocket" is the hub with its clients at a WebSocket port. Their stamps are taken when this
+process reads, since the kernel stamps no bytes of a stream: its wake-up is in the latencies.
 """
 
 import argparse
