@@ -1,9 +1,14 @@
 """Endpoint URLs: what they mean, and what is refused with which words."""
 
+import contextlib
+import re
+
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from gateway.routing.endpoint import NO_MESSAGES, EndpointKind, parse_endpoint
+from gateway.routing.endpoint import MAX_PORT, NO_MESSAGES, EndpointKind, parse_endpoint
 from gateway.routing.hub_settings import HubSettings
 
 
@@ -167,3 +172,48 @@ def test_settings_refuse_an_endpoint_that_is_there_twice() -> None:
 def test_settings_refuse_a_wrong_endpoint_when_read() -> None:
     with pytest.raises(msgspec.ValidationError, match="carrier-pigeon"):
         msgspec.convert({"endpoints": ["carrier-pigeon:home:1"]}, HubSettings)
+
+
+WORDS = st.sampled_from(
+    [*EndpointKind, "udpin", "udpout", "tcpin", "mcast", "serial", "", "/dev/tty", "[::1]", "a.b"]
+)
+PLACES = st.sampled_from(["://", ":", ":127.0.0.1:", ":[::1]:", ",", ":h:", "::"])
+OPTIONS = st.lists(
+    st.one_of(
+        st.tuples(
+            st.sampled_from(["name", "allow", "deny", "rate", "pack", "trusted", "x"]),
+            st.one_of(
+                st.text(max_size=12),
+                st.integers().map(str),
+                st.floats().map(lambda rate: f"ATTITUDE:{rate}"),
+            ),
+        ).map("=".join),
+        st.text(max_size=8),
+    ),
+    max_size=4,
+).map("&".join)
+URLS = st.one_of(
+    st.text(max_size=40),
+    st.tuples(WORDS, PLACES, st.one_of(st.integers().map(str), st.text(max_size=8)), OPTIONS).map(
+        lambda parts: f"{parts[0]}{parts[1]}{parts[2]}?{parts[3]}"
+    ),
+)
+
+
+@given(URLS)
+def test_any_text_is_an_endpoint_that_can_be_used_or_is_refused_by_name(url: str) -> None:
+    endpoint = None
+    with contextlib.suppress(ValueError):
+        endpoint = parse_endpoint(url)
+    if endpoint is None:
+        with pytest.raises(ValueError, match=re.escape(repr(url))):
+            parse_endpoint(url)
+        return
+    assert endpoint.name.isprintable()
+    assert endpoint.host
+    endpoint.host.encode("idna")
+    if endpoint.kind is not EndpointKind.SERIAL:
+        assert 0 <= endpoint.port <= MAX_PORT
+    assert all(us == NO_MESSAGES or 0 < us < 1 << 40 for us in endpoint.interval_us.values())
+    again = parse_endpoint(endpoint.place)
+    assert (again.kind, again.host, again.port) == (endpoint.kind, endpoint.host, endpoint.port)
