@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -143,6 +144,12 @@ class Daemon:
         self._poll()
         self._notifier.ready()
 
+    async def control_socket(self) -> Path:
+        """Wait until orders can be taken, and tell where."""
+        if self._opening is not None:
+            await asyncio.shield(self._opening)
+        return self._control.path
+
     def reload(self) -> str:
         """Take over changed settings of the hub, and signing; clients that stay notice nothing.
 
@@ -208,6 +215,12 @@ class Daemon:
             places_not_kept=self._places.failures,
             refused=self._pipeline.refused,
             forged=self._pipeline.forged,
+            marks=tuple(
+                (key, mark.lat_deg, mark.lon_deg, mark.alt_amsl_m)
+                for key, a in aircraft
+                if (mark := a.vehicle.mark) is not None
+            ),
+            simulated=self._receiver is not None,
         )
 
     def _reload_or_refuse(self) -> str:

@@ -4,6 +4,7 @@ import asyncio
 from pathlib import Path
 from typing import Any, Final
 
+from gateway.edges.operator.control_finder import find_socket
 from gateway.edges.operator.control_socket import request
 
 READING: Final = frozenset(
@@ -17,11 +18,11 @@ class ControlClient:
 
     Parameters
     ----------
-    path : Path
-        Its socket.
+    path : Path or None
+        Its socket; None for the gateway that is found on this machine, at each request anew.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None) -> None:
         self.path = path
 
     async def ask(self, verb: str, **params: Any) -> Any:
@@ -32,4 +33,7 @@ class ControlClient:
         ControlError
             If nobody listens, or the request is refused.
         """
-        return await asyncio.to_thread(request, self.path, verb, params)
+        return await asyncio.to_thread(self._ask, verb, params)
+
+    def _ask(self, verb: str, params: dict[str, Any]) -> Any:
+        return request(self.path or find_socket("run"), verb, params)

@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import inspect
 import logging
 import os
 import socket
@@ -19,15 +20,19 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.edges.clock import GatewayClock
-from gateway.edges.operator.control_socket import socket_path
-from gateway.panel import feed
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.doors.rest_door import RestDoor
-from gateway.panel.feed import TelemetryFeed
-from gateway.panel.page_guard import ROLE, PageGuard
-from gateway.panel.page_lock import PageLock
+from gateway.panel.gateway_watch import GatewayWatch
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.recording_player import Playback
+from gateway.panel.serving import feed
+from gateway.panel.serving.feed import TelemetryFeed
+from gateway.panel.serving.map_tiles import MapTiles
+from gateway.panel.serving.page_guard import ROLE, PageGuard
+from gateway.panel.serving.page_lock import PageLock
+from gateway.panel.serving.path_api import add_paths
+from gateway.panel.serving.recording_files import add_recording_files
 from gateway.panel.shell import build_page
 from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
@@ -40,6 +45,8 @@ log = logging.getLogger(__name__)
 NICENESS: Final = 5
 """The gateway goes before its picture."""
 MAX_CONNECTIONS: Final = 256
+LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
+"""The style sheet of the map library that NiceGUI brings along."""
 
 
 class PanelError(Exception):
@@ -50,6 +57,7 @@ def run_panel(
     settings: PanelSettings,
     recordings: Path,
     connect: str | None,
+    control_socket: Path | None,
     on_link: Callable[[str], None],
     *,
     attached: bool = False,
@@ -64,6 +72,8 @@ def run_panel(
         Folder of the recordings.
     connect : str or None
         A MAVLink endpoint; None for the gateway on this machine.
+    control_socket : Path or None
+        That of the gateway; None for the one that is found.
     on_link : callable
         Given the page's address once it can be opened.
     attached : bool
@@ -76,16 +86,7 @@ def run_panel(
     """
     os.nice(NICENESS)
     sock = _bound(settings)
-    clock, fleet = GatewayClock(), FleetPicture()
-    control = ControlClient(socket_path("run"))
-    uplink = Uplink(connect, fleet, control, clock)
-    history, samples = FieldHistory(), SampleMemory()
-    fleet.listen(history.take)
-    fleet.listen(samples.take)
-    dialogues = Dialogues(fleet, uplink.send, clock)
-    parts = PanelParts(
-        settings, recordings, clock, fleet, control, uplink, history, samples, dialogues
-    )
+    parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
     lock = PageLock(settings.password, settings.viewer_password)
     config = uvicorn.Config(
@@ -107,6 +108,33 @@ def run_panel(
     asyncio.run(_serve(config, sock, parts, on_open, attached=attached))
 
 
+def make_parts(
+    settings: PanelSettings, recordings: Path, connect: str | None, control_socket: Path | None
+) -> PanelParts:
+    """Build what all pages share; see `run_panel`."""
+    clock, fleet = GatewayClock(), FleetPicture()
+    control = ControlClient(control_socket)
+    uplink = Uplink(connect, fleet, control, clock)
+    history, samples = FieldHistory(), SampleMemory()
+    fleet.listen(history.take)
+    fleet.listen(samples.take)
+    dialogues = Dialogues(fleet, uplink.send, clock)
+    watch = GatewayWatch(control, fleet)
+    return PanelParts(
+        settings,
+        recordings,
+        clock,
+        fleet,
+        control,
+        uplink,
+        history,
+        samples,
+        dialogues,
+        watch,
+        Playback(uplink, fleet),
+    )
+
+
 def make_app(parts: PanelParts) -> FastAPI:
     """Build the page and what it fetches."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
@@ -118,7 +146,11 @@ def make_app(parts: PanelParts) -> FastAPI:
     async def _telemetry(websocket: WebSocket) -> None:
         await telemetry.serve(websocket)
 
+    add_paths(app, parts.fleet)
+    MapTiles(parts.settings).serve(app)
+    add_recording_files(app, parts)
     app.mount("/web", StaticFiles(directory=WEB))
+    app.mount("/leaflet", StaticFiles(directory=LEAFLET))
     version = _version_of(WEB)
 
     @ui.page("/")
@@ -151,6 +183,8 @@ async def _serve(
         _end_with_input(server)
     parts.uplink.start()
     parts.dialogues.start()
+    if parts.uplink.is_local:
+        parts.watch.start()
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.01)
@@ -160,6 +194,8 @@ async def _serve(
         await serving
     finally:
         parts.dialogues.close()
+        parts.playback.close()
+        parts.watch.close()
         parts.uplink.close()
 
 

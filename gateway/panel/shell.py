@@ -18,7 +18,10 @@ from gateway.panel.views import (
     calibration_view,
     events_view,
     flight_view,
+    link_view,
+    map_view,
     plots_view,
+    recordings_view,
     tuning_view,
 )
 
@@ -42,6 +45,9 @@ class View:
 
 VIEWS: Final = (
     View("flight", "Flight", "flight", flight_view.build),
+    View("map", "Map", "map", map_view.build),
+    View("link", "Link", "cell_tower", link_view.build),
+    View("recordings", "Recordings", "video_library", recordings_view.build),
     View("calibration", "Calibration", "tune", calibration_view.build),
     View("tuning", "Tuning", "settings", tuning_view.build),
     View("plots", "Plots", "show_chart", plots_view.build),
@@ -65,6 +71,7 @@ def build_page(parts: PanelParts, role: Role, version: str) -> None:
     context = ViewContext(parts, role, ShownUnits(parts.settings.units))
     ui.add_head_html(f'<link rel="stylesheet" href="/web/panel.css?{version}">')
     ui.add_head_html(f'<link rel="stylesheet" href="/web/tools.css?{version}">')
+    ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">')
     ui.add_head_html(f'<script src="/web/telemetry_bus.js?{version}"></script>')
     _Page(context).build()
 
@@ -134,7 +141,7 @@ class _Page:
 
     def _build_button(self, view: View, number: int) -> None:
         button = ui.button(on_click=partial(self.show, view.key)).props("flat no-caps stack")
-        button.props(f'aria-label="{view.title}" aria-keyshortcuts="{number}"')
+        button.props(f'aria-label="{view.title}" aria-keyshortcuts="{number}" data-view={view.key}')
         with button:
             ui.icon(view.icon)
             ui.label(view.title)
@@ -167,7 +174,9 @@ class _Page:
         ids = sorted(fleet.vehicles)
         if ids != self._shown_ids:
             self._shown_ids = ids
-            names = {key: f"{fleet.vehicles[key].model.capitalize()} {key}" for key in ids}
+            if context.system_id not in ids:
+                context.system_id = None
+            names = {key: fleet.vehicles[key].title for key in ids}
             self._choice.set_options(names)
             if context.system_id is None and ids:
                 self._choice.value = ids[0]
@@ -175,6 +184,16 @@ class _Page:
         with self._state:
             for text, kind in _state_of(context):
                 ui.label(text).classes(f"chip {kind}")
+
+
+def _mode_of(context: ViewContext) -> str:
+    """Tell where what is shown comes from."""
+    vehicle, status = context.vehicle, context.parts.watch.status
+    if vehicle is not None and vehicle.origin != "live":
+        return "recording"
+    if status is None:
+        return "MAVLink"
+    return "simulation" if status["simulated"] else "serial"
 
 
 def _state_of(context: ViewContext) -> list[tuple[str, str]]:
@@ -187,4 +206,8 @@ def _state_of(context: ViewContext) -> list[tuple[str, str]]:
         return [(f"silent for {now.silent_s:.0f} s", "bad")]
     has_fix = now.fix_type >= 3
     fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
-    return [("link", "good"), (fix, "good" if has_fix else "bad")]
+    chips = [("link", "good"), (_mode_of(context), ""), (fix, "good" if has_fix else "bad")]
+    recorder = context.parts.watch.recorder
+    if recorder is not None and recorder["state"] != "idle":
+        chips.append(("● REC" if recorder["state"] == "recording" else "not recording", "bad"))
+    return chips

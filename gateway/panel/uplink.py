@@ -38,8 +38,8 @@ ATTEMPTS: Final = 3
 MAX_SENDERS: Final = 64
 """Programs that send through the panel under ids of their own."""
 
-LOCAL_NAME: Final = "panel"
-LOCAL_URL: Final = f"udp-listen:127.0.0.1:0?name={LOCAL_NAME}"
+LOCAL_PLACE: Final = "udp-listen:127.0.0.1:0"
+LOCAL_URL: Final = f"{LOCAL_PLACE}?name=panel"
 PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
 """Where a player that the panel starts sends its frames."""
 
@@ -81,7 +81,7 @@ class Uplink:
         self._listeners: list[Callable[[Any], None]] = []
         self._heard: bytes | None = None
         self._heard_us = -SILENT_US
-        self._local = ""
+        self._local = self._told = ""
         self._acks: dict[tuple[int, int], asyncio.Future[int]] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -252,7 +252,9 @@ class Uplink:
         try:
             port = await self._local_port()
         except ControlError as error:
-            log.debug("no gateway yet: %s", error)
+            if str(error) != self._told:
+                self._told = str(error)
+                log.warning("no MAVLink yet: %s", error)
             return
         url = f"udp:127.0.0.1:{port}?name=gateway"
         if not port or url == self._local:
@@ -266,7 +268,7 @@ class Uplink:
         for _ in range(2):
             status = await self._control.ask("status")
             for listener in status["listeners"]:
-                if listener["name"] == LOCAL_NAME:
+                if listener["endpoint"].partition("?")[0] == LOCAL_PLACE:
                     return int(listener["port"])
             await self._control.ask("clients.add", url=LOCAL_URL)
         return 0

@@ -37,7 +37,9 @@ from nicegui import ui
 from gateway.edges.clock import GatewayClock
 from gateway.panel.control_client import READING, ControlClient
 from gateway.panel.dialogues import Dialogues
+from gateway.panel.gateway_watch import GatewayWatch
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.recording_player import Playback
 from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.sample_memory import SampleMemory
@@ -74,6 +76,16 @@ class PanelParts:
     history: FieldHistory
     samples: SampleMemory
     dialogues: Dialogues
+    watch: GatewayWatch
+    """What the gateway told over its control socket in the last second."""
+    playback: Playback
+    """The recording that is played."""
+
+    @property
+    def recordings_folder(self) -> Path:
+        """Where recordings are: the running gateway's folder, else that of the settings."""
+        recorder = self.watch.recorder
+        return self.recordings if recorder is None else Path(recorder["folder"])
 
 
 @dataclass(eq=False)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
+from gateway.cli.support.asking import SocketOption
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.panel_process import HOW_TO_ADD, LINK
 from gateway.cli.support.settings_options import (
@@ -34,6 +35,7 @@ def panel(
     hash_password: Annotated[
         bool, typer.Option("--hash-password", help="Ask for a password and print its hash.")
     ] = False,
+    socket: SocketOption = None,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
 ) -> None:
     """Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.
@@ -46,7 +48,7 @@ def panel(
     except ModuleNotFoundError as error:
         refuse(f"{HOW_TO_ADD} ({error.name} is missing)")
     if hash_password:
-        from gateway.panel.page_lock import hash_password as hashed
+        from gateway.panel.serving.page_lock import hash_password as hashed
 
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
@@ -57,7 +59,7 @@ def panel(
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = Path(settings.recording.folder).expanduser()
     try:
-        run_panel(wanted, folder, connect, _show_link, attached=attached)
+        run_panel(wanted, folder, connect, socket, _show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))
 

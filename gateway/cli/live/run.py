@@ -109,7 +109,7 @@ async def serve(
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
     daemon.start()
     if panel is not None:
-        panel.start()
+        panel.start(daemon.control_socket)
     try:
         if view is None:
             await _log_lines(daemon, stopped)

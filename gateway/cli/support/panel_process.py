@@ -2,7 +2,9 @@
 
 import asyncio
 import logging
+import os
 import sys
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,9 +43,15 @@ class PanelProcess:
         self._task: asyncio.Task[None] | None = None
         self._child: asyncio.subprocess.Process | None = None
 
-    def start(self) -> None:
-        """Start it; needs a running event loop."""
-        self._task = asyncio.get_running_loop().create_task(self._keep())
+    def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
+        """Start it; needs a running event loop.
+
+        Parameters
+        ----------
+        control_socket : callable
+            Waits for the gateway's control socket and tells where it is.
+        """
+        self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
 
     def close(self) -> None:
         """End it."""
@@ -53,7 +61,8 @@ class PanelProcess:
             with suppress(ProcessLookupError):
                 self._child.terminate()
 
-    async def _keep(self) -> None:
+    async def _keep(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
+        environment = os.environ | {"MAVGATE_SOCKET": str(await control_socket())}
         wait_s = RESTART_S
         while True:
             self._child = await asyncio.create_subprocess_exec(
@@ -62,6 +71,7 @@ class PanelProcess:
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.STDOUT,
+                env=environment,
             )
             await self._read(self._child)
             code = await self._child.wait()

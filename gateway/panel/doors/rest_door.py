@@ -23,7 +23,7 @@ from gateway.panel.doors.message_book import MessageBook
 from gateway.panel.doors.message_json import CLASSES, BadMessageError, from_json, template
 from gateway.panel.doors.message_stream import Follower, MessageStream, pretty
 from gateway.panel.doors.name_filter import EVERYTHING, NameFilters
-from gateway.panel.page_guard import ROLE
+from gateway.panel.serving.page_guard import ROLE
 from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, Role
 

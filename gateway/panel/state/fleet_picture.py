@@ -20,6 +20,8 @@ class FleetPicture:
 
     def __init__(self) -> None:
         self.vehicles: dict[int, VehiclePicture] = {}
+        self.origins: dict[int, str] = {}
+        """Where aircraft are from that are not live: `recorded`, or `re-fused` while played."""
         self.version = 0
         """Counts the messages, so that a reader knows whether there is anything new."""
         self._listeners: list[Listener] = []
@@ -33,6 +35,12 @@ class FleetPicture:
                 self._listeners.remove(listener)
 
         return leave
+
+    def forget(self, system_id: int) -> None:
+        """Let an aircraft go."""
+        self.vehicles.pop(system_id, None)
+        self.origins.pop(system_id, None)
+        self.version += 1
 
     def take(self, message: Any, now_us: int) -> None:
         """Take in one decoded message of anybody.
@@ -52,7 +60,8 @@ class FleetPicture:
         if vehicle is None:
             if len(self.vehicles) >= MAX_VEHICLES:
                 return
-            vehicle = self.vehicles[system_id] = VehiclePicture(system_id)
+            origin = self.origins.get(system_id, "live")
+            vehicle = self.vehicles[system_id] = VehiclePicture(system_id, origin)
         vehicle.take(message, now_us)
         self.version += 1
         for listener in self._listeners:

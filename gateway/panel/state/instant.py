@@ -25,6 +25,10 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """When the newest attitude or position came, on the panel's clock."""
     model: str
     """`plane`, `copter`, `heli`, `rover`, `boat` or `none`; see `VehiclePicture`."""
+    origin: str
+    """`live`, `recorded` or `re-fused`."""
+    generation: int
+    """How often its path began anew."""
     silent_s: float
     """Since the newest heartbeat."""
     q_nb: tuple[float, float, float, float]

@@ -49,10 +49,15 @@ class VehiclePicture:
     ----------
     system_id : int
         MAVLink system.
+    origin : str
+        `live`, `recorded` or `re-fused`.
     """
 
-    def __init__(self, system_id: int) -> None:
+    def __init__(self, system_id: int, origin: str = "live") -> None:
         self.system_id = system_id
+        self.origin = origin
+        self.generation = 0
+        """How often the path began anew."""
         self.newest: dict[str, Any] = {}
         """The newest message of its autopilot by name, as pymavlink decodes it."""
         self.heard_us: dict[str, int] = {}
@@ -90,6 +95,18 @@ class VehiclePicture:
         if taker := self._takers.get(name):
             taker(message, now_us)
 
+    @property
+    def title(self) -> str:
+        """What people call it."""
+        kind = "Aircraft" if self.model == "none" else self.model.capitalize()
+        return f"{kind} {self.system_id}" if self.origin == "live" else f"{kind}, {self.origin}"
+
+    def begin_anew(self) -> None:
+        """Begin the path anew, as after a leap through a recording."""
+        self.track.clear()
+        self.fixes.clear()
+        self.generation += 1
+
     def silent_s(self, now_us: int) -> float:
         """Tell how long no heartbeat came; infinite if none ever did."""
         heard_us = self.heard_us.get("HEARTBEAT")
@@ -122,6 +139,8 @@ class VehiclePicture:
             system_id=self.system_id,
             time_us=self._moved_us,
             model=self.model,
+            origin=self.origin,
+            generation=self.generation,
             silent_s=self.silent_s(now_us),
             q_nb=q_nb,
             roll_rad=roll_pitch_yaw[0],

@@ -1,13 +1,28 @@
 """View 1: the primary flight display, the aircraft in 3D from two viewpoints, the map."""
 
-from nicegui import ui
+from typing import Final
 
-from gateway.panel.view_context import ViewContext
+from nicegui import ui
+from nicegui.element import Element
+
+from gateway.panel.instruments.flight_display import FlightDisplay
+from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.views.map_view import FlightMap
+
+THREE: Final = ui.scene
+"""The 3D library is that of NiceGUI's own scene, whose import makes it known to the page."""
+
+
+class FlightScene(Element, component=WEB / "flight_scene.js"):
+    """The aircraft in 3D, drawn by the browser from the telemetry."""
 
 
 def build(context: ViewContext) -> None:
     """Build the view."""
     with ui.element("div").classes("flight"):
-        ui.element("div").classes("flight-display card")
-        ui.element("div").classes("flight-scene card")
-    del context
+        with ui.element("div").classes("flight-display card"):
+            FlightDisplay()
+        with ui.element("div").classes("flight-map card"):
+            FlightMap(context, full=False)
+        with ui.element("div").classes("flight-scene card"):
+            FlightScene()

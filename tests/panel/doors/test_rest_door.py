@@ -22,9 +22,9 @@ from gateway.panel.control_client import ControlClient
 from gateway.panel.doors.message_json import template
 from gateway.panel.doors.message_stream import MAX_WAITING, MessageStream
 from gateway.panel.doors.rest_door import RestDoor
-from gateway.panel.page_guard import PageGuard
-from gateway.panel.page_lock import PageLock, hash_password
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.serving.page_guard import PageGuard
+from gateway.panel.serving.page_lock import PageLock, hash_password
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.uplink import Uplink
 from gateway.records import Incoming, Outgoing

@@ -17,8 +17,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from gateway.panel.page_lock import PageLock
 from gateway.panel.panel_settings import LOOPBACK, PanelSettings
+from gateway.panel.serving.page_lock import PageLock
 
 COOKIE: Final = "mavgate_panel"
 ROLE: Final = "mavgate.role"

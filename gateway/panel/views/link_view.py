@@ -1,0 +1,203 @@
+"""View 3: the receiver, its nodes, and the gateway's clients."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from nicegui import ui
+
+from gateway.panel.live_table import Cells, LiveTable, RowButton
+from gateway.panel.page_prompts import confirm, notify_failure
+from gateway.panel.view_context import ViewContext
+from gateway.units import US_PER_S
+
+REFRESH_S: Final = 1.0
+SILENT_US: Final = 2 * US_PER_S
+UNKNOWN: Final = "—"
+LOSS_WARN: Final = 5.0
+LOSS_BAD: Final = 20.0
+"""Percent of payloads: above it the estimators live on their memory."""
+
+Record = Mapping[str, Any]
+
+
+class LinkView:
+    """The view's tables.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    """
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        with ui.element("div").classes("cards"):
+            with ui.element("div").classes("card padded"):
+                ui.label("Receiver").classes("title")
+                self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
+                self._nodes = LiveTable(
+                    ("Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age"),
+                    "No node was heard.",
+                )
+            with ui.element("div").classes("card padded"):
+                ui.label("Clients").classes("title")
+                self._build_clients()
+            with ui.element("div").classes("card padded"):
+                ui.label("Listening").classes("title")
+                self._ports = LiveTable(("Port", "State", "Clients", "Turned away"), "No port.")
+            with ui.element("div").classes("card padded"):
+                ui.label("Aircraft over MAVLink").classes("title")
+                self._vehicles = LiveTable(
+                    ("Aircraft", "Heartbeat", "Attitude", "Position", "Messages"),
+                    "No aircraft was heard.",
+                )
+        self._counts: dict[int, int] = {}
+        context.every(REFRESH_S, self.refresh)
+        self.refresh()
+
+    def _build_clients(self) -> None:
+        may = self._context.may_change
+        self._clients = LiveTable(
+            ("Client", "State", "Sent", "Rate", "Dropped", "Received", "Trip", "Heard", "Trust"),
+            "No client.",
+            buttons=[RowButton("close", "Remove this client", self._ask_remove)] if may else (),
+        )
+        if may:
+            with ui.element("div").classes("line"):
+                self._url = ui.input(placeholder="udp:192.168.1.7:14550").props(
+                    'dense outlined aria-label="Endpoint of a new client"'
+                )
+                ui.button("Add", on_click=self._add).props("no-caps")
+
+    async def _add(self) -> None:
+        with notify_failure(self._context):
+            await self._context.ask("clients.add", url=self._url.value.strip())
+            self._url.value = ""
+            await self._context.parts.watch.refresh()
+            self.refresh()
+
+    def _ask_remove(self, name: str) -> None:
+        async def remove() -> None:
+            with notify_failure(self._context):
+                await self._context.ask("clients.remove", name=name)
+                await self._context.parts.watch.refresh()
+                self.refresh()
+
+        confirm(f"Remove the client {name}? It gets nothing more.", "Remove", remove)
+
+    def refresh(self) -> None:
+        """Show the newest status."""
+        self._vehicles.show(self._vehicle_rows())
+        watch = self._context.parts.watch
+        status = watch.status
+        if status is None:
+            self._receiver.set_text("No gateway runs on this machine.")
+            for table in (self._nodes, self._clients, self._ports):
+                table.show({})
+            return
+        self._receiver.set_text(_receiver_line(status))
+        now_us = status["report"]["time_us"]
+        self._nodes.show(
+            {_name_of(node): _node_row(node, now_us) for node in status["report"]["nodes"]}
+        )
+        before = {} if watch.before is None else _sent_by_client(watch.before)
+        span_s = (status["time_us"] - (watch.before or status)["time_us"]) / US_PER_S
+        self._clients.show(
+            {
+                client["name"]: _client_row(client, status["time_us"], before, span_s)
+                for client in status["clients"]
+            }
+        )
+        self._ports.show(
+            {
+                port["name"]: (
+                    (port["name"], ""),
+                    (port["reason"] or port["state"], "bad" if port["reason"] else "good"),
+                    (str(port["clients"]), ""),
+                    (str(port["turned_away"]), "warn" if port["turned_away"] else ""),
+                )
+                for port in status["listeners"]
+            }
+        )
+
+    def _vehicle_rows(self) -> dict[str, Cells]:
+        rows: dict[str, Cells] = {}
+        for system_id, vehicle in sorted(self._context.fleet.vehicles.items()):
+            ages = [self._age(vehicle.heard_us.get(name)) for name in _TELLING]
+            rows[str(system_id)] = (
+                (f"{vehicle.model} {system_id}", ""),
+                *ages,
+                (str(len(vehicle.newest)), ""),
+            )
+        return rows
+
+    def _age(self, heard_us: int | None) -> tuple[str, str]:
+        if heard_us is None:
+            return (UNKNOWN, "")
+        age_us = self._context.now_us - heard_us
+        return (f"{age_us / US_PER_S:.1f} s ago", "bad" if age_us > SILENT_US else "")
+
+
+_TELLING: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
+
+
+def build(context: ViewContext) -> None:
+    """Build the view."""
+    LinkView(context)
+
+
+def _receiver_line(status: Record) -> str:
+    report = status["report"]
+    parts = [
+        f"{report['port']} {'connected' if report['connected'] else 'NOT CONNECTED'}",
+        f"{report['frames']} frames, {report['frames_lost']} lost on the line",
+    ]
+    if (receiver := report["receiver"]) is not None:
+        parts.append(f"channel {receiver['channel']}, noise {receiver['noise_percent']} %")
+    parts += [f"{count} {kind} faults" for kind, count in report["faults"]]
+    return " · ".join(parts)
+
+
+def _name_of(node: Record) -> str:
+    return f"{node['node']['vehicle_id']}.{node['node']['node_id']}"
+
+
+def _node_row(node: Record, now_us: int) -> Cells:
+    total = node["received"] + node["lost"]
+    loss = 100 * node["lost"] / total if total else 0.0
+    age_us = max(0, now_us - node["last_time_us"])
+    kind = "bad" if loss > LOSS_BAD else "warn" if loss > LOSS_WARN else ""
+    return (
+        (_name_of(node), ""),
+        (f"{node['rate_hz']:.0f} Hz", ""),
+        (str(node["received"]), ""),
+        (str(node["lost"]), ""),
+        (f"{loss:.2f} %", kind),
+        (str(node["restarts"]), "warn" if node["restarts"] else ""),
+        (f"{node['clock_skew_ppm']:+.0f} ppm", ""),
+        (f"{age_us / US_PER_S:.1f} s", "bad" if age_us > SILENT_US else "good"),
+    )
+
+
+def _sent_by_client(status: Record) -> dict[int, int]:
+    return {client["client_id"]: client["sent"] for client in status["clients"]}
+
+
+def _client_row(client: Record, now_us: int, before: dict[int, int], span_s: float) -> Cells:
+    sent_before = before.get(client["client_id"])
+    rate = UNKNOWN
+    if sent_before is not None and span_s > 0:
+        rate = f"{(client['sent'] - sent_before) / span_s:.0f} Hz"
+    heard_us, trip_us = client["heard_us"], client["round_trip_us"]
+    is_open = client["state"] == "open"
+    return (
+        (client["name"], ""),
+        (client["reason"] or client["state"], "good" if is_open else "bad"),
+        (str(client["sent"]), ""),
+        (rate, ""),
+        (str(client["dropped"]), "warn" if client["dropped"] else ""),
+        (str(client["received"]), ""),
+        (UNKNOWN if trip_us is None else f"{trip_us / 1000:.1f} ms", ""),
+        ("never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago", ""),
+        ("may change" if client["trusted"] else "may look", ""),
+    )

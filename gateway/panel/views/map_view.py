@@ -1,0 +1,107 @@
+"""View 2: the map."""
+
+import math
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, Final
+
+from msgspec import to_builtins
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.page_prompts import notify_failure
+from gateway.panel.state.instant import Spot
+from gateway.panel.view_context import WEB, ViewContext
+
+LEAFLET: Final = ui.leaflet
+"""The map library is that of NiceGUI's own map, whose import makes it known to the page."""
+
+
+class FlightMap(Element, component=WEB / "flight_map.js"):
+    """The map, drawn by the browser from the telemetry.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    full : bool
+        With its buttons and its clicks, or a small one beside other things.
+    """
+
+    def __init__(self, context: ViewContext, *, full: bool) -> None:
+        super().__init__()
+        styles = context.parts.settings.map_styles
+        self._props["styles"] = [
+            {key: to_builtins(style)[key] for key in ("name", "attribution", "max_zoom")}
+            for style in styles
+        ]
+        self._props["full"] = full
+        if full and context.may_change:
+            self.on("place", partial(_ask, context))
+
+
+def build(context: ViewContext) -> None:
+    """Build the view."""
+    with ui.element("div").classes("card fill"):
+        FlightMap(context, full=True)
+
+
+def _ask(context: ViewContext, event: GenericEventArguments) -> None:
+    """Ask what to do with the place that was clicked."""
+    spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
+    with ui.dialog() as dialog, ui.card().classes("asks"):
+        ui.label(f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}").classes("figure title")
+        ui.label(f"aircraft {context.system_id}").classes("soft")
+
+        def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
+            async def run() -> None:
+                dialog.close()
+                with notify_failure(context):
+                    await act()
+
+            return run
+
+        ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
+        ui.button("Set home here", on_click=then(partial(_set_home, context, spot))).props(
+            "outline"
+        )
+        if context.vehicle is not None and context.vehicle.instant(context.now_us).mark:
+            ui.button("Clear the mark", on_click=then(partial(_clear, context))).props("outline")
+        ui.button("Cancel", on_click=dialog.close).props("flat")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
+def _ground_m(context: ViewContext) -> float:
+    """Take home's height for that of the place: nothing here knows the terrain."""
+    vehicle = context.vehicle
+    if vehicle is None:
+        return math.nan
+    now = vehicle.instant(context.now_us)
+    return now.alt_amsl_m if now.home is None else now.home.alt_amsl_m
+
+
+async def _mark(context: ViewContext, spot: Spot) -> None:
+    await context.command_at(
+        mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
+    )
+    if context.vehicle is not None:
+        context.vehicle.told_mark = spot
+    ui.notify("Marked", type="positive")
+
+
+async def _set_home(context: ViewContext, spot: Spot) -> None:
+    await context.command_at(
+        mavlink.MAV_CMD_DO_SET_HOME, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
+    )
+    ui.notify("Home set", type="positive")
+
+
+async def _clear(context: ViewContext) -> None:
+    await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
+    if context.vehicle is not None:
+        context.vehicle.told_mark = None
+        context.vehicle.newest.pop("NAV_CONTROLLER_OUTPUT", None)
+    ui.notify("Mark cleared", type="positive")

@@ -1,0 +1,240 @@
+"""View 4: recordings, and a flight that is played again."""
+
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from gateway.edges.disk.recordings import delete_recording, list_recordings
+from gateway.panel.live_table import Cells, LiveTable, RowButton
+from gateway.panel.page_prompts import confirm, notify_failure
+from gateway.panel.recording_player import SPEEDS
+from gateway.panel.view_context import WEB, ViewContext
+
+REFRESH_S: Final = 1.0
+PLACE_S: Final = 0.25
+IDLE: Final = "idle"
+STATES: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
+
+
+class TimeSlider(Element, component=WEB / "time_slider.js"):
+    """A slider through a recording; emits `seek` with seconds since its begin."""
+
+
+class UploadButton(Element, component=WEB / "upload_button.js"):
+    """Brings a file; emits `told` with how that went."""
+
+
+class RecordingsView:
+    """The view's elements.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    """
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        with ui.element("div").classes("cards one"):
+            self._player = ui.element("div").classes("card padded").props("data-role=player")
+            with self._player:
+                self._build_player()
+            with ui.element("div").classes("card padded"):
+                self._build_recorder()
+            with ui.element("div").classes("card padded"):
+                with ui.element("div").classes("line"):
+                    ui.label("Recordings").classes("title spring")
+                    if context.may_change:
+                        upload = UploadButton()
+                        upload.props(f":limit={context.parts.settings.upload_limit_mb * 1_000_000}")
+                        upload.on("told", self._on_upload)
+                self._table = LiveTable(
+                    ("Name", "Last written (UTC)", "Size", "Files"),
+                    "Nothing was recorded yet.",
+                    buttons=self._buttons(),
+                )
+        context.every(REFRESH_S, self.refresh)
+        context.every(PLACE_S, self._show_place)
+
+    def _buttons(self) -> list[RowButton]:
+        buttons = [RowButton("play_arrow", "Open", self._open)]
+        buttons += [RowButton("download", "Download", self._download)]
+        if self._context.may_change:
+            buttons += [RowButton("delete", "Delete", self._ask_delete)]
+        return buttons
+
+    def _build_recorder(self) -> None:
+        with ui.element("div").classes("line"):
+            self._state = ui.label().classes("chip").props("data-role=recorder")
+            self._detail = ui.label().classes("soft figure spring")
+            if not self._context.may_change:
+                return
+            start = ui.button("Start", icon="fiber_manual_record", on_click=self._order("start"))
+            start.props('no-caps color=negative aria-label="Start recording"')
+            stop = ui.button("Stop", icon="stop", on_click=self._order("stop"))
+            stop.props('no-caps outline aria-label="Stop recording"')
+        with ui.element("div").classes("line"):
+            self._name = ui.input(placeholder="Name for this recording, or the last one").props(
+                'dense outlined aria-label="Name of the recording"'
+            )
+            ui.button("Save", on_click=self._save).props("no-caps")
+
+    def _build_player(self) -> None:
+        with ui.element("div").classes("line"):
+            self._title = ui.label().classes("title spring")
+            self._twin = ui.switch("re-fused twin", on_change=self._on_twin)
+            ui.button(icon="close", on_click=self._close).props(
+                'flat round dense aria-label="Close the recording"'
+            )
+        self._slider = TimeSlider()
+        self._slider.on("seek", self._on_seek)
+        with ui.element("div").classes("line"):
+            self._toggle = ui.button(icon="pause", on_click=self._on_toggle)
+            self._toggle.props('round dense aria-label="Play or pause"')
+            for icon, to, title in (("replay_10", "-10", "Back"), ("forward_10", "+10", "Ahead")):
+                button = ui.button(icon=icon, on_click=partial(self._play, "seek", to=to))
+                button.props(f'flat round dense aria-label="{title} ten seconds"')
+            self._speed = ui.select(
+                {speed: f"{speed:g}×" for speed in SPEEDS}, value=1, on_change=self._on_speed
+            )
+            self._speed.props('dense borderless options-dense aria-label="Speed"')
+        self._player.set_visibility(False)
+
+    async def refresh(self) -> None:
+        """Show the recorder's state and the folder."""
+        recorder = self._context.parts.watch.recorder
+        if recorder is None:
+            self._state.set_text("no gateway on this machine")
+            self._detail.set_text(str(self._context.parts.recordings))
+        else:
+            self._state.set_text(recorder["state"])
+            self._state.classes(replace=f"chip {STATES.get(recorder['state'], '')}")
+            self._detail.set_text(_detail_of(recorder))
+        recordings = list_recordings(self._context.parts.recordings_folder)
+        self._table.show({entry.name: _row(entry) for entry in reversed(recordings)})
+
+    def _show_place(self) -> None:
+        playback = self._context.parts.playback
+        status = playback.status
+        self._player.set_visibility(status is not None)
+        if status is None:
+            return
+        self._title.set_text(playback.name)
+        self._twin.set_value(playback.has_twin)
+        playing = status["state"] == "playing"
+        self._toggle.props(f"icon={'pause' if playing else 'play_arrow'}")
+        new = {
+            "times": playback.profile.time_s,
+            "heights": playback.profile.alt_amsl_m,
+            "duration": status["duration_s"],
+            "position": round(status["position_s"], 2),
+            "playing": playing,
+            "speed": status["speed"] or SPEEDS[-1],
+        }
+        for key, value in new.items():
+            if self._slider.props.get(key) != value:
+                self._slider.props[key] = value
+
+    def _order(self, word: str) -> Any:
+        async def order() -> None:
+            with notify_failure(self._context):
+                await self._context.ask(f"record.{word}")
+                await self._context.parts.watch.refresh()
+                await self.refresh()
+
+        return order
+
+    async def _save(self) -> None:
+        with notify_failure(self._context):
+            await self._context.ask("record.save", name=self._name.value.strip())
+            ui.notify(f"Saved as {self._name.value.strip()}", type="positive")
+            self._name.value = ""
+            await self._context.parts.watch.refresh()
+            await self.refresh()
+
+    def _ask_delete(self, name: str) -> None:
+        confirm(f"Delete the recording {name} for ever?", "Delete", partial(self._delete, name))
+
+    async def _delete(self, name: str) -> None:
+        context = self._context
+        with notify_failure(context):
+            context.check_may_change()
+            if context.parts.watch.recorder is None:
+                delete_recording(context.parts.recordings_folder, name)
+            else:
+                await context.ask("record.delete", name=name)
+            ui.notify(f"{name} is deleted", type="positive")
+            await self.refresh()
+
+    def _download(self, name: str) -> None:
+        ui.download.from_url(f"/recordings/{quote(name)}")
+
+    async def _on_upload(self, event: GenericEventArguments) -> None:
+        ui.notify(event.args["text"], type="positive" if event.args["ok"] else "negative")
+        await self.refresh()
+
+    async def _open(self, name: str, *, twin: bool = False) -> None:
+        context = self._context
+        with notify_failure(context):
+            context.check_may_change()
+            ui.notify(f"Opening {name}…")
+            await context.parts.playback.open(context.parts.recordings_folder, name, twin=twin)
+            self._show_place()
+
+    async def _on_twin(self, event: Any) -> None:
+        playback = self._context.parts.playback
+        if playback.name and event.value != playback.has_twin:
+            await self._open(playback.name, twin=event.value)
+
+    def _close(self) -> None:
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            self._context.parts.playback.close()
+            self._show_place()
+
+    async def _play(self, verb: str, **params: Any) -> None:
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            await self._context.parts.playback.order(verb, **params)
+            self._show_place()
+
+    async def _on_seek(self, event: GenericEventArguments) -> None:
+        await self._play("seek", to=f"{float(event.args):.2f}")
+
+    async def _on_toggle(self) -> None:
+        status = self._context.parts.playback.status or {}
+        playing = status.get("state") == "playing"
+        await self._play("play.pause" if playing else "play.resume")
+
+    async def _on_speed(self, event: Any) -> None:
+        await self._play("play.speed", speed=float(event.value))
+
+
+def build(context: ViewContext) -> None:
+    """Build the view."""
+    RecordingsView(context)
+
+
+def _detail_of(recorder: dict[str, Any]) -> str:
+    parts = [recorder["reason"]] if recorder["reason"] else []
+    if recorder["name"] and recorder["state"] != IDLE:
+        parts += [recorder["name"], f"{recorder['part_bytes'] / 1e6:.1f} MB"]
+    parts += [f"{recorder['free_bytes'] / 1e9:.1f} GB free in {recorder['folder']}"]
+    return " · ".join(parts)
+
+
+def _row(recording: Any) -> Cells:
+    when = datetime.fromtimestamp(recording.modified_s, UTC)
+    kinds = sorted({Path(file).suffix.lstrip(".") for file in recording.files})
+    return (
+        (recording.name, ""),
+        (f"{when:%Y-%m-%d %H:%M:%S}", ""),
+        (f"{recording.size / 1e6:.2f} MB", ""),
+        (f"{len(recording.files)} {'+'.join(kinds)}", ""),
+    )

@@ -1,0 +1,299 @@
+// The map: fused track and GPS fixes apart, home, mark, accuracy; a metric grid below everything.
+import { leaflet as L } from "nicegui-leaflet";
+
+const EARTH_M = 6378137;
+const rad = Math.PI / 180;
+const CIRCLE_95 = 2.4477 / Math.SQRT2; // of the root of both axes' variances, as a radius
+const MAX_POINTS = 20000;
+const AIRCRAFT = {
+  plane: "M16 2c1.4 0 2 2 2 5v5l12 6v3l-12-3v7l4 3v2l-6-1.6L10 30v-2l4-3v-7L2 21v-3l12-6V7c0-3 .6-5 2-5z",
+  copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
+  none: "M16 3l9 25-9-6-9 6z",
+};
+const COLOURS = { recorded: "recorded", "re-fused": "twin" };
+const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
+const at = (spot) => [spot.lat_deg, spot.lon_deg];
+
+// Lines every 1, 2 or 5 times ten to the n metres from home, with their distance at the edge.
+const MetricGrid = L.Layer.extend({
+  origin: null,
+  onAdd(map) {
+    this.canvas = L.DomUtil.create("canvas", "map-grid", map.getPane("grid"));
+    map.on("move zoom resize viewreset", this.draw, this);
+    this.draw();
+  },
+  onRemove(map) {
+    this.canvas.remove();
+    map.off("move zoom resize viewreset", this.draw, this);
+  },
+  draw() {
+    const map = this._map;
+    if (!map) return;
+    const size = map.getSize();
+    const ratio = window.devicePixelRatio || 1;
+    L.DomUtil.setPosition(this.canvas, map.containerPointToLayerPoint([0, 0]));
+    this.canvas.width = size.x * ratio;
+    this.canvas.height = size.y * ratio;
+    this.canvas.style.width = `${size.x}px`;
+    this.canvas.style.height = `${size.y}px`;
+    const pen = this.canvas.getContext("2d");
+    pen.scale(ratio, ratio);
+    pen.fillStyle = mavgate.colour("map");
+    pen.fillRect(0, 0, size.x, size.y);
+    if (!this.origin) return;
+    const [lat, lon] = this.origin;
+    const here = map.latLngToContainerPoint(this.origin);
+    const east = map.latLngToContainerPoint([lat, lon + 0.001]);
+    const factor = mavgate.factor("length");
+    const per_unit = ((east.x - here.x) / (0.001 * rad * Math.cos(lat * rad) * EARTH_M)) * factor;
+    const wanted = 90 / per_unit;
+    const power = 10 ** Math.floor(Math.log10(wanted));
+    const step = [1, 2, 5, 10].find((times) => times * power >= wanted) * power;
+    this.canvas.dataset.step = step;
+    const unit = mavgate.show("length", 0)[1];
+    const pixels = step * per_unit;
+    pen.strokeStyle = mavgate.colour("grid");
+    pen.fillStyle = mavgate.colour("soft");
+    pen.font = "10px system-ui";
+    pen.lineWidth = 1;
+    const lines = (from, end, origin, draw) => {
+      for (let n = Math.ceil((from - origin) / pixels); origin + n * pixels <= end; n++) {
+        pen.globalAlpha = n % 5 === 0 ? 0.9 : 0.45;
+        draw(origin + n * pixels, `${Math.round(n * step * 1000) / 1000} ${unit}`);
+      }
+    };
+    const stroke = (x1, y1, x2, y2) => {
+      pen.beginPath();
+      pen.moveTo(x1, y1);
+      pen.lineTo(x2, y2);
+      pen.stroke();
+    };
+    lines(0, size.x, here.x, (x, text) => {
+      stroke(x, 0, x, size.y);
+      pen.fillText(text, x + 3, size.y - 5);
+    });
+    lines(0, size.y, here.y, (y, text) => {
+      stroke(0, y, size.x, y);
+      pen.fillText(text.startsWith("-") ? text.slice(1) : text === `0 ${unit}` ? text : `-${text}`, 4, y - 3);
+    });
+  },
+});
+
+export default {
+  template: `
+    <div class="map" :data-follow="follow">
+      <div class="map-canvas" ref="map"></div>
+      <div class="map-tools">
+        <select v-if="styles.length" v-model="style" aria-label="Map style" class="map-style">
+          <option v-for="(s, i) in styles" :key="i" :value="i">{{ s.name }}</option>
+          <option :value="-1">Grid</option>
+        </select>
+        <button :aria-pressed="follow" @click="follow = !follow" title="Keep the aircraft in the middle">{{ follow ? "Following" : "Follow" }}</button>
+        <button v-if="full" @click="fit" title="Show all of the path">Fit</button>
+        <button v-if="full" @click="clear" title="Begin the drawn path anew">Clear path</button>
+      </div>
+      <div class="map-place" v-if="place">
+        <span class="figure" data-role="place">{{ place }}</span>
+        <button @click="copy" title="Copy latitude and longitude">{{ copied ? "Copied" : "Copy" }}</button>
+      </div>
+      <div class="map-legend" v-if="full">
+        <span class="key track">fused</span><span class="key fix">GPS</span>
+        <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
+        <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
+      </div>
+    </div>`,
+  props: { styles: Array, full: Boolean },
+  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "" }),
+
+  mounted() {
+    const map = (this.map = L.map(this.$refs.map, {
+      center: [0, 0], zoom: 3, zoomControl: this.full, attributionControl: true, preferCanvas: true, worldCopyJump: true,
+    }));
+    map.attributionControl.setPrefix("");
+    map.createPane("grid").style.zIndex = 150;
+    map.createPane("fixes").style.zIndex = 390;
+    L.control.scale({ imperial: false }).addTo(map);
+    this.grid = new MetricGrid().addTo(map);
+    this.dots = L.canvas({ pane: "fixes" });
+    this.craft = {};
+    this.mark = L.marker([0, 0], { icon: icon('<svg viewBox="0 0 24 24" class="pin mark"><path d="M12 1v22M1 12h22M12 5a7 7 0 1 0 .1 0z"/></svg>', 26), interactive: false });
+    this.bearing = L.polyline([], { weight: 2, dashArray: "6 6" });
+    this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false });
+    this.accuracy = L.circle([0, 0], { radius: 1, weight: 1, fillOpacity: 0.12, interactive: false });
+    map.on("click", (event) => this.full && this.$emit("place", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
+    map.on("dragstart", () => (this.follow = false));
+    this.$watch("style", () => this.set_style());
+    this.set_style();
+    this.paint();
+    this.theme = new MutationObserver(() => this.paint());
+    this.theme.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.size = new ResizeObserver(() => map.invalidateSize({ animate: false }));
+    this.size.observe(this.$el);
+    this.stop = mavgate.subscribe(() => (this.stale = true));
+    let drawn_ms = 0;
+    const draw = (now_ms) => {
+      this.handle = requestAnimationFrame(draw);
+      if (!this.stale || now_ms - drawn_ms < 60 || !this.$el.offsetParent) return;
+      drawn_ms = now_ms;
+      this.stale = false;
+      this.draw();
+    };
+    draw(100);
+    this.$el.mavgate_map = map;
+  },
+  unmounted() {
+    cancelAnimationFrame(this.handle);
+    this.stop?.();
+    this.theme?.disconnect();
+    this.size?.disconnect();
+    this.map?.remove();
+  },
+
+  methods: {
+    set_style() {
+      this.tiles?.remove();
+      const style = this.styles[this.style];
+      if (!style) return;
+      this.tiles = L.tileLayer(`/tiles/${this.style}/{z}/{x}/{y}`, {
+        maxZoom: 22, maxNativeZoom: style.max_zoom, attribution: style.attribution, errorTileUrl: "",
+      }).addTo(this.map);
+    },
+    paint() {
+      this.mark_colour = mavgate.colour("mark");
+      this.bearing.setStyle({ color: this.mark_colour });
+      this.accuracy.setStyle({ color: mavgate.colour("track"), fillColor: mavgate.colour("track") });
+      for (const one of Object.values(this.craft)) {
+        one.track.setStyle({ color: mavgate.colour(one.colour) });
+        one.fixes.eachLayer((dot) => dot.setStyle({ color: mavgate.colour("fix") }));
+      }
+      this.grid.draw();
+    },
+    make(id, state) {
+      const path = `<svg viewBox="0 0 32 32" class="craft"><path d="${AIRCRAFT[state.model] ?? AIRCRAFT.none}"/></svg>`;
+      const one = {
+        marker: L.marker(at(state), { icon: icon(path, 34), title: `Aircraft ${id}`, interactive: false }).addTo(this.map),
+        generation: state.generation,
+        colour: COLOURS[state.origin] ?? "track",
+        track: L.polyline([], { color: mavgate.colour(COLOURS[state.origin] ?? "track"), weight: 3, interactive: false }).addTo(this.map),
+        fixes: L.layerGroup().addTo(this.map),
+        fix: "",
+      };
+      this.fetch_path(id, one);
+      return one;
+    },
+    async fetch_path(id, one) {
+      const answer = await fetch(`/path/${id}`);
+      if (!answer.ok) return;
+      const { track, fixes } = await answer.json();
+      one.track.setLatLngs([...track.map(([lat, lon]) => [lat, lon]), ...one.track.getLatLngs()]);
+      for (const [lat, lon] of fixes.slice(-2000)) this.dot(one, [lat, lon]);
+    },
+    dot(one, place) {
+      L.circleMarker(place, { pane: "fixes", radius: 1.8, weight: 1, fill: false, color: mavgate.colour("fix"), interactive: false, renderer: this.dots }).addTo(one.fixes);
+      const dots = one.fixes.getLayers();
+      if (dots.length > 2500) for (const old of dots.slice(0, 500)) one.fixes.removeLayer(old);
+    },
+    draw() {
+      for (const [id, state] of Object.entries(mavgate.vehicles)) {
+        if (state.lat_deg === null) continue;
+        const one = (this.craft[id] ??= this.make(id, state));
+        if (one.generation !== state.generation) {
+          one.generation = state.generation;
+          one.track.setLatLngs([]);
+          one.fixes.clearLayers();
+        }
+        one.marker.setLatLng(at(state));
+        const arrow = one.marker.getElement()?.querySelector("svg");
+        if (arrow) {
+          arrow.style.transform = `rotate(${state.heading_deg ?? 0}deg)`;
+          arrow.dataset.selected = id === mavgate.selected;
+        }
+        const last = one.track.getLatLngs().at(-1);
+        if (!last || this.map.distance(last, at(state)) > 1) {
+          one.track.addLatLng(at(state));
+          if (one.track.getLatLngs().length > MAX_POINTS) one.track.setLatLngs(one.track.getLatLngs().slice(MAX_POINTS / 4));
+        }
+        if (state.fix && one.fix !== String(at(state.fix))) {
+          one.fix = String(at(state.fix));
+          this.dot(one, at(state.fix));
+        }
+      }
+      for (const [id, one] of Object.entries(this.craft)) {
+        if (id in mavgate.vehicles) continue;
+        for (const layer of [one.marker, one.track, one.fixes]) layer.remove();
+        delete this.craft[id];
+      }
+      this.draw_selected(mavgate.state);
+    },
+    draw_selected(state) {
+      if (!state || state.lat_deg === null) return;
+      const here = at(state);
+      this.toggle(this.home, state.home, () => this.home.setLatLng(at(state.home)));
+      const origin = state.home ? at(state.home) : (this.grid.origin ?? here);
+      if (String(origin) !== String(this.grid.origin)) {
+        this.grid.origin = origin;
+        this.grid.draw();
+      }
+      this.toggle(this.mark, state.mark, () => this.mark.setLatLng(at(state.mark)));
+      this.toggle(this.bearing, state.mark, () => this.bearing.setLatLngs([here, at(state.mark)]));
+      const radius = state.pos_std_m === null ? null : CIRCLE_95 * state.pos_std_m;
+      this.toggle(this.accuracy, radius !== null, () => this.accuracy.setLatLng(here).setRadius(radius));
+      this.circle = radius === null ? "" : mavgate.show("length", radius).join(" ");
+      this.way = "";
+      if (state.mark) {
+        const told = state.mark_distance_m !== null;
+        const distance = told ? state.mark_distance_m : this.map.distance(here, at(state.mark));
+        const bearing = told ? state.mark_bearing_deg : bearing_deg(here, at(state.mark));
+        this.way = `mark ${mavgate.show("distance", distance, 2).join(" ")}, ${Math.round(bearing) % 360}°`;
+      }
+      this.place = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;
+      if (!this.placed) {
+        this.placed = true;
+        this.map.setView(here, 17, { animate: false });
+      } else if (this.follow) {
+        this.map.panTo(here, { animate: false });
+      }
+    },
+    toggle(layer, shown, place) {
+      if (shown) {
+        place();
+        if (!this.map.hasLayer(layer)) layer.addTo(this.map);
+      } else if (this.map.hasLayer(layer)) {
+        layer.remove();
+      }
+    },
+    fit() {
+      this.follow = false;
+      const tracks = Object.values(this.craft).map((one) => one.track.getBounds());
+      const all = tracks.reduce((sum, bounds) => sum.extend(bounds), L.latLngBounds([]));
+      if (all.isValid()) this.map.fitBounds(all.pad(0.1));
+    },
+    clear() {
+      for (const one of Object.values(this.craft)) {
+        one.track.setLatLngs([]);
+        one.fixes.clearLayers();
+      }
+    },
+    async copy() {
+      try {
+        await navigator.clipboard.writeText(this.place);
+      } catch {
+        // Without TLS a browser gives no clipboard but by way of a selection.
+        const box = Object.assign(document.createElement("textarea"), { value: this.place });
+        document.body.append(box);
+        box.select();
+        document.execCommand("copy");
+        box.remove();
+      }
+      this.copied = true;
+      setTimeout(() => (this.copied = false), 1500);
+    },
+  },
+};
+
+function bearing_deg([lat, lon], [to_lat, to_lon]) {
+  const turn = (to_lon - lon) * rad;
+  const y = Math.sin(turn) * Math.cos(to_lat * rad);
+  const x = Math.cos(lat * rad) * Math.sin(to_lat * rad) - Math.sin(lat * rad) * Math.cos(to_lat * rad) * Math.cos(turn);
+  return (Math.atan2(y, x) / rad + 360) % 360;
+}

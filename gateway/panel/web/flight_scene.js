@@ -1,0 +1,439 @@
+// The aircraft in 3D from two viewpoints: one world, drawn twice.
+//
+// World: metres, x east, y north, z up; its origin is home, or the first place that was told.
+// Aircraft models stand in x forward, y left, z up.
+import { THREE } from "nicegui-scene";
+
+const EARTH_M = 6378137;
+const TAIL = 6000; // points of a path
+const STEP_M = 1.5; // between them
+const AHEAD_S = 0.25; // no pose is foretold further
+const FRAME_MS = 30;
+const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "Beside" };
+const SPAN_M = 2; // of the models
+const COLOURS = { recorded: "recorded", "re-fused": "twin" };
+const rad = Math.PI / 180;
+
+function material(colour, extra = {}) {
+  return new THREE.MeshStandardMaterial({ color: colour, roughness: 0.55, metalness: 0.05, ...extra });
+}
+
+function box(group, size, at, colour) {
+  const mesh = new THREE.Mesh(new THREE.BoxGeometry(...size), material(colour));
+  mesh.position.set(...at);
+  group.add(mesh);
+  return mesh;
+}
+
+// A tapered, swept surface between two chords, thin.
+function surface(group, root, tip, colour) {
+  const thick = 0.018;
+  const [rx, ry, rz, rc] = root;
+  const [tx, ty, tz, tc] = tip;
+  const corners = [];
+  for (const z of [thick, -thick])
+    corners.push([rx, ry, rz + z], [rx - rc, ry, rz + z], [tx - tc, ty, tz + z], [tx, ty, tz + z]);
+  const faces = [0, 1, 2, 0, 2, 3, 6, 5, 4, 7, 6, 4, 3, 2, 6, 3, 6, 7, 0, 4, 5, 0, 5, 1, 0, 3, 7, 0, 7, 4];
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(corners.flat(), 3));
+  geometry.setIndex(faces);
+  const flat = geometry.toNonIndexed();
+  flat.computeVertexNormals();
+  group.add(new THREE.Mesh(flat, material(colour, { side: THREE.DoubleSide })));
+}
+
+function plane(main, trim) {
+  const group = new THREE.Group();
+  const profile = [[0, 0.72], [0.05, 0.7], [0.1, 0.55], [0.11, 0.2], [0.1, -0.1], [0.05, -0.45], [0.028, -0.86], [0, -0.88]];
+  const body = new THREE.Mesh(
+    new THREE.LatheGeometry(profile.map(([r, x]) => new THREE.Vector2(r, x)), 18),
+    material(main),
+  );
+  body.rotation.z = -Math.PI / 2;
+  group.add(body);
+  const canopy = new THREE.Mesh(new THREE.SphereGeometry(0.1, 16, 10), material("#1b2b3a", { roughness: 0.2 }));
+  canopy.scale.set(2.1, 0.75, 0.75);
+  canopy.position.set(0.28, 0, 0.075);
+  group.add(canopy);
+  for (const side of [1, -1]) {
+    surface(group, [0.26, 0.06 * side, 0.03, 0.34], [0.16, 0.86 * side, 0.09, 0.2], main);
+    surface(group, [0.16, 0.86 * side, 0.09, 0.2], [0.13, 1.0 * side, 0.105, 0.15], trim);
+    surface(group, [-0.6, 0.03 * side, 0.02, 0.2], [-0.68, 0.36 * side, 0.03, 0.12], trim);
+  }
+  const fin = new THREE.Group();
+  surface(fin, [0, 0, 0, 0.24], [-0.14, 0.32, 0, 0.12], trim);
+  fin.rotation.x = Math.PI / 2;
+  fin.position.set(-0.58, 0, 0.02);
+  group.add(fin);
+  const disc = new THREE.Mesh(
+    new THREE.CircleGeometry(0.24, 32),
+    material("#9fb3c4", { transparent: true, opacity: 0.28, side: THREE.DoubleSide }),
+  );
+  disc.rotation.y = Math.PI / 2;
+  disc.position.x = 0.74;
+  group.add(disc);
+  return group;
+}
+
+function copter(main, trim) {
+  const group = new THREE.Group();
+  const body = new THREE.Mesh(new THREE.SphereGeometry(0.22, 20, 12), material(main));
+  body.scale.set(1.5, 0.95, 0.5);
+  group.add(body);
+  box(group, [0.12, 0.1, 0.06], [0.32, 0, 0.0], "#1b2b3a");
+  for (const [x, y] of [[1, 1], [1, -1], [-1, 1], [-1, -1]]) {
+    const arm = box(group, [0.86, 0.06, 0.05], [x * 0.3, y * 0.3, 0.02], main);
+    arm.rotation.z = Math.atan2(y, x);
+    const motor = new THREE.Mesh(new THREE.CylinderGeometry(0.06, 0.07, 0.12, 16), material("#33414e"));
+    motor.rotation.x = Math.PI / 2;
+    motor.position.set(x * 0.6, y * 0.6, 0.07);
+    group.add(motor);
+    const rotor = new THREE.Mesh(
+      new THREE.CircleGeometry(0.34, 32),
+      material(x > 0 ? trim : "#9fb3c4", { transparent: true, opacity: 0.4, side: THREE.DoubleSide }),
+    );
+    rotor.position.set(x * 0.6, y * 0.6, 0.14);
+    group.add(rotor);
+    box(group, [0.03, 0.03, 0.22], [x * 0.18, y * 0.2, -0.18], "#33414e");
+  }
+  return group;
+}
+
+function dart(main) {
+  const group = new THREE.Group();
+  const cone = new THREE.Mesh(new THREE.ConeGeometry(0.3, 1.3, 4), material(main, { flatShading: true }));
+  cone.rotation.z = -Math.PI / 2;
+  group.add(cone);
+  return group;
+}
+
+const MODELS = { plane, copter, heli: copter };
+
+class Path {
+  constructor(scene, colour) {
+    this.positions = new Float32Array(TAIL * 3);
+    this.count = 0;
+    const line = () => {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(this.positions, 3));
+      return geometry;
+    };
+    this.line = new THREE.Line(line(), new THREE.LineBasicMaterial({ color: colour }));
+    this.shadow = new THREE.Line(line(), new THREE.LineBasicMaterial({ color: "#000000", transparent: true, opacity: 0.25 }));
+    this.shadow.scale.z = 0;
+    this.stalk = new THREE.Line(
+      new THREE.BufferGeometry().setFromPoints([new THREE.Vector3(), new THREE.Vector3()]),
+      new THREE.LineBasicMaterial({ color: colour, transparent: true, opacity: 0.5 }),
+    );
+    for (const part of this.parts()) {
+      part.frustumCulled = false;
+      scene.add(part);
+    }
+  }
+  parts() {
+    return [this.line, this.shadow, this.stalk];
+  }
+  add(point) {
+    const n = this.count;
+    if (n) {
+      const [x, y, z] = this.positions.subarray((n - 1) * 3, n * 3);
+      if (Math.hypot(point.x - x, point.y - y, point.z - z) < STEP_M) return;
+    }
+    if (n === TAIL) {
+      // The older half goes, so that moving it is seldom.
+      this.positions.copyWithin(0, (TAIL / 2) * 3);
+      this.count = TAIL / 2;
+    }
+    this.positions.set([point.x, point.y, point.z], this.count * 3);
+    this.count += 1;
+    for (const part of [this.line, this.shadow]) {
+      part.geometry.setDrawRange(0, this.count);
+      part.geometry.attributes.position.needsUpdate = true;
+    }
+  }
+  end(point) {
+    this.stalk.geometry.attributes.position.setXYZ(0, point.x, point.y, point.z);
+    this.stalk.geometry.attributes.position.setXYZ(1, point.x, point.y, 0);
+    this.stalk.geometry.attributes.position.needsUpdate = true;
+  }
+  clear() {
+    this.count = 0;
+    for (const part of [this.line, this.shadow]) part.geometry.setDrawRange(0, 0);
+  }
+}
+
+export default {
+  template: `
+    <div class="scene" tabindex="0" aria-label="Aircraft in 3D">
+      <canvas></canvas>
+      <div v-for="(view, i) in views" :key="i" class="scene-view" :data-place="i">
+        <select class="scene-choice" v-model="views[i]" :aria-label="'Viewpoint ' + (i + 1)">
+          <option v-for="(title, key) in titles" :key="key" :value="key">{{ title }}</option>
+        </select>
+        <span class="scene-note">{{ notes[i] }}</span>
+      </div>
+      <div v-if="trouble" class="scene-trouble">{{ trouble }}</div>
+    </div>`,
+  data: () => ({ views: ["chase", "ground"], titles: VIEWS, notes: ["", ""], trouble: "" }),
+
+  mounted() {
+    this.canvas = this.$el.querySelector("canvas");
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true });
+    } catch {
+      this.trouble = "This browser draws no 3D (WebGL is off).";
+      return;
+    }
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 1.5));
+    this.renderer.setScissorTest(true);
+    this.aircraft = {};
+    this.origin = null;
+    this.drawn_ms = 0;
+    this.swing = { azimuth: 0, elevation: 14, distance: 6.5 };
+    this.build_world();
+    this.observer = new ResizeObserver(() => this.resize());
+    this.observer.observe(this.$el);
+    this.stop = mavgate.subscribe(() => this.take());
+    this.theme = new MutationObserver(() => this.paint());
+    this.theme.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.$el.addEventListener("pointermove", (event) => this.drag(event));
+    this.$el.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    this.resize();
+    const draw = (now_ms) => {
+      this.handle = requestAnimationFrame(draw);
+      if (now_ms - this.drawn_ms < FRAME_MS || !this.$el.offsetParent) return;
+      this.drawn_ms = now_ms;
+      this.draw();
+    };
+    draw(0);
+  },
+  unmounted() {
+    cancelAnimationFrame(this.handle);
+    this.stop?.();
+    this.observer?.disconnect();
+    this.theme?.disconnect();
+    this.renderer?.dispose();
+  },
+
+  methods: {
+    build_world() {
+      this.scene = new THREE.Scene();
+      this.sun = new THREE.DirectionalLight("#ffffff", 2.2);
+      this.sun.position.set(-60, -40, 90);
+      this.fill = new THREE.HemisphereLight("#ffffff", "#88775f", 1.6);
+      this.scene.add(this.sun, this.fill);
+      this.ground = new THREE.Mesh(new THREE.CircleGeometry(8000, 48), new THREE.MeshBasicMaterial());
+      this.ground.position.z = -0.3;
+      this.fine = new THREE.GridHelper(1000, 100);
+      this.coarse = new THREE.GridHelper(16000, 160);
+      this.coarse.position.z = -0.15;
+      for (const grid of [this.fine, this.coarse]) {
+        grid.rotation.x = Math.PI / 2;
+        grid.material.transparent = true;
+        this.scene.add(grid);
+      }
+      const home = new THREE.Group();
+      this.pad = new THREE.Mesh(new THREE.RingGeometry(2.2, 3, 40), new THREE.MeshBasicMaterial({ side: THREE.DoubleSide }));
+      this.pole = new THREE.Mesh(new THREE.CylinderGeometry(0.12, 0.12, 6, 8), new THREE.MeshBasicMaterial());
+      this.pole.rotation.x = Math.PI / 2;
+      this.pole.position.z = 3;
+      home.add(this.pad, this.pole);
+      this.beacon = new THREE.Mesh(new THREE.CylinderGeometry(0.5, 0.5, 60, 10), new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.55 }));
+      this.beacon.rotation.x = Math.PI / 2;
+      this.beacon.visible = false;
+      this.scene.add(this.ground, home, this.beacon);
+      this.cameras = [0, 1].map(() => {
+        const camera = new THREE.PerspectiveCamera(55, 1, 0.1, 12000);
+        camera.up.set(0, 0, 1);
+        return camera;
+      });
+      this.paint();
+    },
+    paint() {
+      const sky = mavgate.colour("sky-far");
+      this.scene.background = new THREE.Color(sky);
+      this.scene.fog = new THREE.Fog(sky, 150, 2600);
+      this.ground.material.color.set(mavgate.colour("terrain"));
+      for (const [grid, opacity] of [[this.fine, 0.28], [this.coarse, 0.5]]) {
+        grid.material.color.set(mavgate.colour("terrain-line"));
+        grid.material.vertexColors = false;
+        grid.material.opacity = opacity;
+        grid.material.needsUpdate = true;
+      }
+      this.pad.material.color.set(mavgate.colour("home"));
+      this.pole.material.color.set(mavgate.colour("home"));
+      this.beacon.material.color.set(mavgate.colour("mark"));
+      for (const id of Object.keys(this.aircraft)) this.forget(id);
+    },
+    place(lat, lon, alt) {
+      const o = this.origin;
+      const cos = Math.cos(o.lat * rad);
+      let east = lon - o.lon;
+      if (east > 180) east -= 360;
+      if (east < -180) east += 360;
+      return new THREE.Vector3(east * rad * cos * EARTH_M, (lat - o.lat) * rad * EARTH_M, alt - o.alt);
+    },
+    take() {
+      const now_ms = performance.now();
+      for (const [id, state] of Object.entries(mavgate.vehicles)) {
+        if (state.lat_deg === null || state.alt_amsl_m === null) continue;
+        this.set_origin(state);
+        const craft = (this.aircraft[id] ??= this.make(id, state));
+        if (craft.model !== state.model || craft.generation !== state.generation) {
+          this.forget(id);
+          continue;
+        }
+        const point = this.place(state.lat_deg, state.lon_deg, state.alt_amsl_m);
+        if (!craft.point || craft.point.distanceToSquared(point) > 0) {
+          if (craft.point && craft.point.distanceTo(point) > 500) craft.path.clear();
+          craft.point = point;
+          craft.moved_ms = now_ms;
+          craft.path.add(point);
+        }
+        craft.state = state;
+        craft.turned_ms = now_ms;
+      }
+      for (const id of Object.keys(this.aircraft)) if (!(id in mavgate.vehicles)) this.forget(id);
+      const mark = mavgate.state?.mark;
+      this.beacon.visible = Boolean(mark && this.origin);
+      if (this.beacon.visible) this.beacon.position.copy(this.place(mark.lat_deg, mark.lon_deg, this.origin.alt + 30));
+    },
+    set_origin(state) {
+      const home = state.home;
+      const here = home ?? state;
+      const wanted = { lat: here.lat_deg, lon: here.lon_deg, alt: here.alt_amsl_m, by_home: Boolean(home) };
+      const moved = this.origin && Math.hypot(wanted.lat - this.origin.lat, wanted.lon - this.origin.lon) > 1e-4;
+      if (!this.origin || (wanted.by_home && !this.origin.by_home) || (moved && wanted.by_home && this.owner === state.system_id)) {
+        this.origin = wanted;
+        this.owner = state.system_id;
+        for (const id of Object.keys(this.aircraft)) this.forget(id);
+      }
+    },
+    make(id, { model, origin, generation }) {
+      const main = id === mavgate.selected ? "#f2f5f7" : "#b9c6d1";
+      const group = (MODELS[model] ?? dart)(main, "#e0592a");
+      group.userData.yardstick = SPAN_M;
+      this.scene.add(group);
+      const craft = { group, model, generation, path: new Path(this.scene, mavgate.colour(COLOURS[origin] ?? "track")), state: null, point: null };
+      craft.pose = new THREE.Quaternion();
+      this.fetch_path(id, craft);
+      return craft;
+    },
+    async fetch_path(id, craft) {
+      const answer = await fetch(`/path/${id}`);
+      if (!answer.ok) return;
+      const { track } = await answer.json();
+      const since = Array.from(craft.path.positions.subarray(0, craft.path.count * 3));
+      craft.path.clear();
+      for (const [lat, lon, alt] of track.slice(-TAIL / 2)) craft.path.add(this.place(lat, lon, alt));
+      for (let i = 0; i < since.length; i += 3) craft.path.add(new THREE.Vector3(...since.slice(i, i + 3)));
+    },
+    forget(id) {
+      const craft = this.aircraft[id];
+      if (!craft) return;
+      this.scene.remove(craft.group, ...craft.path.parts());
+      delete this.aircraft[id];
+    },
+    pose(craft, now_ms) {
+      const { state, group } = craft;
+      const turned_s = Math.min((now_ms - craft.turned_ms) / 1000, AHEAD_S);
+      const moved_s = Math.min((now_ms - craft.moved_ms) / 1000, AHEAD_S);
+      if (state.q_nb[0] !== null) {
+        const [w, x, y, z] = state.q_nb;
+        const q_nb = new THREE.Quaternion(x, y, z, w);
+        const [p, q, r] = state.rate_b_radps.map((rate) => (rate ?? 0) * turned_s);
+        const angle = Math.hypot(p, q, r);
+        if (angle > 1e-6) q_nb.multiply(new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(p, q, r).normalize(), angle));
+        // FRD to NED becomes x forward, y left, z up to east, north, up.
+        const to_enu = new THREE.Quaternion(Math.SQRT1_2, Math.SQRT1_2, 0, 0);
+        const to_frd = new THREE.Quaternion(1, 0, 0, 0);
+        group.quaternion.copy(to_enu.multiply(q_nb).multiply(to_frd));
+      }
+      const [n, e, d] = state.vel_n_mps.map((v) => v ?? 0);
+      const target = craft.point.clone().add(new THREE.Vector3(e, n, -d).multiplyScalar(moved_s));
+      if (!craft.shown || craft.shown.distanceTo(target) > 30) craft.shown = target.clone();
+      craft.shown.lerp(target, 0.5);
+      group.position.copy(craft.shown);
+      craft.path.end(craft.shown);
+    },
+    draw() {
+      const now_ms = performance.now();
+      for (const craft of Object.values(this.aircraft)) if (craft.state) this.pose(craft, now_ms);
+      const craft = this.aircraft[mavgate.selected];
+      const { clientWidth: width, clientHeight: height } = this.canvas;
+      const stacked = height > width * 0.75;
+      this.views.forEach((view, i) => {
+        const camera = this.cameras[i];
+        const size = stacked ? [width, height / 2] : [width / 2, height];
+        const corner = stacked ? [0, i === 0 ? height / 2 : 0] : [i * size[0], 0];
+        camera.aspect = size[0] / size[1];
+        if (craft?.state) this.aim(view, camera, craft, i);
+        for (const other of Object.values(this.aircraft)) this.scale(other, camera, view, other === craft);
+        camera.updateProjectionMatrix();
+        this.renderer.setViewport(...corner, ...size);
+        this.renderer.setScissor(...corner, ...size);
+        this.renderer.render(this.scene, camera);
+      });
+      this.$el.dataset.stacked = stacked;
+      this.$el.dataset.model = craft?.model ?? "none";
+      this.$el.dataset.frames = Number(this.$el.dataset.frames ?? 0) + 1;
+    },
+    // A model two metres wide would vanish a kilometre away; it is drawn larger there.
+    scale(craft, camera, view, selected) {
+      const distance = camera.position.distanceTo(craft.group.position);
+      const apparent = (2 * Math.tan((camera.fov * rad) / 2) * distance) / SPAN_M;
+      craft.group.scale.setScalar(Math.max(1, apparent * (selected ? 0.13 : 0.07)));
+      craft.group.visible = !(view === "cockpit" && selected);
+    },
+    aim(view, camera, craft, i) {
+      const { position, quaternion } = craft.group;
+      const forward = new THREE.Vector3(1, 0, 0).applyQuaternion(quaternion);
+      const heading = Math.atan2(forward.y, forward.x);
+      camera.up.set(0, 0, 1);
+      camera.fov = 55;
+      if (view === "chase" || view === "side") {
+        const azimuth = heading + (view === "side" ? Math.PI / 2 : Math.PI) + this.swing.azimuth * rad;
+        const elevation = this.swing.elevation * rad;
+        const distance = this.swing.distance;
+        camera.position.set(
+          position.x + distance * Math.cos(elevation) * Math.cos(azimuth),
+          position.y + distance * Math.cos(elevation) * Math.sin(azimuth),
+          Math.max(position.z + distance * Math.sin(elevation), 0.4),
+        );
+        camera.lookAt(position);
+      } else if (view === "cockpit") {
+        camera.fov = 70;
+        camera.up.set(0, 0, 1).applyQuaternion(quaternion);
+        camera.position.copy(position).addScaledVector(forward, 0.4);
+        camera.lookAt(camera.position.clone().add(forward));
+      } else if (view === "above") {
+        camera.up.set(0, 1, 0);
+        camera.position.set(position.x, position.y, position.z + 160);
+        camera.lookAt(position);
+      } else {
+        // A person ten metres south of home, with a field glass that shows some ground.
+        camera.position.set(0, -10, 1.7);
+        const distance = camera.position.distanceTo(position);
+        camera.fov = Math.min(60, Math.max(9, (2 * Math.atan(40 / distance)) / rad));
+        camera.lookAt(position);
+        const [text, unit] = mavgate.show("distance", distance);
+        this.notes[i] = `${text} ${unit}`;
+        return;
+      }
+      this.notes[i] = "";
+    },
+    resize() {
+      const { clientWidth, clientHeight } = this.$el;
+      if (clientWidth && clientHeight) this.renderer?.setSize(clientWidth, clientHeight, false);
+    },
+    drag(event) {
+      if (!(event.buttons & 1) || event.target.tagName === "SELECT") return;
+      this.swing.azimuth -= event.movementX * 0.4;
+      this.swing.elevation = Math.min(85, Math.max(-5, this.swing.elevation + event.movementY * 0.3));
+    },
+    wheel(event) {
+      event.preventDefault();
+      this.swing.distance = Math.min(200, Math.max(2.5, this.swing.distance * Math.exp(event.deltaY * 0.001)));
+    },
+  },
+};

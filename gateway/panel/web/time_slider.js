@@ -1,0 +1,108 @@
+// A slider through a recording, with the flight's altitude drawn in it.
+export default {
+  template: `
+    <div class="time-slider" role="slider" tabindex="0" aria-label="Moment of the recording"
+      :aria-valuemin="0" :aria-valuemax="Math.round(duration)" :aria-valuenow="Math.round(shown)"
+      :aria-valuetext="text(shown)" @pointerdown="grab" @pointermove="drag" @pointerup="drop" @keydown="key">
+      <canvas ref="canvas"></canvas>
+      <span class="time-slider-text figure">{{ text(shown) }} / {{ text(duration) }}</span>
+    </div>`,
+  props: { times: Array, heights: Array, duration: Number, position: Number, playing: Boolean, speed: Number },
+  data: () => ({ held: null, shown: 0 }),
+  mounted() {
+    this.told_ms = performance.now();
+    this.size = new ResizeObserver(() => this.draw());
+    this.size.observe(this.$el);
+    for (const name of ["times", "heights", "duration"]) this.$watch(name, () => this.draw());
+    this.$watch("position", () => (this.told_ms = performance.now()));
+    const turn = () => {
+      this.handle = requestAnimationFrame(turn);
+      if (!this.$el.offsetParent) return;
+      const ahead = this.playing ? ((performance.now() - this.told_ms) / 1000) * this.speed : 0;
+      const now = this.held ?? Math.min(this.position + Math.min(ahead, this.speed), this.duration);
+      if (Math.abs(now - this.shown) < this.duration / 4000) return;
+      this.shown = now;
+      this.draw();
+    };
+    turn();
+    this.draw();
+  },
+  unmounted() {
+    cancelAnimationFrame(this.handle);
+    this.size?.disconnect();
+  },
+  methods: {
+    text(seconds) {
+      const whole = Math.max(0, Math.floor(seconds));
+      const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+      const two = (n) => String(n).padStart(2, "0");
+      return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
+    },
+    draw() {
+      const { clientWidth: width, clientHeight: height } = this.$el;
+      if (!width) return;
+      const canvas = this.$refs.canvas;
+      const ratio = window.devicePixelRatio || 1;
+      if (canvas.width !== width * ratio) {
+        canvas.width = width * ratio;
+        canvas.height = height * ratio;
+      }
+      const pen = canvas.getContext("2d");
+      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      pen.clearRect(0, 0, width, height);
+      const x = (s) => (this.duration ? (s / this.duration) * width : 0);
+      const low = Math.min(...this.heights);
+      const high = Math.max(...this.heights, low + 1);
+      const y = (h) => height - 8 - ((h - low) / (high - low)) * (height - 30);
+      if (this.heights.length) {
+        const path = new Path2D();
+        path.moveTo(x(this.times[0]), height);
+        this.times.forEach((t, i) => path.lineTo(x(t), y(this.heights[i])));
+        path.lineTo(x(this.times.at(-1)), height);
+        pen.fillStyle = mavgate.colour("line");
+        pen.fill(path);
+        pen.save();
+        pen.beginPath();
+        pen.rect(0, 0, x(this.shown), height);
+        pen.clip();
+        pen.fillStyle = mavgate.colour("accent");
+        pen.globalAlpha = 0.45;
+        pen.fill(path);
+        pen.restore();
+        pen.fillStyle = mavgate.colour("soft");
+        pen.font = "11px system-ui";
+        pen.textAlign = "right";
+        pen.fillText(mavgate.show("altitude", high, 0).join(" "), width - 6, 14);
+      }
+      pen.fillStyle = mavgate.colour("accent");
+      pen.fillRect(x(this.shown) - 1, 0, 2, height);
+      pen.beginPath();
+      pen.arc(Math.min(Math.max(x(this.shown), 6), width - 6), height - 7, 6, 0, 7);
+      pen.fill();
+      this.$el.dataset.points = this.heights.length;
+    },
+    at(event) {
+      const box = this.$el.getBoundingClientRect();
+      return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) * this.duration;
+    },
+    grab(event) {
+      this.$el.setPointerCapture(event.pointerId);
+      this.held = this.at(event);
+    },
+    drag(event) {
+      if (this.held !== null) this.held = this.at(event);
+    },
+    drop(event) {
+      if (this.held === null) return;
+      this.$emit("seek", this.at(event));
+      setTimeout(() => (this.held = null), 600);
+    },
+    key(event) {
+      const step = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60 }[event.key];
+      if (step === undefined) return;
+      event.preventDefault();
+      event.stopPropagation();
+      this.$emit("seek", Math.min(this.duration, Math.max(0, this.shown + step)));
+    },
+  },
+};

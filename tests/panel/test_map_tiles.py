@@ -1,0 +1,161 @@
+"""Tiles from files, from a server on loopback, and from the disk when that is gone."""
+
+import os
+import sqlite3
+import struct
+import threading
+import zlib
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+from pmtiles.tile import Compression, TileType, zxy_to_tileid
+from pmtiles.writer import Writer
+
+from gateway.panel.panel_settings import MapStyle, PanelSettings
+from gateway.panel.serving.map_tiles import MapTiles, tidy
+
+pytestmark = pytest.mark.io
+
+EVERYWHERE = """
+    with recursive n(i) as (select 0 union all select i + 1 from n where i < 15)
+    select 4, a.i, b.i from n a, n b
+"""
+"""All tiles of zoom 4; a map shows them larger when it looks closer."""
+
+
+def picture(shade: int = 0) -> bytes:
+    def part(name: bytes, data: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(name + data))
+        return struct.pack(">I", len(data)) + name + data + check
+
+    head = part(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + head
+        + part(b"IDAT", zlib.compress(bytes((0, shade))))
+        + part(b"IEND", b"")
+    )
+
+
+def write_mbtiles(file: Path, data: bytes, places: str = EVERYWHERE) -> None:
+    """Write a file that has the same picture at some places."""
+    with sqlite3.connect(file) as database:
+        database.execute("create table places (zoom_level, tile_column, tile_row)")
+        database.execute(f"insert into places {places}")
+        database.execute("create table picture (tile_data)")
+        database.execute("insert into picture values (?)", (data,))
+        database.execute("create view tiles as select * from places, picture")
+    database.close()
+
+
+class _Owner(BaseHTTPRequestHandler):
+    answers: ClassVar[dict[str, bytes]]
+    asked: ClassVar[list[str]]
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        body = self.answers.get(self.path)
+        self.send_response(200 if body is not None else 404)
+        self.end_headers()
+        self.wfile.write(body or b"")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def owner() -> Iterator[tuple[str, type[_Owner]]]:
+    class Owner(_Owner):
+        answers: ClassVar[dict[str, bytes]] = {}
+        asked: ClassVar[list[str]] = []
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Owner)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/{{z}}/{{x}}/{{y}}.png", Owner
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def tiles_of(folder: Path, url: str) -> MapTiles:
+    style = MapStyle(name="test", url=url)
+    return MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=(style,)))
+
+
+async def test_seen_once_it_is_kept_on_disk(
+    tmp_path: Path, owner: tuple[str, type[_Owner]]
+) -> None:
+    url, asked = owner
+    asked.answers["/3/1/2.png"] = picture()
+    assert await tiles_of(tmp_path, url).tile(0, 3, 1, 2) == picture()
+    asked.answers.clear()
+    assert await tiles_of(tmp_path, url).tile(0, 3, 1, 2) == picture()
+    assert asked.asked == ["/3/1/2.png"]
+
+
+async def test_what_is_no_picture_is_not_kept(
+    tmp_path: Path, owner: tuple[str, type[_Owner]]
+) -> None:
+    url, asked = owner
+    asked.answers["/0/0/0.png"] = b"<script>alert(1)</script>"
+    assert await tiles_of(tmp_path, url).tile(0, 0, 0, 0) is None
+    assert not list(tmp_path.rglob("*.*"))
+
+
+async def test_old_tile_is_shown_while_there_is_no_network(tmp_path: Path) -> None:
+    tiles = tiles_of(tmp_path, "http://127.0.0.1:9/{z}/{x}/{y}")
+    assert await tiles.tile(0, 2, 1, 1) is None
+
+
+@pytest.mark.parametrize("place", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
+async def test_tiles_beyond_the_world_are_not_asked_for(
+    tmp_path: Path, owner: tuple[str, type[_Owner]], place: tuple[int, int, int]
+) -> None:
+    url, asked = owner
+    assert await tiles_of(tmp_path, url).tile(0, *place) is None
+    assert await tiles_of(tmp_path, url).tile(1, 0, 0, 0) is None
+    assert asked.asked == []
+
+
+async def test_mbtiles_counts_rows_from_the_south(tmp_path: Path) -> None:
+    file = tmp_path / "field.mbtiles"
+    write_mbtiles(file, picture(), "select 2, 1, 0")
+    tiles = tiles_of(tmp_path, str(file))
+    assert await tiles.tile(0, 2, 1, 3) == picture()
+    assert await tiles.tile(0, 2, 1, 0) is None
+
+
+async def test_pmtiles(tmp_path: Path) -> None:
+    file = tmp_path / "field.pmtiles"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.write_tile(zxy_to_tileid(4, 3, 2), picture(7))
+        header = {
+            "tile_type": TileType.PNG,
+            "tile_compression": Compression.NONE,
+            "min_lon_e7": 0, "min_lat_e7": 0, "max_lon_e7": 0, "max_lat_e7": 0,
+            "center_zoom": 0, "center_lon_e7": 0, "center_lat_e7": 0,
+        }  # fmt: skip
+        writer.finalize(header, {})
+    tiles = tiles_of(tmp_path, str(file))
+    assert await tiles.tile(0, 4, 3, 2) == picture(7)
+    assert await tiles.tile(0, 4, 3, 3) is None
+
+
+@pytest.mark.parametrize("name", ["missing.mbtiles", "missing.pmtiles", "broken.pmtiles"])
+async def test_broken_file_leaves_the_grid(tmp_path: Path, name: str) -> None:
+    (tmp_path / "broken.pmtiles").write_bytes(b"no tiles at all")
+    assert await tiles_of(tmp_path, str(tmp_path / name)).tile(0, 0, 0, 0) is None
+
+
+def test_oldest_tiles_go_first(tmp_path: Path) -> None:
+    for age in range(5):
+        file = tmp_path / f"{age}"
+        file.write_bytes(bytes(100))
+        os.utime(file, (1e9 - age, 1e9 - age))
+    tidy(tmp_path, 250)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]

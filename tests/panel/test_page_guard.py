@@ -1,0 +1,171 @@
+"""Who may reach the page: tested on the guard alone, before an application that grants all."""
+
+import http
+from collections.abc import AsyncIterator
+
+import httpx
+import pytest
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse
+from starlette.types import Receive, Scope, Send
+
+from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.serving.page_guard import COOKIE, MAX_BODY, ROLE, PageGuard
+from gateway.panel.serving.page_lock import MAX_FAILURES, PageLock, hash_password, matches
+
+HERE = "http://127.0.0.1:14590"
+OPERATOR, VIEWER = hash_password("tower"), hash_password("visitor")
+
+
+async def grants_all(scope: Scope, receive: Receive, send: Send) -> None:
+    body = await Request(scope, receive).body()
+    text = f"{scope[ROLE]} {len(body)}"
+    await PlainTextResponse(text)(scope, receive, send)
+
+
+def guarded(settings: PanelSettings | None = None) -> PageGuard:
+    settings = settings or PanelSettings()
+    lock = PageLock(settings.password, settings.viewer_password)
+    return PageGuard(grants_all, settings, lock)
+
+
+def client_of(guard: PageGuard, base: str = HERE) -> httpx.AsyncClient:
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app=guard), base_url=base)
+
+
+@pytest.fixture
+async def locked() -> AsyncIterator[httpx.AsyncClient]:
+    settings = PanelSettings(
+        address="0.0.0.0", password=OPERATOR, viewer_password=VIEWER, insecure=True
+    )
+    async with client_of(guarded(settings), "http://192.168.1.7:14590") as client:
+        yield client
+
+
+async def websocket_answer(guard: PageGuard, **headers: str) -> str:
+    """Ask for the telemetry as a page would; what the guard says first."""
+    said: list[str] = []
+
+    async def receive() -> dict[str, str]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: dict[str, object]) -> None:
+        said.append(str(message["type"]))
+
+    async def accept(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "websocket.accept"})
+
+    guard.app = accept
+    raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "websocket", "path": "/telemetry", "headers": raw, "client": ("127.0.0.1", 1)}
+    await guard(scope, receive, send)
+    return said[0]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:14590", "localhost:14590", "[::1]:14590"])
+async def test_own_names_are_let_in(host: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.get("/", headers={"host": host})
+    assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
+    assert answer.headers["x-frame-options"] == "DENY"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", ""])
+async def test_foreign_name_that_points_here_is_refused(host: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.get("/", headers={"host": host})
+    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:8080", "null"])
+async def test_other_page_of_the_same_browser_cannot_steer(origin: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.post("/", headers={"origin": origin})
+    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+
+
+async def test_own_page_may_post() -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.post("/", headers={"origin": HERE})
+    assert answer.status_code == http.HTTPStatus.OK
+
+
+async def test_websocket_asks_for_the_origin_too() -> None:
+    host = "127.0.0.1:14590"
+    assert await websocket_answer(guarded(), host=host, origin=HERE) == "websocket.accept"
+    evil = await websocket_answer(guarded(), host=host, origin="http://evil.example")
+    assert evil == "websocket.close"
+    assert await websocket_answer(guarded(), host="evil.example", origin=HERE) == "websocket.close"
+
+
+async def test_named_host_is_let_in() -> None:
+    async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
+        answer = await client.get("/", headers={"host": "ground.local:14590"})
+    assert answer.status_code == http.HTTPStatus.OK
+
+
+async def test_too_much_is_refused_told_or_not() -> None:
+    async def chunks() -> AsyncIterator[bytes]:
+        for _ in range(20):
+            yield bytes(MAX_BODY // 10)
+
+    async with client_of(guarded()) as client:
+        told = await client.post("/x", content=bytes(MAX_BODY + 1))
+        untold = await client.post("/x", content=chunks())
+        fitting = await client.post("/x", content=bytes(MAX_BODY))
+    assert told.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert untold.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert fitting.text == f"operator {MAX_BODY}"
+
+
+async def test_nothing_is_shown_without_the_password(locked: httpx.AsyncClient) -> None:
+    assert (await locked.get("/")).headers["location"] == "/login"
+    assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
+    locked.cookies.set(COOKIE, "forged")
+    assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
+
+
+async def test_websocket_needs_the_password() -> None:
+    settings = PanelSettings(password=OPERATOR)
+    answer = await websocket_answer(guarded(settings), host="127.0.0.1:14590", origin=HERE)
+    assert answer == "websocket.close"
+
+
+@pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("visitor", "viewer")])
+async def test_password_tells_the_role(locked: httpx.AsyncClient, password: str, role: str) -> None:
+    answer = await locked.post("/login", data={"password": password})
+    assert answer.status_code == http.HTTPStatus.SEE_OTHER
+    assert "HttpOnly" in answer.headers["set-cookie"]
+    assert "SameSite=strict" in answer.headers["set-cookie"]
+    assert (await locked.get("/")).text.startswith(role)
+    await locked.post("/logout")
+    assert (await locked.get("/")).headers["location"] == "/login"
+
+
+async def test_guessing_is_slowed(locked: httpx.AsyncClient) -> None:
+    for _ in range(MAX_FAILURES):
+        answer = await locked.post("/login", data={"password": "guess"})
+        assert answer.status_code == http.HTTPStatus.UNAUTHORIZED
+    answer = await locked.post("/login", data={"password": "tower"})
+    assert answer.status_code == http.HTTPStatus.TOO_MANY_REQUESTS
+
+
+def test_hash_matches_its_password_alone() -> None:
+    assert matches("tower", OPERATOR)
+    assert not matches("Tower", OPERATOR)
+    assert hash_password("tower") != OPERATOR
+    for broken in ("", "scrypt$", "scrypt$x$y$z", "scrypt$7$AAAA$AAAA", "md5$1$AAAA$AAAA"):
+        assert not matches("tower", broken)
+
+
+@pytest.mark.parametrize(
+    ("settings", "missing"),
+    [
+        ({"address": "0.0.0.0"}, "password"),
+        ({"address": "192.168.1.7", "password": OPERATOR}, "certificate"),
+        ({"address": "::", "insecure": True}, "password"),
+    ],
+)
+def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: str) -> None:
+    with pytest.raises(ValueError, match=missing):
+        PanelSettings(**settings)

@@ -1,0 +1,172 @@
+"""The rows of the window that the panel stands in for, each on a real page."""
+
+import io
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from gateway.edges.operator.control_socket import request
+from tests.panel.browsing import WAIT_MS, Process, needs_chromium, open_page, show
+
+pytestmark = [
+    pytest.mark.io,
+    pytest.mark.slow,
+    needs_chromium,
+    pytest.mark.xdist_group("panel"),
+]
+expect.set_options(timeout=WAIT_MS)
+
+
+@pytest.fixture
+def page(browser: Browser, demo: Process) -> Iterator[Page]:
+    opened = open_page(browser, demo.link())
+    troubles: list[str] = []
+    opened.on("pageerror", lambda error: troubles.append(str(error)))
+    yield opened
+    opened.close()
+    assert troubles == []
+
+
+def test_row_3d_from_two_viewpoints(page: Page) -> None:
+    scene = page.locator(".scene")
+    expect(scene).to_have_attribute("data-model", "plane")
+    choices = scene.locator("select")
+    assert [choices.nth(i).input_value() for i in range(2)] == ["chase", "ground"]
+    page.wait_for_function("document.querySelector('.scene').dataset.frames > 5")
+    # Over each half's own region the world is drawn: sky, ground and aircraft, not one colour.
+    picture = Image.open(io.BytesIO(scene.screenshot())).convert("RGB")
+    upper = picture.crop((0, 60, picture.width, picture.height // 2))
+    lower = picture.crop((0, picture.height // 2 + 60, picture.width, picture.height))
+    assert all(len(half.getcolors(1 << 24)) > 20 for half in (upper, lower))
+    assert upper.tobytes() != lower.resize(upper.size).tobytes()
+    choices.nth(0).select_option("above")
+    before = scene.get_attribute("data-frames")
+    page.wait_for_function(f"document.querySelector('.scene').dataset.frames > {before} + 2")
+
+
+def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
+    show(page, "map")
+    view = page.locator("section[data-view='map']")
+    expect(view.locator(".leaflet-tile-loaded").first).to_be_visible()
+    style = view.get_by_label("Map style")
+    assert style.locator("option").all_inner_texts() == ["Field", "Other", "Grid"]
+    first = view.locator(".leaflet-tile-loaded").first.get_attribute("src")
+    style.select_option(label="Other")
+    expect(view.locator(".leaflet-tile-loaded[src*='/tiles/1/']").first).to_be_visible()
+    assert first is not None
+    assert "/tiles/0/" in first
+    style.select_option(label="Grid")
+    expect(view.locator(".leaflet-tile")).to_have_count(0)
+    step = view.locator("canvas.map-grid").get_attribute("data-step")
+    for _ in range(3):
+        view.locator(".leaflet-control-zoom-out").click()
+        page.wait_for_timeout(300)
+    wide = view.locator("canvas.map-grid").get_attribute("data-step")
+    assert float(wide or 0) > float(step or 0)
+    expect(view.locator(".craft[data-selected='true']")).to_be_visible()
+    expect(view.locator(".pin.home")).to_be_visible()
+
+
+def test_row_latitude_and_longitude_to_copy(browser: Browser, demo: Process) -> None:
+    page = open_page(browser, demo.link(), "map")
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    view = page.locator("section[data-view='map']")
+    expect(view.locator("[data-role='place']")).to_have_text(re.compile(r"-7\.7\d{5}, 110\.3\d{5}"))
+    view.get_by_text("Copy", exact=True).click()
+    expect(view.get_by_text("Copied")).to_be_visible()
+    copied = page.evaluate("navigator.clipboard.readText()")
+    assert re.fullmatch(r"-7\.7\d{5}, 110\.3\d{5}", copied)
+    page.close()
+
+
+def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
+    show(page, "map")
+    view = page.locator("section[data-view='map']")
+    expect(view.locator(".pin.home")).to_be_visible()
+    canvas = view.locator(".map-canvas")
+    canvas.click(position={"x": 300, "y": 250})
+    page.get_by_text("Mark this place").click()
+    expect(view.locator("[data-role='way']")).to_have_text(
+        re.compile(r"mark \d+(\.\d+)? (m|km), \d{1,3}°")
+    )
+    expect(view.locator(".pin.mark")).to_be_visible()
+    socket = demo.log.parent / "mavgate" / "run.sock"
+    ((vehicle_id, lat_deg, lon_deg, _),) = request(socket, "status")["marks"]
+    told = json.loads(page.evaluate("JSON.stringify(mavgate.state.mark)"))
+    assert vehicle_id == 1
+    assert (told["lat_deg"], told["lon_deg"]) == pytest.approx((lat_deg, lon_deg), abs=2e-7)
+    canvas.click(position={"x": 400, "y": 300})
+    page.get_by_text("Clear the mark").click()
+    expect(view.locator("[data-role='way']")).to_have_count(0)
+
+
+def test_row_serial_recording_or_simulation_mode(page: Page) -> None:
+    expect(page.locator(".chips").get_by_text("simulation")).to_be_visible()
+
+
+def test_row_start_stop_save_delete_export_import_and_move_in_time(
+    page: Page, tmp_path: Path
+) -> None:
+    show(page, "recordings")
+    view = page.locator("section[data-view='recordings']")
+    state = view.locator("[data-role='recorder']")
+    expect(state).to_have_text("idle")
+    view.get_by_label("Start recording").click()
+    expect(state).to_have_text("recording")
+    expect(page.locator(".chips").get_by_text("REC")).to_be_visible()
+    page.wait_for_timeout(6000)
+    view.get_by_label("Stop recording").click()
+    expect(state).to_have_text("idle")
+    view.get_by_label("Name of the recording").fill("morning flight")
+    view.get_by_text("Save", exact=True).click()
+    row = view.locator("tr[data-key='morning flight']")
+    expect(row).to_be_visible()
+    with page.expect_download() as waiting:
+        row.get_by_label("Download").click()
+    archive = tmp_path / "flight.zip"
+    waiting.value.save_as(archive)
+    with ZipFile(archive) as packed:
+        names = packed.namelist()
+        tlog = next(name for name in names if name.endswith(".tlog"))
+        (tmp_path / "evening_01.tlog").write_bytes(packed.read(tlog))
+    assert "morning flight_01_v1.csv" in names
+    view.get_by_label("Bring a recording").set_input_files(tmp_path / "evening_01.tlog")
+    brought = view.locator("tr[data-key='evening']")
+    expect(brought).to_be_visible()
+    (tmp_path / "holiday.tlog").write_text("this is no flight at all, but a text\n")
+    view.get_by_label("Bring a recording").set_input_files(tmp_path / "holiday.tlog")
+    expect(page.get_by_text("this is no recording")).to_be_visible()
+    _move_in_time(page, row)
+    for name in ("morning flight", "evening"):
+        view.locator(f"tr[data-key='{name}']").get_by_label("Delete").click()
+        page.locator(".asks").get_by_role("button", name="Delete").click()
+        expect(view.locator(f"tr[data-key='{name}']")).to_have_count(0)
+
+
+def _move_in_time(page: Page, row: object) -> None:
+    view = page.locator("section[data-view='recordings']")
+    row.get_by_label("Open").click()  # type: ignore[attr-defined]
+    slider = view.get_by_role("slider")
+    expect(slider).to_be_visible()
+    page.wait_for_function("document.querySelector('.time-slider').dataset.points > 10")
+    view.get_by_label("Play or pause").click()
+    length_s = float(slider.get_attribute("aria-valuemax") or 0)
+    assert length_s > 3
+    box = slider.bounding_box()
+    assert box is not None
+    slider.click(position={"x": box["width"] * 0.5, "y": 50})
+    half = re.compile(f"^[{int(length_s / 2) - 1}-{int(length_s / 2) + 1}]$")
+    expect(slider).to_have_attribute("aria-valuenow", half)
+    page.wait_for_function("Object.values(mavgate.vehicles).some((v) => v.origin === 'recorded')")
+    view.get_by_text("re-fused twin").click()
+    page.wait_for_function("Object.values(mavgate.vehicles).some((v) => v.origin === 're-fused')")
+    expect(slider).to_be_visible()
+    view.get_by_label("Close the recording").click()
+    expect(slider).to_be_hidden()
+    page.wait_for_function("Object.values(mavgate.vehicles).every((v) => v.origin === 'live')")
