@@ -89,7 +89,8 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
     lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
     usable = is_usable(fix, settings)
     if usable:
-        earth.update(lat_deg, lon_deg, fix.alt_amsl_m, fix.utc_us)
+        alt_m = fix.alt_amsl_m if math.isfinite(fix.alt_amsl_m) else 0.0
+        earth.update(lat_deg, lon_deg, alt_m, fix.utc_us)
     vel = fix.vel_n_mps
     if not all(map(math.isfinite, vel)):
         vel = (NAN, NAN, NAN)

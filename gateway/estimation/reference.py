@@ -57,7 +57,6 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
     return (
         fix.fix_ok
         and fix.fix_type in USABLE_FIXES
-        and math.isfinite(fix.alt_amsl_m)
         and not fix.h_acc_m > settings.gps_max_h_acc_m
         and (fix.lat_dege7, fix.lon_dege7) != (0, 0)
     )

@@ -4,10 +4,16 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray
+from gateway.estimation.kernel_record import FloatArray, write_vec
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
 
+BIAS_CHANGE_RADPS: Final = 0.15 * RAD_PER_DEG
+"""What a gyroscope's bias may change by between rest and flight, by heat and vibration."""
+LEAST_CHANGE_RADPS: Final = 0.05 * RAD_PER_DEG
+FLOWN_S: Final = 20.0
+"""A bias is that of a motion which lasted so long."""
 REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
 
@@ -68,6 +74,14 @@ class RestState:
     gyro_rest: Annotated[FloatArray, (3,)]
     """Behind `gyro_lp`: still the bias when a slow start of motion is noticed."""
     accel_lp: Annotated[FloatArray, (3,)]
+    flown_s: float
+    """Time in motion since the last rest."""
+    flown_known: int
+    """1 once the bias was learned in motion before a rest."""
+    flown_bias_b: Annotated[FloatArray, (3,)]
+    """The bias with which the last motion ended."""
+    bias_of_rest: int
+    """1 from a rest until the aircraft moves."""
 
 
 @compiled
@@ -106,3 +120,46 @@ def watch_rest(
     )
     s.rest_s = s.rest_s + dt if quiet else 0.0
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
+
+
+@compiled
+def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: float) -> float:
+    """Tell how firmly a bias that was learned at rest may be believed in flight.
+
+    Parameters
+    ----------
+    s : RestState
+        Changed in place.
+    bias_b : tuple of 3 floats
+        The estimator's, rad/s.
+    rested : bool
+        Whether it rested until the newest sample.
+    moving : bool
+        What the GPS says.
+    dt : float
+        Time step, s.
+
+    Returns
+    -------
+    float
+        Standard deviation in rad/s at the begin of a motion: what the bias has changed by from
+        motion to rest before, or may change by where that is not known; 0 at other times.
+    """
+    if s.at_rest == 1:
+        if not rested and s.flown_s > FLOWN_S:
+            s.flown_known = 1
+            write_vec(s.flown_bias_b, bias_b)
+        s.flown_s, s.bias_of_rest = 0.0, 1
+        return 0.0
+    if not moving:
+        return 0.0
+    s.flown_s += dt
+    if s.bias_of_rest == 0:
+        return 0.0
+    s.bias_of_rest = 0
+    if s.flown_known == 0:
+        return BIAS_CHANGE_RADPS
+    change = 0.0
+    for k in range(3):
+        change = max(change, abs(bias_b[k] - s.flown_bias_b[k]))
+    return min(max(change, LEAST_CHANGE_RADPS), BIAS_CHANGE_RADPS)

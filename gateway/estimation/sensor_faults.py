@@ -1,10 +1,12 @@
 """Whether gyroscope and accelerometer may be believed."""
 
+import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray, write_vec
 from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 STUCK_S: Final = 1.0
 """The same three numbers for so long, while the other sensor moves: the sensor is stuck."""
@@ -13,6 +15,8 @@ HOLD_S: Final = 0.2
 GYRO_LIMIT_RADPS: Final = 40.0
 ACCEL_LIMIT_MPS2: Final = 400.0
 """No sensor of this system reads more; what does is no measurement."""
+START_LEAST_MPS2: Final = 0.5 * STANDARD_GRAVITY_MPS2
+START_MOST_MPS2: Final = 2.0 * STANDARD_GRAVITY_MPS2
 
 
 class HealthState:
@@ -31,6 +35,18 @@ class HealthState:
 def is_sound(v: Vec3, limit: float) -> bool:
     """Tell whether a vector is finite and within what a sensor can read."""
     return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
+
+
+@compiled
+def is_start(s: HealthState, gyro: Vec3, accel: Vec3) -> bool:
+    """Tell whether an estimator may begin with a sample, and set the fault if not.
+
+    A sensor that has just been woken may send zeros; what is far from gravity tells no level.
+    """
+    norm = math.sqrt(accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2])
+    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    s.fault = 0 if sound and START_LEAST_MPS2 < norm < START_MOST_MPS2 else 1
+    return s.fault == 0
 
 
 @compiled

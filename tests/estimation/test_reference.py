@@ -20,7 +20,6 @@ def test_good_fix_and_unknown_accuracy_are_usable() -> None:
         {"fix_type": GpsFixType.NONE},
         {"fix_type": GpsFixType.TIME_ONLY},
         {"h_acc_m": 100.0},
-        {"alt_amsl_m": math.nan},
         {"lat_dege7": 0, "lon_dege7": 0},
     ],
     ids=str,

@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from gateway.estimation.alignment import MatchState, collect_match
 from gateway.estimation.complementary.complementary_state import (
     ComplementarySettings,
     ComplementaryState,
@@ -107,25 +106,6 @@ class TestField:
         assert field_similarity(state, 45.0, 1.1) == pytest.approx(1.0)
         assert field_similarity(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(0.5)
         assert field_similarity(state, 52.0, 1.1) < 0.1
-
-
-@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 179.0, -135.0])
-def test_accelerations_tell_the_first_heading(turn_deg: float) -> None:
-    rng = np.random.default_rng(1)
-    state, turn = new_record(MatchState), math.radians(turn_deg)
-    done = False
-    for _ in range(200):
-        n, e = rng.normal(0, 2.0, 2)
-        force = (
-            n * math.cos(turn) + e * math.sin(turn),
-            -n * math.sin(turn) + e * math.cos(turn),
-            0.0,
-        )
-        done = collect_match(state, force, (n, e, 0.0), 0.2, 0.2)
-        if done:
-            break
-    assert done
-    assert math.atan2(state.match[1], state.match[0]) == pytest.approx(turn, abs=1e-6)
 
 
 def test_stuck_sensors() -> None:

@@ -13,9 +13,10 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.complementary.heading import carry_heading
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
 from gateway.estimation.kernel_record import as_quat
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 
@@ -39,6 +40,7 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
     dt : float
         Length of the epoch, s.
     """
+    carry_heading(s)
     growth = DRIFT_RAD2PS * dt
     for k in range(3):
         s.bias_cov[k, k] = min(s.bias_cov[k, k] + growth, p.bias_initial_radps**2)
@@ -56,6 +58,13 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
             # The low-passed frame falls behind by the bias error, and gravity pulls it back.
             correct_bias(s, p, row, s.turn_lp[6 + k] - s.tilt_sum[k] / dt, variance)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+
+
+@compiled
+def raise_bias_variance(s: ComplementaryState, std: float) -> None:
+    """Believe the bias no more firmly than to a standard deviation in rad/s."""
+    for k in range(3):
+        s.bias_cov[k, k] = max(s.bias_cov[k, k], std * std)
 
 
 @compiled
@@ -104,7 +113,12 @@ def correct_bias(
     innovation = max(-CLIP_RADPS, min(CLIP_RADPS, measured - expected))
     if not math.isfinite(innovation):
         return
+    c = s.heading_cov
+    shared = row[0] * c[0] + row[1] * c[1] + row[2] * c[2]
+    s.heading_rad = wrap_pi(s.heading_rad + shared / spread * innovation)
+    s.heading_var -= shared * shared / spread
     for k in range(3):
+        c[k] -= column[k] * shared / spread
         b[k] += column[k] / spread * innovation
         b[k] = max(-p.bias_limit_radps, min(p.bias_limit_radps, b[k]))
         for j in range(3):

@@ -4,26 +4,29 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
-from gateway.estimation.complementary.bias import update_bias
-from gateway.estimation.complementary.complementary_output import write_output
+from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
+from gateway.estimation.complementary.bias import raise_bias_variance, update_bias
+from gateway.estimation.complementary.complementary_output import (
+    write_output,
+)
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
 from gateway.estimation.complementary.heading import UNKNOWN_VAR, is_heading_good, take_mag
-from gateway.estimation.complementary.manoeuvre import take_fix_velocity
+from gateway.estimation.complementary.intake import bridge_gap, take_gps
 from gateway.estimation.complementary.navigation import (
-    blend_fix,
     dead_reckon,
-    is_plausible,
-    restart_at,
     stand_still,
     take_baro,
 )
+from gateway.estimation.complementary.reorientation import (
+    lose_attitude,
+    watch_gravity,
+)
 from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
 from gateway.estimation.flagbits import FRESH_GPS_S
-from gateway.estimation.history import recall, remember
+from gateway.estimation.history import remember
 from gateway.estimation.kernel_record import (
     FloatArray,
     IntArray,
@@ -34,30 +37,18 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import (
     NEVER_S,
-    fix_position,
-    fix_velocity,
-    is_relocked,
-    move_origin,
-    past_state,
 )
-from gateway.estimation.rest import watch_rest
-from gateway.estimation.sensor_faults import (
-    ACCEL_LIMIT_MPS2,
-    GYRO_LIMIT_RADPS,
-    HOLD_S,
-    check_sensors,
-    is_sound,
-)
+from gateway.estimation.rest import doubt_rest_bias, watch_rest
+from gateway.estimation.sensor_faults import HOLD_S, check_sensors, is_start
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import NAN, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-GAP_S: Final = 0.5
-"""A longer silence is not integrated over."""
 EPOCH_S: Final = 0.1
 """Without GPS, the bias is updated this often."""
-MOVING_MPS: Final = 3.0
 
+PULL_MPS2: Final = 0.5
+"""An acceleration of this much, by GPS, shows more in the level than the bias does."""
 ZERO: Final = (0.0, 0.0, 0.0)
 
 
@@ -78,7 +69,7 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
 @compiled
 def forget_times(s: ComplementaryState) -> None:
     """Drop all that is tied to the clock."""
-    s.mag_s = s.fix_s = s.fix_valid_s = s.baro_s = NEVER_S
+    s.mag_s = s.fix_s = s.fix_valid_s = s.pair_s = s.baro_s = NEVER_S
     s.reject_last[0] = NEVER_S
     s.reject_s = s.rest_s = s.epoch_s = 0.0
     s.ring_count = s.at_rest = 0
@@ -87,14 +78,16 @@ def forget_times(s: ComplementaryState) -> None:
 @compiled
 def begin(s: ComplementaryState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first sound sample, level by its specific force."""
-    s.fault = 0 if is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2) else 1
-    if s.fault == 1:
+    if not is_start(s, gyro, accel):
         return
     s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
     write_vec(s.gyro_lp, gyro)
     write_vec(s.gyro_rest, gyro)
     write_vec(s.accel_lp, accel)
     write_vec(s.force_lp_i, accel)
+    write_vec(s.force_mean_i, accel)
+    # One sample may be anything: the alignment finds the level within the first second.
+    lose_attitude(s)
     take_gravity(s, accel, 1.0, 1e-3)
     # Two turns: the first leaves a remainder where the start is upside down.
     take_gravity(s, accel, 1.0, 1e-3)
@@ -147,17 +140,11 @@ def take_imu(
 
 
 @compiled
-def bridge_gap(s: ComplementaryState, dt: float) -> None:
-    """Go on after a silence: straight ahead, and level anew from here."""
-    s.fault = 1
+def note_down_turn(s: ComplementaryState, dt: float) -> None:
+    """Note how the bias turns the heading."""
+    down = rotate_inverse(as_quat(s.q_eb), (0.0, 0.0, 1.0))
     for k in range(3):
-        s.pos_n[k] += s.vel_n[k] * dt
-    s.ring_count = 0
-    s.fix_valid_s = NEVER_S
-    s.force_lp_s = s.rest_s = s.epoch_s = 0.0
-    s.at_rest = 0
-    s.tilt_sum[0] = s.tilt_sum[1] = 0.0
-    s.heading_var = max(s.heading_var, 0.03)
+        s.down_turn[k] += down[k] * dt
 
 
 @compiled
@@ -179,12 +166,16 @@ def advance(
         s.missing_gyro_s = 0.0
     strapdown(s, gyro, dt)
     refresh(s)
+    note_down_turn(s, dt)
     if not sound_accel:
         accel = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
     since_fix = s.time_s - s.fix_s
     moving = since_fix < FRESH_GPS_S and speed(s) > p.rest_speed_mps
     if sound_gyro and sound_accel:
+        rested = s.at_rest == 1
         watch_rest(s, p, gyro, accel, moving, dt)
+        raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
+        watch_gravity(s)
     s.heading_var = min(s.heading_var + p.heading_process_rad2ps * dt, UNKNOWN_VAR)
     coasting = since_fix < p.coast_s and speed(s) > MOVING_MPS
     by_gps = since_fix < FRESH_GPS_S or coasting
@@ -192,7 +183,8 @@ def advance(
         take_gravity(s, rotate(as_quat(s.q_ib), accel), p.tau_accel_s, dt)
         s.epoch_s += dt
         if s.epoch_s >= EPOCH_S:
-            update_bias(s, p, p.tau_accel_s, s.epoch_s)
+            if s.by_gps == 0 or s.pull_mps2 < PULL_MPS2:
+                update_bias(s, p, p.tau_accel_s, s.epoch_s)
             s.epoch_s = 0.0
     dead_reckon(s, accel, dt)
     if s.at_rest == 1 and since_fix > FRESH_GPS_S:
@@ -204,95 +196,6 @@ def advance(
 def speed(s: ComplementaryState) -> float:
     """Horizontal speed in m/s."""
     return math.hypot(s.vel_n[0], s.vel_n[1])
-
-
-@compiled
-def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: FloatArray) -> None:
-    """Take in one fix at its arrival.
-
-    Parameters
-    ----------
-    s : ComplementaryState
-        Changed in place.
-    p : ComplementaryGains
-        Constants.
-    time_us : int
-        Arrival on the gateway clock.
-    row : ndarray, shape (GPS_COLUMNS,)
-        See `columns`.
-    """
-    if s.started == 0 or row[GPS_USABLE] == 0.0:
-        return
-    learn_declination(s, row[GPS_DECLINATION])
-    arrival_s = (time_us - s.base_us) * 1e-6
-    then = s.then
-    valid_s = recall(s.ring, s.ring_count, arrival_s - p.gps_latency_s, s.time_s, s.integrals, then)
-    lag = s.time_s - valid_s
-    move_origin(s, row[GPS_LAT], row[GPS_LON])
-    pos, vel = fix_position(s, row), fix_velocity(row)
-    past = past_state(s, then, lag)
-    told_velocity = is_sound(vel, 1000.0)
-    if not told_velocity:
-        vel = velocity_from_position(s, pos, past)
-    if not accept_fix(s, p, row, pos, vel, past, lag):
-        return
-    s.fix_s = s.time_s
-    if told_velocity:
-        interval = take_fix_velocity(s, p, valid_s, vel, as_vec(then))
-        if interval > 0.0:
-            update_bias(s, p, p.tau_accel_gps_s, interval)
-    refresh(s)
-
-
-@compiled
-def velocity_from_position(s: ComplementaryState, pos: Vec3, past: tuple[Vec3, Vec3]) -> Vec3:
-    """Stand in for a velocity that the receiver does not tell."""
-    share = 0.0 if s.fix_s == NEVER_S else 0.5 / max(s.time_s - s.fix_s, 0.5)
-    (p0, p1, p2), (v0, v1, v2) = past
-    return (
-        v0 + share * (pos[0] - p0),
-        v1 + share * (pos[1] - p1),
-        v2 + share * (pos[2] - p2),
-    )
-
-
-@compiled
-def accept_fix(
-    s: ComplementaryState,
-    p: ComplementaryGains,
-    row: FloatArray,
-    pos: Vec3,
-    vel: Vec3,
-    past: tuple[Vec3, Vec3],
-    lag: float,
-) -> bool:
-    """Blend a plausible fix, start anew at the first and after a lasting disagreement."""
-    if s.fix_s == NEVER_S:
-        restart_at(s, pos, vel, lag)
-        return True
-    off_m = math.hypot(pos[0] - past[0][0], pos[1] - past[0][1])
-    off_mps = math.hypot(vel[0] - past[1][0], vel[1] - past[1][1])
-    if is_plausible(s, p, row, off_m, off_mps):
-        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
-        blend_fix(s, p, pos, vel, past, lag)
-        return True
-    if is_relocked(s, p.gps_relock_s, pos, vel):
-        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
-        s.fix_valid_s = NEVER_S
-        restart_at(s, pos, vel, lag)
-        return True
-    return False
-
-
-@compiled
-def learn_declination(s: ComplementaryState, declination_rad: float) -> None:
-    """Turn a magnetic heading to true north when the declination becomes known."""
-    if not math.isfinite(declination_rad):
-        return
-    if s.heading_known == 1 and s.heading_true == 0:
-        s.heading_rad += declination_rad
-        s.heading_true = 1
-    s.declination_rad = declination_rad
 
 
 @compiled

@@ -3,17 +3,13 @@
 from typing import Final
 
 from gateway.compiled import compiled, record_at
-from gateway.estimation.complementary.complementary_kernels import (
-    run,
-    start,
-    take_gps,
-    take_imu,
-)
+from gateway.estimation.complementary.complementary_kernels import run, start, take_imu
 from gateway.estimation.complementary.complementary_output import write_output
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.complementary.intake import take_gps
 from gateway.estimation.complementary.navigation import take_baro
 from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import FloatArray, layout

@@ -65,7 +65,7 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
 @compiled
 def flags_of(s: ComplementaryState) -> int:
     """Put the flags together."""
-    flags = ATTITUDE_VALID if s.started == 1 else 0
+    flags = ATTITUDE_VALID if s.started == 1 and s.lost == 0 else 0
     if s.heading_known == 1 and s.heading_true == 1 and is_heading_good(s):
         flags |= HEADING_VALID
     if s.at_rest == 1:

@@ -2,7 +2,8 @@
 
 from typing import Annotated
 
-from gateway.estimation.alignment import MatchState
+from gateway.estimation.alignment.gps_velocity import WayState
+from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.kernel_record import FloatArray, filled_record
 from gateway.estimation.local_position import PlaceState
 from gateway.estimation.magfield import CompassSettings, FieldGains, FieldState, field_gains
@@ -156,7 +157,7 @@ class ComplementaryGains(RestGains, FieldGains):
     gps_latency_s: float
 
 
-class ComplementaryState(HealthState, RestState, FieldState, PlaceState, MatchState):
+class ComplementaryState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
     """All that the complementary estimator remembers."""
 
     started: int
@@ -164,10 +165,8 @@ class ComplementaryState(HealthState, RestState, FieldState, PlaceState, MatchSt
     time_us: int
     bias_b: Annotated[FloatArray, (3,)]
     bias_cov: Annotated[FloatArray, (3, 3)]
-    q_ib: Annotated[FloatArray, (4,)]
-    """Body to the inertial frame of the gyroscope alone."""
     q_ei: Annotated[FloatArray, (4,)]
-    """That frame to a level frame of free heading."""
+    """The gyroscope's frame to a level frame of free heading."""
     q_eb: Annotated[FloatArray, (4,)]
     q_nb: Annotated[FloatArray, (4,)]
     force_lp_i: Annotated[FloatArray, (3,)]
@@ -186,8 +185,10 @@ class ComplementaryState(HealthState, RestState, FieldState, PlaceState, MatchSt
     heading_rad: float
     """Turn about down from the level frame to NED."""
     heading_var: float
-    heading_known: int
-    """0 unknown, 1 magnetic or true north."""
+    heading_cov: Annotated[FloatArray, (3,)]
+    """With the gyroscope's bias."""
+    down_turn: Annotated[FloatArray, (3,)]
+    """Integral of the down row of `R_nb` since `heading_cov` was carried on."""
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
     declination_rad: float

@@ -11,7 +11,6 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment import collect_match, information_of
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
@@ -23,8 +22,14 @@ from gateway.records import Vec3
 
 UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
-GOOD_VAR: Final = 0.07
-"""Up to 15 deg of standard deviation, the GPS acceleration may be turned by the heading."""
+BIAS_HEED: Final = 3.0
+"""So much more noise a heading has for the bias."""
+LEAST_VAR: Final = 1e-6
+"""Rounding must not make a variance negative."""
+MATCH_WINDOW_S: Final = 1.0
+"""Differences of successive velocities share their noise; over this time it averages out."""
+GOOD_VAR: Final = 0.3
+"""Up to 30 deg of standard deviation, the GPS acceleration may be turned by the heading."""
 
 
 @compiled
@@ -34,14 +39,43 @@ def is_heading_good(s: ComplementaryState) -> bool:
 
 
 @compiled
-def correct_heading(s: ComplementaryState, measured_rad: float, variance: float) -> None:
+def correct_heading(
+    s: ComplementaryState, p: ComplementaryGains, measured_rad: float, variance: float
+) -> None:
     """Blend one measured heading in, the shortest way round."""
+    carry_heading(s)
     if s.heading_known == 0:
         s.heading_rad, s.heading_var, s.heading_known = measured_rad, variance, 1
+        s.heading_cov[0] = s.heading_cov[1] = s.heading_cov[2] = 0.0
         return
-    gain = s.heading_var / (s.heading_var + variance)
-    s.heading_rad = wrap_pi(s.heading_rad + gain * wrap_pi(measured_rad - s.heading_rad))
-    s.heading_var *= 1.0 - gain
+    spread = s.heading_var + variance
+    innovation = wrap_pi(measured_rad - s.heading_rad)
+    s.heading_rad = wrap_pi(s.heading_rad + s.heading_var / spread * innovation)
+    # The bias heeds a heading less than the heading does: its errors last, and look like a drift.
+    limit, heed = p.bias_limit_radps, s.heading_var + BIAS_HEED * variance
+    left = (2.0 - spread / heed) / heed
+    for k in range(3):
+        bias = s.bias_b[k] + s.heading_cov[k] / heed * innovation
+        s.bias_b[k] = max(-limit, min(limit, bias))
+        for j in range(3):
+            s.bias_cov[k, j] -= s.heading_cov[k] * s.heading_cov[j] * left
+    for k in range(3):
+        s.heading_cov[k] *= variance / spread
+    s.heading_var = max(s.heading_var * variance / spread, LEAST_VAR)
+
+
+@compiled
+def carry_heading(s: ComplementaryState) -> None:
+    """Let the gyroscope's bias make the heading uncertain, and tied to it, up to now."""
+    P, r, c = s.bias_cov, s.down_turn, s.heading_cov
+    for k in range(3):
+        column = P[k, 0] * r[0] + P[k, 1] * r[1] + P[k, 2] * r[2]
+        # With the covariance before this one is carried on: twice it, and the square.
+        s.heading_var += r[k] * (column - 2.0 * c[k])
+    for k in range(3):
+        c[k] -= P[k, 0] * r[0] + P[k, 1] * r[1] + P[k, 2] * r[2]
+    s.heading_var = min(max(s.heading_var, LEAST_VAR), UNKNOWN_VAR)
+    r[0] = r[1] = r[2] = 0.0
 
 
 @compiled
@@ -58,7 +92,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         Calibrated field in body FRD, uT.
     """
     dt = s.time_s - s.mag_s
-    if dt <= 0.0:
+    if dt <= 0.0 or s.lost == 1:
         return
     s.mag_s = s.time_s
     north, east, down = rotate(as_quat(s.q_eb), mag_b)
@@ -75,12 +109,24 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     measured = -math.atan2(east, north)
     if math.isfinite(declination):
         measured += declination
-    correct_heading(s, measured, p.heading_noise_rad2s / (dt * weight))
+    correct_heading(s, p, measured, p.heading_noise_rad2s / (dt * weight))
+
+
+@compiled
+def information_of(accel_n: Vec3, dt: float, noise_mps: float) -> float:
+    """Tell how much the mean acceleration of one interval says of the heading, 1/rad2."""
+    power = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
+    return power * dt * MATCH_WINDOW_S / (2.0 * noise_mps * noise_mps)
 
 
 @compiled
 def take_match(
-    s: ComplementaryState, p: ComplementaryGains, force_e: Vec3, accel_n: Vec3, dt: float
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    force_e: Vec3,
+    accel_n: Vec3,
+    dt: float,
+    noise: float,
 ) -> None:
     """Correct the heading by matching the horizontal force with the GPS acceleration.
 
@@ -96,15 +142,13 @@ def take_match(
         Mean acceleration in NED, m/s2.
     dt : float
         Length of the interval, s.
+    noise : float
+        Of the GPS velocity, m/s.
     """
-    noise = p.gps_velocity_noise_mps
     if s.heading_known == 1:
         information = information_of(accel_n, dt, noise)
         if information > 0.0:
             s.heading_true = 1
             real = force_e[0] * accel_n[0] + force_e[1] * accel_n[1]
             imag = force_e[0] * accel_n[1] - force_e[1] * accel_n[0]
-            correct_heading(s, math.atan2(imag, real), 1.0 / information)
-    elif collect_match(s, force_e, accel_n, dt, noise):
-        s.heading_true = 1
-        correct_heading(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])
+            correct_heading(s, p, math.atan2(imag, real), 1.0 / information)

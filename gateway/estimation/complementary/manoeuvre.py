@@ -28,7 +28,12 @@ MAX_BASELINE_S: Final = 2.5
 
 @compiled
 def take_fix_velocity(
-    s: ComplementaryState, p: ComplementaryGains, valid_s: float, vel: Vec3, force_i: Vec3
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    valid_s: float,
+    vel: Vec3,
+    force_i: Vec3,
+    noise_mps: float,
 ) -> float:
     """Use the change of the GPS velocity since the last fix as the acceleration.
 
@@ -44,6 +49,8 @@ def take_fix_velocity(
         GPS velocity NED, m/s.
     force_i : tuple of 3 floats
         Integral of the specific force in the inertial frame up to `valid_s`, m/s.
+    noise_mps : float
+        Of the velocity.
 
     Returns
     -------
@@ -65,7 +72,7 @@ def take_fix_velocity(
         (force_i[2] - old_force[2]) / dt,
     )
     accel = ((vel[0] - old_vel[0]) / dt, (vel[1] - old_vel[1]) / dt, (vel[2] - old_vel[2]) / dt)
-    take_match(s, p, rotate(as_quat(s.q_ei), mean), accel, dt)
+    take_match(s, p, rotate(as_quat(s.q_ei), mean), accel, dt, noise_mps)
     if not is_heading_good(s):
         return 0.0
     half = -0.5 * s.heading_rad

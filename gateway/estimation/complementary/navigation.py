@@ -48,6 +48,9 @@ def dead_reckon(s: ComplementaryState, force_b: Vec3, dt: float) -> None:
     unbiased = (force_b[0] - b[0], force_b[1] - b[1], force_b[2] - b[2])
     north, east, down = rotate(as_quat(s.q_nb), unbiased)
     accel = (north, east, down + STANDARD_GRAVITY_MPS2 - s.accel_bias_d)
+    if s.lost == 1:
+        # With no attitude to turn it by, the force tells nothing: straight on between fixes.
+        accel = (0.0, 0.0, 0.0)
     for k in range(3):
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * accel[k] * dt) * dt
         s.integrals[3 + k] += accel[k] * dt
@@ -62,13 +65,13 @@ def restart_at(s: ComplementaryState, pos: Vec3, vel: Vec3, lag: float) -> None:
     write_vec(s.vel_n, vel)
     for k in range(2):
         s.pos_n[k] = pos[k] + vel[k] * lag
-    if s.has_height == 0 or s.baro_known == 0:
-        s.pos_n[2] = pos[2] + vel[2] * lag
-    elif s.baro_known == 1:
+    down = pos[2] + vel[2] * lag
+    if not math.isfinite(down):
+        return
+    if s.has_height == 1 and s.baro_known == 1:
         # The barometer has held the height so far; the fix tells its offset to the sea.
-        shift = pos[2] + vel[2] * lag - s.pos_n[2]
-        s.pos_n[2] += shift
-        s.baro_offset_m += shift
+        s.baro_offset_m += down - s.pos_n[2]
+    s.pos_n[2] = down
     s.has_height = 1
 
 
@@ -118,6 +121,11 @@ def blend_fix(
         s.vel_n[k] += step
     if s.at_rest == 0:
         learn_accel_bias(s, gain_vel, vel, past[1])
+    if not math.isfinite(pos[2]):
+        return
+    if s.has_height == 0:
+        s.pos_n[2], s.has_height = pos[2] + vel[2] * lag, 1
+        return
     baro_fresh = s.baro_known == 1 and s.time_s - s.baro_s < BARO_STALE_S
     if baro_fresh:
         gain = 1.0 - math.exp(-dt / p.tau_baro_offset_s)

@@ -4,6 +4,8 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.review import GAP_S
+from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -16,6 +18,7 @@ from gateway.estimation.eskf.measure import (
     update_by_rest,
     update_by_velocity,
 )
+from gateway.estimation.eskf.recovery import raise_bias_variance, watch_gravity
 from gateway.estimation.eskf.start import (
     begin,
     bridge_gap,
@@ -38,7 +41,7 @@ from gateway.estimation.local_position import (
     BARO_STALE_S,
 )
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, compare_field, field_similarity
-from gateway.estimation.rest import watch_rest
+from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
 from gateway.geometry.quaternion import (
     from_rotation_vector,
@@ -50,8 +53,6 @@ from gateway.geometry.quaternion import (
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-GAP_S: Final = 0.5
-"""A longer silence is not integrated over."""
 COVARIANCE_S: Final = 0.02
 """The covariance is propagated this often, and before each measurement."""
 PSEUDO_S: Final = 0.1
@@ -60,6 +61,8 @@ COMPASS_S: Final = 0.045
 """Between compass measurements; its slow error makes more of them useless."""
 ROUGH_LIMIT: Final = 1e4
 """A larger change is a fault, and NaN compares false."""
+UNAIDED_PULL_MPS2: Final = 0.5
+"""A lasting acceleration of this much halves the belief in standing still."""
 ZERO: Final = (0.0, 0.0, 0.0)
 
 
@@ -93,8 +96,8 @@ def take_imu(
         s.fault = 1
         if dt < -GAP_S:
             s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
-            forget_times(s)
             bridge_gap(s, p, 1.0)
+            forget_times(s)
         return
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
     if dt > GAP_S:
@@ -111,7 +114,11 @@ def take_imu(
         accel = substitute_force(s)
     integrate(s, gyro, accel, dt)
     if sound_gyro and sound_accel:
-        watch_rest(s, p, gyro, accel, is_moving(s, p), dt)
+        moving = is_moving(s, p)
+        rested = s.at_rest == 1
+        watch_rest(s, p, gyro, accel, moving, dt)
+        raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
+        watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
     take_substitutes(s, p)
@@ -153,8 +160,9 @@ def substitute_force(s: EskfState) -> Vec3:
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
     """Tell whether the GPS says that the aircraft moves."""
-    fresh = s.aided == 1 and s.time_s - s.fix_s < FRESH_GPS_S
-    return bool(fresh and math.hypot(s.vel_n[0], s.vel_n[1]) > p.rest_speed_mps)
+    vel = s.vel_n if s.aided == 1 else s.fix_vel
+    fresh = s.time_s - s.fix_s < FRESH_GPS_S
+    return bool(fresh and math.hypot(vel[0], vel[1]) > p.rest_speed_mps)
 
 
 @compiled
@@ -178,6 +186,7 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
         gyro[2] - b[2] - e[2] * gyro[2],
     )
     write_vec(s.rate_b, rate)
+    carry_frame(s, rate, dt)
     # The force of the interval acts, on average, at the attitude half way through it.
     half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
     q = multiply(as_quat(s.q_nb), half)
@@ -185,6 +194,8 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
     f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
     s.pending_s += dt
+    force_i = rotate(as_quat(s.q_ib), (f0, f1, f2))
+    follows = s.aided == 0 and s.time_s - s.fix_s < FRESH_GPS_S and math.isfinite(s.fix_vel[2])
     for k in range(3):
         force = x[k] * f0 + y[k] * f1 + z[k] * f2
         s.pending_force_n[k] += force * dt
@@ -198,9 +209,12 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
         s.integrals[3 + k] += a * dt
+        s.integrals[k] += force_i[k] * dt
         s.pending_accel_sq += a * a * dt
         if s.aided == 1:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
+        elif follows:
+            s.pos_n[k] += s.fix_vel[k] * dt
         s.vel_n[k] += a * dt
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
 
@@ -216,8 +230,10 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
         end_dead_reckoning(s, p)
     if s.at_rest == 1:
         update_by_rest(s, p)
-    elif s.aided == 0:
-        update_by_velocity(s, p, p.unaided_var * UNAIDED_CORRELATION_S / dt)
+    elif s.aided == 0 and s.lost == 0:
+        pull = s.pull_mps2 / UNAIDED_PULL_MPS2
+        variance = p.unaided_var * UNAIDED_CORRELATION_S / dt * (1.0 + pull * pull)
+        update_by_velocity(s, p, variance)
 
 
 @compiled
@@ -233,6 +249,8 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     mag_b : tuple of 3 floats
         Calibrated field in body FRD, uT.
     """
+    if s.lost == 1:
+        return
     dt = s.time_s - s.mag_s
     b = s.mag_bias_b
     mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])

@@ -2,7 +2,8 @@
 
 from typing import Annotated, Final
 
-from gateway.estimation.alignment import MatchState
+from gateway.estimation.alignment.gps_velocity import WayState
+from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.kernel_record import FloatArray
 from gateway.estimation.local_position import PlaceState
 from gateway.estimation.magfield import FieldState
@@ -26,7 +27,7 @@ BARO_BIAS: Final = 24
 STATES: Final = 25
 
 
-class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
+class EskfState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
     """All that the filter remembers."""
 
     started: int
@@ -65,7 +66,6 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
 
     aided: int
     """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""
-    heading_known: int
     heading_true: int
     declination_rad: float
     mag_s: float
@@ -85,9 +85,7 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, MatchState):
     has_height: int
     """1 once a fix has told the height above the sea."""
     fix_s: float
-    fix_valid_s: float
     fix_vel: Annotated[FloatArray, (3,)]
-    fix_force: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
     off_last_m: float

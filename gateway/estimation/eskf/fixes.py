@@ -1,10 +1,15 @@
 """GPS fixes: the first heading, starts and restarts, and the update by a late fix."""
 
 import math
-from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment import collect_match
+from gateway.estimation.alignment.gps_velocity import (
+    FASTEST_MPS,
+    velocity_noise,
+    velocity_of_fix,
+)
+from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
+from gateway.estimation.alignment.wahba import align_by_velocity
 from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -15,11 +20,12 @@ from gateway.estimation.eskf.measure import (
     set_wander_variance,
     update_by_fix,
 )
+from gateway.estimation.eskf.recovery import lose_attitude, review_attitude, turn_heading
 from gateway.estimation.eskf.start import (
+    bridge_gap,
     relock_at,
     restart_at,
-    start_heading_by_match,
-    turn_heading,
+    start_height,
 )
 from gateway.estimation.history import recall
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
@@ -33,13 +39,6 @@ from gateway.estimation.local_position import (
 )
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
-
-MIN_BASELINE_S: Final = 0.15
-MAX_BASELINE_S: Final = 2.5
-"""Interval of two fixes whose velocities tell an acceleration."""
-STEP_NOISE_MPS: Final = 0.2
-"""Noise of the step from one velocity to the next, in which slow errors cancel."""
-ZERO: Final = (0.0, 0.0, 0.0)
 
 
 @compiled
@@ -59,32 +58,58 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     """
     if s.started == 0 or row[GPS_USABLE] == 0.0:
         return
+    if not (math.isfinite(row[GPS_LAT]) and math.isfinite(row[GPS_LON])):
+        return
     learn_declination(s, row[GPS_DECLINATION])
     set_wander_variance(s, p, row)
-    then = s.then
     wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
-    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, then)
+    catch_up(s, p, wanted_s)
+    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
     lag = s.time_s - valid_s
     move_origin(s, row[GPS_LAT], row[GPS_LON])
     pos, vel = fix_position(s, row), fix_velocity(row)
-    told_velocity = is_sound(vel, 1000.0)
+    align(s, p, valid_s, pos, vel)
+    recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
     if s.heading_known == 0:
-        if told_velocity:
-            match_heading(s, valid_s, vel, (then[3], then[4], then[5]))
-        if s.heading_known == 0:
-            follow_fix(s, pos, vel)
-            return
-    if s.aided == 0:
-        restart_at(s, p, pos, vel if told_velocity else ZERO, lag)
-        accept(s, vel)
+        follow_fix(s, pos, lag)
+    elif s.aided == 0:
+        restart_at(s, p, pos, as_vec(s.fix_vel), lag)
+        accept(s)
+    else:
+        fuse_fix(s, p, row, pos, vel, lag)
+
+
+@compiled
+def catch_up(s: EskfState, p: EskfGains, valid_s: float) -> None:
+    """Go on to a fix that was valid long after the newest sample: the IMU is silent."""
+    ahead = valid_s - s.time_s
+    if ahead > GAP_S:
+        s.time_us += int(ahead * 1e6)
+        s.time_s = (s.time_us - s.base_us) * 1e-6
+        bridge_gap(s, p, ahead)
+
+
+@compiled
+def align(s: EskfState, p: EskfGains, valid_s: float, pos: Vec3, told: Vec3) -> None:
+    """Give the velocity of a fix to the alignment, and heed what that says."""
+    vel, at_s = velocity_of_fix(s, valid_s, pos, told)
+    if not is_sound(vel, FASTEST_MPS):
         return
-    fuse_fix(s, p, row, pos, vel, lag)
+    write_vec(s.fix_vel, vel)
+    if s.by_gps == 0 and s.aided == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS:
+        # What was found without GPS took the pull of every turn for gravity.
+        lose_attitude(s, p)
+    at_s = recall(s.ring, s.ring_count, at_s, s.time_s, s.integrals, s.then)
+    dt = align_by_velocity(s, at_s, vel, as_vec(s.then), velocity_noise(told))
+    if dt > 0.0:
+        review_attitude(s, p, dt)
 
 
 @compiled
 def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Update by a fix that lies near, reject one that does not, relock on those that insist."""
     propagate(s, p)
+    start_height(s, p, pos[2] + s.vel_n[2] * lag)
     past_pos, past_vel = past_state(s, s.then, lag)
     once, twice = lag_integrals(s, s.then, lag)
     w = s.wander_n
@@ -99,10 +124,10 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
     note_contradiction(s, off_m if unlikely else 0.0)
     if not unlikely or off_m < p.gate_m:
         update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
-        accept(s, vel)
+        accept(s)
     elif is_relocked(s, p.gps_relock_s, pos, vel):
-        relock_at(s, p, pos, vel if is_sound(vel, 1000.0) else ZERO, lag)
-        accept(s, vel)
+        relock_at(s, p, pos, as_vec(s.fix_vel), lag)
+        accept(s)
 
 
 @compiled
@@ -113,38 +138,20 @@ def note_contradiction(s: EskfState, off_m: float) -> None:
 
 
 @compiled
-def accept(s: EskfState, vel: Vec3) -> None:
+def accept(s: EskfState) -> None:
     """Note that a fix was used."""
     s.fix_s = s.time_s
-    write_vec(s.fix_vel, vel)
     s.reject_s, s.reject_last[0] = 0.0, NEVER_S
 
 
 @compiled
-def follow_fix(s: EskfState, pos: Vec3, vel: Vec3) -> None:
-    """Show a fix as it is while it cannot be fused: without a heading."""
-    write_vec(s.fix_vel, vel)
+def follow_fix(s: EskfState, pos: Vec3, lag: float) -> None:
+    """Show a fix while it cannot be fused, without a heading; its velocity moves it on."""
     s.fix_s = s.time_s
-    s.pos_n[0], s.pos_n[1] = pos[0], pos[1]
-    if s.baro_known == 0:
-        s.pos_n[2] = pos[2]
-
-
-@compiled
-def match_heading(s: EskfState, valid_s: float, vel: Vec3, integral: Vec3) -> None:
-    """Collect the match of GPS and inertial accelerations; it may give the first heading."""
-    dt = valid_s - s.fix_valid_s
-    if dt < MIN_BASELINE_S:
-        return
-    old, force = as_vec(s.fix_vel), as_vec(s.fix_force)
-    write_vec(s.fix_force, integral)
-    s.fix_valid_s = valid_s
-    if dt > MAX_BASELINE_S:
-        return
-    accel = ((vel[0] - old[0]) / dt, (vel[1] - old[1]) / dt, (vel[2] - old[2]) / dt)
-    mean = ((integral[0] - force[0]) / dt, (integral[1] - force[1]) / dt, 0.0)
-    if collect_match(s, mean, accel, dt, STEP_NOISE_MPS):
-        start_heading_by_match(s, math.atan2(s.match[1], s.match[0]), 1.0 / s.match[2])
+    for k in range(3):
+        moved = s.fix_vel[k] * lag
+        if k < 2 or (s.baro_known == 0 and math.isfinite(pos[2])):
+            s.pos_n[k] = pos[k] + (moved if math.isfinite(moved) else 0.0)
 
 
 @compiled

@@ -192,7 +192,7 @@ def update_by_fix(
     row : ndarray, shape (GPS_COLUMNS,)
         The fix, for its accuracies.
     off_pos, off_vel : tuple of 3 floats
-        Innovations; a velocity that is not finite is left out.
+        Innovations; what is not finite is left out.
     once, twice : tuple of 3 floats
         See `lag_integrals`.
     lag : float
@@ -210,6 +210,8 @@ def update_by_fix(
                 + late_vel[k]
             )
             update_scalar(s, off_vel[k], noise, VELOCITY_GATE_SQ)
+        if not math.isfinite(off_pos[k]):
+            continue
         position_row(s, k, once, twice, lag)
         noise = p.gps_position_var if k < 2 else p.gps_height_var
         update_scalar(

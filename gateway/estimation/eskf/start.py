@@ -4,6 +4,8 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
+from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.eskf.covariance import decorrelate, propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
@@ -20,19 +22,17 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row
+from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
-from gateway.estimation.sensor_faults import ACCEL_LIMIT_MPS2, GYRO_LIMIT_RADPS, is_sound
-from gateway.geometry.quaternion import from_euler, multiply, normalise
+from gateway.estimation.sensor_faults import is_sound, is_start
+from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
 from gateway.records import NAN, Vec3
 
-FIRST_TILT_VAR: Final = 0.05**2
-NO_HEADING_VAR: Final = 3.0
 FIRST_VELOCITY_VAR: Final = 0.5**2
-GAP_TILT_RATE: Final = 0.05
-"""Over a gap the attitude may have changed by this much a second, rad/s."""
+NO_VELOCITY_VAR: Final = 5.0**2
+GAP_REST_RATE: Final = 0.02
 GAP_ACCEL_MPS2: Final = 3.0
-GAP_TILT_LIMIT_RAD: Final = 0.6
 RELOCK_HEADING_VAR: Final = 0.3**2
 
 
@@ -54,7 +54,7 @@ def start(s: EskfState, p: EskfGains) -> None:
 @compiled
 def forget_times(s: EskfState) -> None:
     """Drop all that is tied to the clock."""
-    s.mag_s = s.mag_used_s = s.fix_s = s.fix_valid_s = s.baro_s = s.pseudo_s = NEVER_S
+    s.mag_s = s.mag_used_s = s.fix_s = s.pair_s = s.baro_s = s.pseudo_s = NEVER_S
     s.reject_last[0] = NEVER_S
     s.reject_s = s.rest_s = 0.0
     s.ring_count = s.at_rest = 0
@@ -63,8 +63,7 @@ def forget_times(s: EskfState) -> None:
 @compiled
 def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first sound sample, level by its specific force."""
-    s.fault = 0 if is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2) else 1
-    if s.fault == 1:
+    if not is_start(s, gyro, accel):
         return
     s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
     write_vec(s.gyro_lp, gyro)
@@ -74,22 +73,10 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
     roll = math.atan2(-accel[1], -accel[2])
     pitch = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
     write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
-    decorrelate(s.P, TILT, FIRST_TILT_VAR)
-    decorrelate(s.P, TILT + 1, FIRST_TILT_VAR)
-    decorrelate(s.P, TILT + 2, NO_HEADING_VAR)
-    for k in range(3):
-        decorrelate(s.P, VEL + k, p.unaided_var)
-
-
-@compiled
-def turn_heading(s: EskfState, turn_rad: float) -> None:
-    """Turn the whole attitude about down."""
-    half = 0.5 * turn_rad
-    turn = (math.cos(half), 0.0, 0.0, math.sin(half))
-    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
-    # The integrals stand in the old heading.
-    s.ring_count = 0
-    s.fix_valid_s = NEVER_S
+    write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
+    write_vec(s.force_mean_i, accel)
+    # One sample may be anything: the alignment finds the level within the first second.
+    lose_attitude(s, p)
 
 
 @compiled
@@ -121,14 +108,6 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def start_heading_by_match(s: EskfState, turn_rad: float, variance: float) -> None:
-    """Take the heading from GPS against inertial acceleration."""
-    turn_heading(s, turn_rad)
-    decorrelate(s.P, TILT + 2, variance)
-    s.heading_known = s.heading_true = 1
-
-
-@compiled
 def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix alone.
 
@@ -139,25 +118,33 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
     p : EskfGains
         Constants.
     pos, vel : tuple of 3 floats
-        The fix, metres from the origin and m/s.
+        The fix, metres from the origin and m/s; NaN what it does not tell.
     lag : float
         Its age, s.
     """
     propagate(s, p)
+    told = is_sound(vel, FASTEST_MPS)
+    vel = vel if told else (0.0, 0.0, 0.0)
     for k in range(3):
-        decorrelate(s.P, VEL + k, FIRST_VELOCITY_VAR)
+        decorrelate(s.P, VEL + k, FIRST_VELOCITY_VAR if told else NO_VELOCITY_VAR)
         s.vel_n[k] = vel[k]
     for k in range(2):
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
-    if s.has_height == 0:
-        down = pos[2] + vel[2] * lag
-        start_position(s, 2, down, p.gps_height_var)
-        s.has_height = 1
-        if s.baro_known == 1:
-            restart_baro(s, p)
+    start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
     start_iron_search(s, p)
     s.off_last_m = s.contradiction_m = 0.0
+
+
+@compiled
+def start_height(s: EskfState, p: EskfGains, down_m: float) -> None:
+    """Take the height from the first fix that tells one."""
+    if s.has_height == 1 or not math.isfinite(down_m):
+        return
+    start_position(s, 2, down_m, p.gps_height_var)
+    s.has_height = 1
+    if s.baro_known == 1:
+        restart_baro(s, p)
 
 
 @compiled
@@ -206,10 +193,18 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
 
 @compiled
 def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
-    """Go on after a silence: straight ahead, and much less sure."""
+    """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     propagate(s, p)
     s.fault = 1
-    turned = min(GAP_TILT_RATE * dt, GAP_TILT_LIMIT_RAD)
+    rate = (
+        s.gyro_lp[0] - s.gyro_bias_b[0],
+        s.gyro_lp[1] - s.gyro_bias_b[1],
+        s.gyro_lp[2] - s.gyro_bias_b[2],
+    )
+    still = s.at_rest == 1
+    turning = 0.0 if still else math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    turned = (GAP_REST_RATE if still else GAP_TILT_RATE + turning) * dt
+    turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt if not still else 0.0)
     for k in range(3):
         if s.aided == 1:
             s.pos_n[k] += s.vel_n[k] * dt
@@ -217,6 +212,17 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
         s.P[VEL + k, VEL + k] += (GAP_ACCEL_MPS2 * dt) ** 2
         s.P[POS + k, POS + k] += (0.5 * GAP_ACCEL_MPS2 * dt * dt) ** 2
     s.ring_count = 0
-    s.fix_valid_s = NEVER_S
+    s.pair_s = NEVER_S
     s.rest_s = 0.0
     s.at_rest = 0
+    if turned > GAP_LOST_RAD and not still:
+        lose_attitude(s, p)
+
+
+@compiled
+def turn_on(s: EskfState, turn_rad: float) -> None:
+    """Turn attitude and velocity about down: a turn that was flown goes on."""
+    half = 0.5 * turn_rad
+    turn = (math.cos(half), 0.0, 0.0, math.sin(half))
+    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))

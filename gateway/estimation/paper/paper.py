@@ -299,7 +299,10 @@ class PaperEstimator:
     def _read(self, fix: GpsFix) -> tuple[kernels.Place, Vec3]:
         """Tell the place and velocity of a fix, and keep it for the next one's bearing."""
         s = self._s
-        place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, fix.alt_amsl_m)
+        # Without a height of its own a fix lies as high as the one before.
+        last_m = s.last_fix[2] if math.isfinite(s.last_fix[2]) else 0.0
+        alt_m = fix.alt_amsl_m if math.isfinite(fix.alt_amsl_m) else last_m
+        place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, alt_m)
         self._earth.update(*place, fix.utc_us)
         vel = fix.vel_n_mps
         if not is_finite(vel):

@@ -18,8 +18,9 @@ from gateway.records import (
 )
 from gateway.settings import Settings, setting
 
-EXTRA_FIELDS: Final = ("baro_alt_m",)
-"""May be mapped though the table has no such column: heights become pressures."""
+EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
+"""May be mapped though the table has no such columns: heights become pressures, speed and course
+the velocity where it is not told."""
 NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 """Without these there is nothing to fuse."""
 SEA_LEVEL_PA: Final = 101_325.0
@@ -172,7 +173,7 @@ class ForeignReader:
             lat_dege7=round(value["gps_lat_dege7"]),
             lon_dege7=round(value["gps_lon_dege7"]),
             alt_amsl_m=value.get("gps_alt_amsl_m", NAN),
-            vel_n_mps=_vector(value, "gps_vel_{}_mps", ("north", "east", "down")),
+            vel_n_mps=_velocity(value),
             alt_ellipsoid_m=value.get("gps_alt_ellipsoid_m", NAN),
             h_acc_m=value.get("gps_h_acc_m", NAN),
             v_acc_m=value.get("gps_v_acc_m", NAN),
@@ -181,6 +182,16 @@ class ForeignReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
+
+
+def _velocity(value: Mapping[str, float]) -> Vec3:
+    """Read a fix's velocity, or make its level part of speed and course."""
+    north, east, down = _vector(value, "gps_vel_{}_mps", ("north", "east", "down"))
+    if not (math.isfinite(north) and math.isfinite(east)):
+        speed = value.get("gps_speed_mps", NAN)
+        course_rad = math.radians(value.get("gps_course_deg", NAN))
+        north, east = speed * math.cos(course_rad), speed * math.sin(course_rad)
+    return (north, east, down)
 
 
 def _vector(value: Mapping[str, float], name: str, axes: Iterable[str]) -> Vec3:

@@ -13,7 +13,7 @@ from gateway.sensing.chain import pressure_altitude_m
 
 TRACKER = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
 NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"
-NAMES += "gps_vn,gps_ve,gps_vd,note"
+NAMES += "gps_vn,gps_ve,gps_vd,note,gps_speed_ms,gps_course_deg"
 
 
 def read(*lines: str) -> tuple[ForeignReader, list[Any]]:
@@ -39,6 +39,13 @@ def test_a_full_line() -> None:
     assert row.gps.fix_type is GpsFixType.FIX_3D
     assert math.isnan(row.gps.h_acc_m)
     assert row.raw is row.state is None
+
+
+def test_speed_and_course_stand_in_for_a_velocity_that_is_not_told() -> None:
+    _, rows = read("1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120")
+    north, east, down = rows[0].gps.vel_n_mps
+    assert (north, east) == pytest.approx((-2.5, 4.330127), abs=1e-6)
+    assert math.isnan(down)
 
 
 def test_blank_cells_are_nothing_new() -> None:

@@ -1,0 +1,155 @@
+"""When the alignment's attitude takes the place of an estimator's own."""
+
+import math
+from typing import Annotated, Final
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment.wahba import (
+    AlignmentState,
+    alignment_std,
+    clear_alignment,
+    heading_difference,
+    level_difference,
+    misfit,
+    solve_alignment,
+)
+from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
+from gateway.estimation.local_position import NEVER_S
+from gateway.geometry.quaternion import multiply, normalise
+from gateway.records import Quat
+
+FOUND_LEVEL_RAD: Final = 0.08
+FOUND_HEADING_RAD: Final = 0.2
+"""Up to these standard deviations an alignment is taken for the attitude."""
+PATIENCE_S: Final = 8.0
+"""What pulls for longer is taken for gravity, where nothing else is told."""
+PULLED_MPS2: Final = 1.0
+DOUBT_LEVEL_RAD: Final = 0.14
+DOUBT_HEADING_RAD: Final = 0.3
+DOUBT_S: Final = 2.0
+"""An attitude further off than this, for so long, is given up for that of the alignment."""
+DOUBT_GRAVITY_RAD: Final = 0.6
+DOUBT_GRAVITY_S: Final = 5.0
+"""The same where there is gravity alone, which manoeuvres hide."""
+DOUBT_SIGMA: Final = 4.0
+SURE_RAD: Final = 0.12
+"""An alignment's heading that is less sure than this contradicts nothing."""
+GRAVITY_PAIR_S: Final = 0.1
+GAP_S: Final = 0.5
+"""A longer silence of the IMU is not integrated over."""
+GAP_TILT_RATE: Final = 0.05
+"""In a silence the attitude may change by this beside the turn that it was in, rad/s."""
+GAP_LOST_RAD: Final = 0.35
+"""An attitude that may have changed by more is no attitude any more."""
+MOVING_MPS: Final = 3.0
+"""From this speed on, an attitude that was found without GPS is not believed."""
+
+
+class ReviewState(AlignmentState):
+    """What the alignment says, and whether the attitude is known."""
+
+    lost: int
+    """1 while the attitude is not known."""
+    lost_s: float
+    """For how long."""
+    doubt_s: float
+    """For how long the alignment has contradicted the attitude."""
+    at_rest: int
+    heading_known: int
+    found_q_nb: Annotated[FloatArray, (4,)]
+    level_std: float
+    heading_std: float
+    """The alignment's attitude after the last pair, and its standard deviations in rad."""
+
+
+@compiled
+def lose(s: ReviewState) -> None:
+    """Note that the attitude is not known; the alignment begins anew."""
+    s.lost, s.lost_s, s.doubt_s = 1, 0.0, 0.0
+    s.heading_known = 0
+    clear_alignment(s)
+    s.pair_s = NEVER_S
+
+
+@compiled
+def find(s: ReviewState, q_nb: Quat) -> Quat:
+    """Note that the attitude is known again, and tell it.
+
+    Parameters
+    ----------
+    s : ReviewState
+        `heading_known` is 0 afterwards where the alignment tells no heading.
+    q_nb : tuple of 4 floats
+        The estimator's own, whose heading is kept then.
+
+    Returns
+    -------
+    tuple of 4 floats
+        `q_nb` from here on.
+    """
+    s.lost, s.doubt_s = 0, 0.0
+    found = as_quat(s.found_q_nb)
+    s.heading_known = 1 if s.by_gps == 1 and s.heading_std < FOUND_HEADING_RAD else 0
+    if s.heading_known == 1:
+        return found
+    half = 0.5 * heading_difference(q_nb, found)
+    return normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found))
+
+
+@compiled
+def tells_heading(s: ReviewState) -> bool:
+    """Tell whether a heading that is not known yet can be had from the alignment."""
+    found = s.by_gps == 1 and s.level_std < FOUND_LEVEL_RAD and s.heading_std < FOUND_HEADING_RAD
+    return bool(s.lost == 0 and s.heading_known == 0 and found)
+
+
+@compiled
+def is_to_be_taken(
+    s: ReviewState, q_nb: Quat, level_told: float, heading_told: float, dt: float
+) -> bool:
+    """Solve the alignment after a new pair and compare it with the attitude.
+
+    Parameters
+    ----------
+    s : ReviewState
+        Changed in place.
+    q_nb : tuple of 4 floats
+        The estimator's own attitude.
+    level_told, heading_told : float
+        Its standard deviations, rad.
+    dt : float
+        Length of the pair, s.
+
+    Returns
+    -------
+    bool
+        Whether the alignment's attitude is to take its place: see `find`.
+    """
+    q_ni = solve_alignment(s)
+    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni))
+    write_quat(s.found_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
+    level_found = s.level_std < FOUND_LEVEL_RAD
+    if s.lost == 1:
+        s.lost_s += dt
+        pulled = s.by_gps == 0 and s.pull_mps2 > PULLED_MPS2
+        return level_found and not (pulled and s.lost_s < PATIENCE_S)
+    doubted = is_contradicted(s, q_nb, level_told, heading_told)
+    s.doubt_s = s.doubt_s + dt if doubted else 0.0
+    return s.doubt_s > (DOUBT_S if s.by_gps == 1 else DOUBT_GRAVITY_S)
+
+
+@compiled
+def is_contradicted(s: ReviewState, q_nb: Quat, level_told: float, heading_told: float) -> bool:
+    """Tell whether the alignment and the attitude cannot both be right."""
+    found = as_quat(s.found_q_nb)
+    allowed = DOUBT_SIGMA * math.hypot(s.level_std, level_told)
+    off = level_difference(found, q_nb)
+    if s.by_gps == 0:
+        return bool(off > max(DOUBT_GRAVITY_RAD, allowed) and s.pull_mps2 == 0.0)
+    if off > max(DOUBT_LEVEL_RAD, allowed):
+        return True
+    if s.heading_known == 0:
+        return False
+    allowed = DOUBT_SIGMA * math.hypot(s.heading_std, heading_told)
+    turned = abs(heading_difference(found, q_nb))
+    return bool(s.heading_std < SURE_RAD and turned > max(DOUBT_HEADING_RAD, allowed))

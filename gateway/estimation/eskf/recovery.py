@@ -1,0 +1,89 @@
+"""An attitude that is lost, and one that the alignment has found."""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment.review import (
+    GRAVITY_PAIR_S,
+    find,
+    is_to_be_taken,
+    lose,
+    tells_heading,
+)
+from gateway.estimation.alignment.wahba import align_by_gravity, heading_difference
+from gateway.estimation.eskf.covariance import decorrelate, propagate
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
+from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
+from gateway.estimation.rest import BIAS_CHANGE_RADPS
+from gateway.geometry.quaternion import multiply, normalise
+
+LOST_TILT_VAR: Final = 0.5**2
+NO_HEADING_VAR: Final = 3.0
+
+
+@compiled
+def raise_bias_variance(s: EskfState, std: float) -> None:
+    """Believe the gyroscope's bias no more firmly than to a standard deviation in rad/s."""
+    for k in range(GYRO_BIAS, GYRO_BIAS + 3):
+        s.P[k, k] = max(s.P[k, k], std * std)
+
+
+@compiled
+def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: float) -> None:
+    """Begin the covariance of an attitude; place and velocity begin at the next fix."""
+    propagate(s, p)
+    decorrelate(s.P, TILT, level_var)
+    decorrelate(s.P, TILT + 1, level_var)
+    decorrelate(s.P, TILT + 2, heading_var)
+    for k in range(3):
+        decorrelate(s.P, VEL + k, p.unaided_var)
+        s.vel_n[k] = 0.0
+    s.aided = 0
+    # The integrals in NED stand in the old attitude.
+    s.ring_count = 0
+
+
+@compiled
+def turn_heading(s: EskfState, turn_rad: float) -> None:
+    """Turn the whole attitude about down."""
+    half = 0.5 * turn_rad
+    turn = (math.cos(half), 0.0, 0.0, math.sin(half))
+    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    # The integrals stand in the old heading.
+    s.ring_count = 0
+
+
+@compiled
+def lose_attitude(s: EskfState, p: EskfGains) -> None:
+    """Give the attitude up; the place follows the fixes until the alignment has found another."""
+    lose(s)
+    begin_attitude(s, p, LOST_TILT_VAR, NO_HEADING_VAR)
+
+
+@compiled
+def watch_gravity(s: EskfState, p: EskfGains) -> None:
+    """Look at gravity where GPS tells no velocity."""
+    dt = align_by_gravity(s, s.time_s, as_vec(s.integrals), GRAVITY_PAIR_S)
+    if dt > 0.0:
+        review_attitude(s, p, dt)
+
+
+@compiled
+def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
+    """Compare the attitude with the alignment after a new pair of `dt` seconds."""
+    level_told = math.sqrt(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
+    heading_told = math.sqrt(s.P[TILT + 2, TILT + 2])
+    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, dt):
+        if tells_heading(s):
+            turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
+            decorrelate(s.P, TILT + 2, s.heading_std * s.heading_std)
+            s.heading_known = s.heading_true = 1
+        return
+    write_quat(s.q_nb, find(s, as_quat(s.q_nb)))
+    if s.heading_known == 1:
+        s.heading_true = 1
+    heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else NO_HEADING_VAR
+    raise_bias_variance(s, BIAS_CHANGE_RADPS)
+    begin_attitude(s, p, s.level_std * s.level_std, heading_var)

@@ -1,0 +1,106 @@
+"""The attitude out of motion: from any start, by exact and noisy pairs."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.estimation.alignment.gps_velocity import WayState, velocity_of_fix
+from gateway.estimation.alignment.wahba import (
+    AlignmentState,
+    align_by_gravity,
+    align_by_velocity,
+    alignment_std,
+    heading_difference,
+    level_difference,
+    misfit,
+    solve_alignment,
+)
+from gateway.estimation.kernel_record import new_record
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+NAN = math.nan
+
+
+def feed(state: AlignmentState, attitude: Rotation, seed: int, noise_mps: float = 0.0) -> None:
+    """Ten seconds of accelerations, seen in a frame that lies in NED by `attitude`."""
+    rng = np.random.default_rng(seed)
+    state.pair_s = -1e9
+    force_i, vel = np.zeros(3), np.zeros(3)
+    for k in range(50):
+        told = vel + rng.normal(0.0, noise_mps, 3) if noise_mps else vel
+        align_by_velocity(state, 0.2 * k, tuple(told), tuple(force_i), 0.2)
+        accel = rng.normal(0.0, 3.0, 3)
+        vel = vel + 0.2 * accel
+        force_n = accel - [0.0, 0.0, STANDARD_GRAVITY_MPS2]
+        force_i = force_i + 0.2 * attitude.inv().apply(force_n)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_attitude_is_found(seed: int) -> None:
+    attitude = Rotation.random(rng=np.random.default_rng(seed))
+    state = new_record(AlignmentState)
+    feed(state, attitude, seed)
+    found = Rotation.from_quat(solve_alignment(state), scalar_first=True)
+    assert math.degrees((found * attitude.inv()).magnitude()) < 0.01
+
+
+def test_the_standard_deviations_are_honest() -> None:
+    """Of noisy velocities; pairs share their noise, so they may tell too much, never too little."""
+    level, heading = [], []
+    for seed in range(60):
+        attitude = Rotation.random(rng=np.random.default_rng(seed))
+        state = new_record(AlignmentState)
+        feed(state, attitude, seed, 0.2)
+        q = solve_alignment(state)
+        stds = alignment_std(state, misfit(state, q))
+        true = tuple(attitude.as_quat(scalar_first=True))
+        # The same vector in the body stands for the vertical of both.
+        level.append(level_difference(q, true) / stds[0])
+        heading.append(heading_difference(q, true) / stds[1])
+    assert 0.2 < np.sqrt(np.mean(np.square(level))) < 1.2
+    assert 0.2 < np.sqrt(np.mean(np.square(heading))) < 1.2
+
+
+def test_gravity_tells_the_level_alone() -> None:
+    attitude = Rotation.from_euler("ZYX", [1.0, 0.4, -2.5])
+    state = new_record(AlignmentState)
+    state.pair_s = -1e9
+    force = attitude.inv().apply([0.0, 0.0, -STANDARD_GRAVITY_MPS2])
+    for k in range(30):
+        align_by_gravity(state, 0.1 * k, tuple(force * 0.1 * k), 0.1)
+    level_std, heading_std = alignment_std(state, 1.0)
+    found = Rotation.from_quat(solve_alignment(state), scalar_first=True)
+    np.testing.assert_allclose(found.apply(force), [0.0, 0.0, -STANDARD_GRAVITY_MPS2], atol=1e-6)
+    assert level_std < 0.05
+    assert heading_std > 1.0
+
+
+class TestVelocityOfFix:
+    def test_told_is_taken(self) -> None:
+        state = new_record(WayState)
+        assert velocity_of_fix(state, 5.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)) == ((4, 5, 6), 5.0)
+
+    def test_two_places_tell_it_half_way(self) -> None:
+        state = new_record(WayState)
+        state.way_s = -1e9
+        unknown = (NAN, NAN, NAN)
+        assert math.isnan(velocity_of_fix(state, 5.0, (0.0, 0.0, -9.0), unknown)[0][0])
+        assert math.isnan(velocity_of_fix(state, 5.5, (5.0, 0.0, -9.0), unknown)[0][0])
+        vel, at_s = velocity_of_fix(state, 6.0, (10.0, -3.0, -10.0), unknown)
+        assert vel == pytest.approx((10.0, -3.0, -1.0))
+        assert at_s == 5.5
+
+    def test_heights_tell_the_climb_that_speed_and_course_do_not(self) -> None:
+        state = new_record(WayState)
+        velocity_of_fix(state, 5.0, (0.0, 0.0, -9.0), (3.0, 4.0, NAN))
+        vel, at_s = velocity_of_fix(state, 6.0, (0.0, 0.0, -11.0), (3.0, 4.0, NAN))
+        assert vel == pytest.approx((3.0, 4.0, -2.0))
+        assert at_s == 6.0
+
+    def test_without_heights_it_does_not_climb(self) -> None:
+        state = new_record(WayState)
+        velocity_of_fix(state, 5.0, (0.0, 0.0, NAN), (3.0, 4.0, NAN))
+        vel, _ = velocity_of_fix(state, 6.0, (0.0, 0.0, NAN), (3.0, 4.0, NAN))
+        assert vel == (3.0, 4.0, 0.0)

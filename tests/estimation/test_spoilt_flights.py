@@ -1,0 +1,117 @@
+"""Flights spoilt as in the field: an estimator is back with its unspoilt run 20 s afterwards."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.estimation.columns import GYRO, NAV_FLAGS, NAV_LAT
+from gateway.records import NavFlags
+from tools.flights import Flight, read_flight, simulated_flight
+from tools.score_estimators import (
+    attitude_scores,
+    position_errors_m,
+    run_complementary,
+    run_eskf,
+)
+from tools.spoil_flight import RECOVERY_S, SPOILS, applies, departure, mid_air, no_mag
+
+pytestmark = pytest.mark.slow
+
+RUNS = {"complementary": run_complementary, "eskf": run_eskf}
+SEEDS = (21, 22)
+PLACE_M = 10.0
+
+LIMIT_DEG: dict[tuple[str, str], float] = {
+    ("complementary", "late_gps"): 5.5,
+    ("complementary", "no_mag"): 4.0,
+    ("complementary", "mid_air"): 8.5,
+}
+"""For tilt and heading alike; where nothing is said, 3 deg."""
+
+
+@pytest.fixture(scope="module", params=SEEDS)
+def flight(request: pytest.FixtureRequest) -> Flight:
+    return simulated_flight(request.param, calibrated=request.param % 2 == 1)
+
+
+def off(flight: Flight, name: str, how: str) -> tuple[float, float, float]:
+    spoilt = SPOILS[how](flight)
+    run = RUNS[name]
+    found = departure(flight, run(flight), spoilt.flight, run(spoilt.flight))
+    return found.after(spoilt.ends_s + RECOVERY_S)
+
+
+@pytest.mark.parametrize("how", SPOILS)
+@pytest.mark.parametrize("name", RUNS)
+def test_simulated(flight: Flight, name: str, how: str) -> None:
+    tilt_deg, heading_deg, place_m = off(flight, name, how)
+    limit_deg = LIMIT_DEG.get((name, how), 3.0)
+    assert tilt_deg < limit_deg
+    assert heading_deg < limit_deg
+    assert place_m < PLACE_M
+
+
+REAL_LIMIT_DEG: dict[tuple[str, str], float] = {
+    ("complementary", "late_gps"): 4.0,
+    ("complementary", "no_velocity"): 5.0,
+    ("complementary", "no_mag"): 5.0,
+}
+
+
+@pytest.mark.parametrize("how", SPOILS)
+@pytest.mark.parametrize("name", RUNS)
+def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    tilt_deg, heading_deg, place_m = off(flight, name, how)
+    limit_deg = REAL_LIMIT_DEG.get((name, how), 3.0)
+    assert tilt_deg < limit_deg
+    assert heading_deg < limit_deg
+    assert place_m < PLACE_M
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_nothing_is_told_that_is_not_known(flight: Flight, name: str) -> None:
+    """Begun in flight: whatever the flags vouch for holds, and they do so in the end."""
+    spoilt = mid_air(flight)
+    out = RUNS[name](spoilt.flight)
+    flags = out[:, NAV_FLAGS].astype(int)
+    said = replace(spoilt.flight, counts=(flags & int(NavFlags.HEADING_VALID)) != 0)
+    assert attitude_scores(said, out[:, :4])["total"] < 12.0
+    late = spoilt.flight.log.imu_time_us * 1e-6 > spoilt.ends_s + RECOVERY_S
+    assert (flags[late] & int(NavFlags.HEADING_VALID | NavFlags.ATTITUDE_VALID)).all()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_bias_that_changes_at_take_off_is_unlearned(flight: Flight, name: str) -> None:
+    """What the gyroscope shows at rest is not what it shows in flight."""
+    imu, time_s = flight.log.imu.copy(), flight.log.imu_time_us * 1e-6
+    imu[time_s < 14.0, GYRO + 2] -= math.radians(0.9)
+    changed = replace(flight, log=replace(flight.log, imu=imu))
+    yaw_deg = attitude_scores(changed, RUNS[name](changed)[:, :4])["yaw"]
+    assert yaw_deg < {"complementary": 7.0, "eskf": 2.0}[name]
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_place_moves_on_while_no_heading_is_known(flight: Flight, name: str) -> None:
+    """Started in flight without a compass: between two fixes lie 3 m, not a held place."""
+    spoilt = no_mag(mid_air(flight).flight).flight
+    out = RUNS[name](spoilt)
+    first_s = spoilt.log.gps_time_us[0] * 1e-6
+    time_s = spoilt.log.imu_time_us * 1e-6
+    early = (time_s > first_s + 0.5) & (time_s < first_s + 4.0)
+    assert np.nanmax(position_errors_m(spoilt, out)[early]) < 6.0
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_fix_without_height_leaves_the_rest_of_it(flight: Flight, name: str) -> None:
+    out = RUNS[name](SPOILS["no_height"](flight).flight)
+    assert np.isfinite(out[:, :4]).all()
+    settled = flight.log.imu_time_us > 20e6
+    assert np.isfinite(out[settled][:, NAV_LAT : NAV_LAT + 2]).all()
+
+
+def test_every_way_of_spoiling_applies_to_a_whole_flight(flight: Flight) -> None:
+    assert all(applies(how, flight) for how in SPOILS)

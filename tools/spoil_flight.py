@@ -1,0 +1,273 @@
+"""Spoil a flight as flights are spoilt in the field, and tell how an estimator gets over it.
+
+    python tools/spoil_flight.py FLIGHT.csv.gz --how silence -o SPOILT.csv.gz
+
+The spoilt log has the form of the tracker logs that `mavgate fuse` reads.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.estimation.columns import (
+    GPS_ALT,
+    GPS_LAT,
+    GPS_VEL,
+    GYRO,
+    MAG,
+    NAV_LAT,
+    NAV_LON,
+)
+from tools.flights import GPS_NAMES, IMU_NAMES, Flight, north_east_m, read_flight
+
+SILENCE_S = 4.0
+RECOVERY_S = 20.0
+"""So long after the disturbance an estimator has to be back."""
+GYRO_OFF_RADPS = math.radians(1.0)
+ZERO_ROWS = 3
+
+
+@dataclass(frozen=True)
+class Spoilt:
+    """A flight with its disturbance."""
+
+    flight: Flight
+    ends_s: float
+    """When the disturbance is over; where it lasts, when the flight begins in earnest."""
+
+
+def first_fix_s(flight: Flight) -> float:
+    """Tell when GPS, or without any the log, begins."""
+    times = flight.log.gps_time_us if len(flight.log.gps) else flight.log.imu_time_us
+    return float(times[0]) * 1e-6
+
+
+def middle_s(flight: Flight) -> float:
+    """Tell the middle of what counts."""
+    counted = flight.log.imu_time_us[flight.counts] * 1e-6
+    return float(counted[len(counted) // 2])
+
+
+def turn_s(flight: Flight) -> float:
+    """Tell the begin of the span of `SILENCE_S` that turns most, with time left after it."""
+    time_s, log = flight.log.imu_time_us * 1e-6, flight.log
+    dt = np.diff(time_s, prepend=time_s[0]).clip(0.0, 0.1)
+    turned = np.cumsum(np.abs(np.linalg.norm(log.imu[:, GYRO : GYRO + 3], axis=1)) * dt)
+    span = np.interp(time_s + SILENCE_S, time_s, turned) - turned
+    counted = time_s[flight.counts]
+    usable = (time_s > counted[0] + 30.0) & (time_s < counted[-1] - 3.0 * RECOVERY_S)
+    return float(time_s[np.argmax(np.where(usable, span, -1.0))])
+
+
+def zero_rows(flight: Flight) -> Spoilt:
+    """Send all-zero samples first, as an MPU6050 may that has just been woken."""
+    imu = flight.log.imu.copy()
+    imu[:ZERO_ROWS, : len(IMU_NAMES)] = 0.0
+    spoilt = replace(flight, log=replace(flight.log, imu=imu))
+    return Spoilt(spoilt, float(flight.log.imu_time_us[ZERO_ROWS]) * 1e-6)
+
+
+def late_gps(flight: Flight) -> Spoilt:
+    """Let GPS come in the middle of the flight."""
+    keep = flight.log.gps_time_us * 1e-6 > middle_s(flight)
+    spoilt = flight.with_gps(keep)
+    return Spoilt(spoilt, first_fix_s(spoilt))
+
+
+def without(flight: Flight, columns: slice) -> Spoilt:
+    """Take columns from the fixes."""
+    gps = flight.log.gps.copy()
+    gps[:, columns] = math.nan
+    return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), first_fix_s(flight))
+
+
+def no_velocity(flight: Flight) -> Spoilt:
+    """Take the velocity from the fixes."""
+    return without(flight, slice(GPS_VEL, GPS_VEL + 3))
+
+
+def no_height(flight: Flight) -> Spoilt:
+    """Take the height from the fixes."""
+    return without(flight, slice(GPS_ALT, GPS_ALT + 1))
+
+
+def no_mag(flight: Flight) -> Spoilt:
+    """Take the magnetometer."""
+    imu = flight.log.imu.copy()
+    imu[:, MAG : MAG + 3] = math.nan
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+
+
+def no_baro(flight: Flight) -> Spoilt:
+    """Take the barometer."""
+    log = replace(flight.log, baro_time_us=np.empty(0, np.int64), baro_alt_m=np.empty(0))
+    return Spoilt(replace(flight, log=log), first_fix_s(flight))
+
+
+def cut(flight: Flight, keep: np.ndarray) -> Flight:
+    """Keep some of the IMU's samples, and with them the truth about them."""
+    log = replace(flight.log, imu_time_us=flight.log.imu_time_us[keep], imu=flight.log.imu[keep])
+    return replace(
+        flight,
+        log=log,
+        q_nb=flight.q_nb[keep],
+        pos_ne_m=flight.pos_ne_m[keep],
+        counts=flight.counts[keep],
+        truth={name: values[keep] for name, values in flight.truth.items()},
+    )
+
+
+def silence(flight: Flight) -> Spoilt:
+    """Let the IMU fall silent in the sharpest turn; GPS and barometer go on."""
+    time_s, begin_s = flight.log.imu_time_us * 1e-6, turn_s(flight)
+    spoilt = cut(flight, (time_s <= begin_s) | (time_s > begin_s + SILENCE_S))
+    return Spoilt(spoilt, begin_s + SILENCE_S)
+
+
+def mid_air(flight: Flight) -> Spoilt:
+    """Begin in the middle of the flight, as a gateway does that is restarted."""
+    begin_s = middle_s(flight)
+    spoilt = cut(flight, flight.log.imu_time_us * 1e-6 > begin_s)
+    log, baro = spoilt.log, flight.log.baro_time_us * 1e-6 > begin_s
+    log = replace(log, baro_time_us=log.baro_time_us[baro], baro_alt_m=log.baro_alt_m[baro])
+    spoilt = replace(spoilt, log=log).with_gps(log.gps_time_us * 1e-6 > begin_s)
+    return Spoilt(spoilt, begin_s)
+
+
+def gyro_off(flight: Flight) -> Spoilt:
+    """Let every axis of the gyroscope read too much throughout."""
+    imu = flight.log.imu.copy()
+    imu[:, GYRO : GYRO + 3] += GYRO_OFF_RADPS
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+
+
+def half_rate(flight: Flight) -> Spoilt:
+    """Lose every other sample of the IMU; what was new in it comes with the next."""
+    imu, odd = flight.log.imu.copy(), np.arange(len(flight.log.imu)) % 2 == 1
+    known = np.isfinite(imu[:, MAG])
+    late = np.flatnonzero(odd & known & ~np.roll(known, -1))
+    late = late[late + 1 < len(imu)]
+    imu[late + 1, MAG : MAG + 3] = imu[late, MAG : MAG + 3]
+    spoilt = cut(replace(flight, log=replace(flight.log, imu=imu)), ~odd)
+    return Spoilt(spoilt, first_fix_s(flight))
+
+
+SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
+    "zero_rows": zero_rows,
+    "late_gps": late_gps,
+    "no_velocity": no_velocity,
+    "no_height": no_height,
+    "no_mag": no_mag,
+    "no_baro": no_baro,
+    "silence": silence,
+    "mid_air": mid_air,
+    "gyro_off": gyro_off,
+    "half_rate": half_rate,
+}
+GPS_SPOILS = ("late_gps", "no_velocity", "no_height")
+
+
+def applies(how: str, flight: Flight) -> bool:
+    """Tell whether a flight has what a way of spoiling takes."""
+    log = flight.log
+    if how in GPS_SPOILS:
+        return len(log.gps) > 0
+    if how == "no_mag":
+        return bool(np.isfinite(log.imu[:, MAG]).any())
+    return how != "no_baro" or len(log.baro_alt_m) > 0
+
+
+@dataclass(frozen=True)
+class Departure:
+    """How far a spoilt run is from the unspoilt one, by the instant."""
+
+    time_s: np.ndarray
+    tilt_deg: np.ndarray
+    heading_deg: np.ndarray
+    place_m: np.ndarray
+
+    def after(self, since_s: float, percent: float = 95.0) -> tuple[float, float, float]:
+        """Tell what tilt, heading and place keep below most of the time; 0 where there is none."""
+        late = self.time_s >= since_s
+
+        def usual(values: np.ndarray) -> float:
+            known = values[late & ~np.isnan(values)]
+            return float(np.percentile(known, percent, method="higher")) if len(known) else 0.0
+
+        return usual(self.tilt_deg), usual(self.heading_deg), usual(self.place_m)
+
+
+def departure(flight: Flight, out: np.ndarray, spoilt: Flight, spoilt_out: np.ndarray) -> Departure:
+    """Compare a spoilt run with the unspoilt one at the instants that count in both."""
+    _, left, right = np.intersect1d(
+        flight.log.imu_time_us, spoilt.log.imu_time_us, return_indices=True
+    )
+    use = flight.counts[left]
+    left, right = left[use], right[use]
+    told = np.isfinite(spoilt_out[right, 0])
+    quats = np.where(told[:, None], spoilt_out[right, :4], (1.0, 0.0, 0.0, 0.0))
+    found = Rotation.from_quat(quats, scalar_first=True)
+    off = found * Rotation.from_quat(out[left, :4], scalar_first=True).inv()
+    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
+    heading = (2.0 * np.arctan2(z, w) + np.pi) % (2.0 * np.pi) - np.pi
+    place = np.full(len(left), np.nan)
+    if out.shape[1] > NAV_LON:
+        ours = north_east_m(flight, out[left, NAV_LAT], out[left, NAV_LON])
+        theirs = north_east_m(flight, spoilt_out[right, NAV_LAT], spoilt_out[right, NAV_LON])
+        place = np.hypot(*(theirs - ours).T)
+        place[np.isnan(theirs[:, 0]) & np.isfinite(ours[:, 0])] = math.inf
+    # Nothing told where the other tells something is as far off as can be.
+    tilt = np.where(told, 2.0 * np.arccos(np.hypot(w, z).clip(max=1.0)), math.inf)
+    return Departure(
+        time_s=spoilt.log.imu_time_us[right] * 1e-6,
+        tilt_deg=np.degrees(tilt),
+        heading_deg=np.degrees(np.where(told, np.abs(heading), math.inf)),
+        place_m=place,
+    )
+
+
+def write_flight(flight: Flight, path: Path) -> None:
+    """Write the samples as a tracker log."""
+    log = flight.log
+    n = len(log.imu_time_us)
+    table = pd.DataFrame({"time_s": log.imu_time_us * 1e-6})
+    table[IMU_NAMES] = log.imu[:, : len(IMU_NAMES)]
+    for name in ("baro_alt_m", "gps_time_s", *GPS_NAMES):
+        table[name] = np.nan
+    at = np.searchsorted(log.imu_time_us, log.baro_time_us).clip(max=n - 1)
+    table.loc[at, "baro_alt_m"] = log.baro_alt_m
+    at = np.searchsorted(log.imu_time_us, log.gps_time_us).clip(max=n - 1)
+    table.loc[at, "gps_time_s"] = log.gps_time_us * 1e-6
+    for k, name in enumerate(GPS_NAMES):
+        table.loc[at, name] = log.gps[:, GPS_LAT + k]
+    reference = flight.reference
+    words = f"gps_latency_s={reference.gps_latency_s} declination_deg={reference.declination_deg}"
+    text = f"# {flight.name} {words}\n" + table.to_csv(index=False, float_format="%.9g")
+    path.write_bytes(text.encode())
+
+
+def main() -> None:
+    """Read, spoil, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("flight", type=Path, help="a tracker log")
+    parser.add_argument("--how", choices=SPOILS, required=True)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    flight = read_flight(arguments.flight)
+    if not applies(arguments.how, flight):
+        parser.error(f"{flight.name} has not what {arguments.how} takes from a flight")
+    spoilt = SPOILS[arguments.how](flight)
+    write_flight(spoilt.flight, arguments.out)
+    print(f"{arguments.out}: the disturbance ends at {spoilt.ends_s:.2f} s")
+
+
+if __name__ == "__main__":
+    main()
