@@ -80,7 +80,7 @@ def fused(log: Path, estimator: str) -> list[str]:
         result = CliRunner().invoke(app, [*arguments, "--config", str(settings)])
         if result.exit_code != 0:
             raise RuntimeError(result.output)
-        lines = out.read_text().splitlines()
+        lines = [line for line in out.read_text().splitlines() if not line.startswith("#")]
     return [lines[0], *np.array(lines[1:])[::EVERY].tolist()]
 
 
