@@ -1,4 +1,4 @@
-"""RecordedTable I on a real fixed-wing flight with its GPS thinned to one fix a second."""
+"""Table I on a real fixed-wing flight with its GPS thinned to one fix a second."""
 
 from pathlib import Path
 

@@ -11,10 +11,12 @@ from gateway.analysis.reporting.sections.comparison import comparison
 from gateway.analysis.reporting.sections.estimators import estimators
 from gateway.analysis.reporting.sections.ground_track import gps_interpolation, ground_track
 from gateway.analysis.reporting.sections.orientation import orientation
+from gateway.analysis.reporting.sections.pilot import figures_of, pilot_facts, the_flight
 from gateway.analysis.reporting.sections.raw_sensors import heights, magnetometer, noise, timing
 from gateway.analysis.reporting.sections.weights import weights
 
 SECTIONS: Final[tuple[Callable[[Case], Section | None], ...]] = (
+    the_flight,
     ground_track,
     estimators,
     orientation,
@@ -26,7 +28,8 @@ SECTIONS: Final[tuple[Callable[[Case], Section | None], ...]] = (
     noise,
     timing,
 )
-"""In the order of the page; a section that the flight has no data for is left out."""
+"""In the order of the page: the flight itself, then the study of filters. A section that the flight
+has no data for is left out."""
 
 
 def make_report(case: Case, other: Case | None = None) -> Report:
@@ -54,10 +57,10 @@ def make_report(case: Case, other: Case | None = None) -> Report:
 
 
 def _facts(case: Case) -> list[Fact]:
-    flight = case.flight
+    flight, figures = case.flight, figures_of(case)
     return [
-        Fact(f"{flight.duration_s:.0f} s", "duration"),
+        *([] if figures is None else pilot_facts(figures)),
+        Fact(f"{flight.duration_s:.0f} s", "recorded"),
         Fact(f"{len(flight.time_us)}", f"IMU samples, {flight.rate_hz:.0f} a second"),
-        Fact(f"{len(fixes_of(flight))}", "usable GPS fixes"),
-        Fact(case.chosen, "estimator chosen by the settings"),
+        Fact(f"{len(fixes_of(flight))}", f"usable GPS fixes; estimator {case.chosen}"),
     ]

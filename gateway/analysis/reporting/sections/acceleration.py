@@ -17,20 +17,25 @@ AXIS_NAMES: Final = "xyz"
 
 
 def acceleration(case: Case) -> Section:
-    """Build the section."""
+    """Build the section; where the flight's rate is too low for the filters, their design alone."""
     sensing, rate_hz = case.fusion.sensing, case.flight.rate_hz
     cutoff = sensing.accel_cutoff_hz
     if cutoff >= 0.5 * rate_hz:
-        note = f" At this flight's {rate_hz:.0f} samples/s a cutoff of {cutoff:g} Hz does nothing."
-    else:
-        note = ""
+        return Section(
+            "Acceleration filters",
+            f"At this flight's {rate_hz:.0f} samples/s a low-pass at {cutoff:g} Hz does nothing: "
+            "half the sample rate is the highest frequency that there is. So there is nothing to "
+            "draw of this flight; the table shows the filters at the paper's rate.",
+            [],
+            [_paper_table(case)],
+        )
     return Section(
         "Acceleration filters",
         f"Second-order low-passes at {cutoff:g} Hz, as in figures 9 and 10 of the paper. "
         "Chebyshev passes all up to the cutoff and falls faster from there, but rings after a "
         "step and delays unevenly. "
         "The paper holds that it also takes longer; with the same order both are the same five "
-        f"multiplications a sample, and the table tells what they take here.{note}",
+        f"multiplications a sample, and the table tells what they take here.",
         [
             _excerpt(case, 0, "fig09_acceleration_x"),
             _excerpt(case, 1, "fig10_acceleration_y"),
@@ -49,12 +54,16 @@ def acceleration(case: Case) -> Section:
                 f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
                 "three axes.",
             ),
-            ReportTable(
-                "filters_paper",
-                compare(sensing, PAPER_RATE_HZ),
-                f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
-            ),
+            _paper_table(case),
         ],
+    )
+
+
+def _paper_table(case: Case) -> ReportTable:
+    return ReportTable(
+        "filters_paper",
+        compare(case.fusion.sensing, PAPER_RATE_HZ),
+        f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
     )
 
 
@@ -63,7 +72,8 @@ def _excerpt(case: Case, axis: int, name: str) -> Picture:
         name,
         lambda width: _draw_excerpt(case, axis, width),
         f"Specific force along body {AXIS_NAMES[axis]}, the {EXCERPT_S:.0f} s in which it changes "
-        "most: raw, and behind either filter.",
+        "most: raw, and behind either filter. The lines nearly cover one another, so the lower "
+        "panel shows what Chebyshev gives less what Butterworth gives.",
     )
 
 
@@ -82,15 +92,23 @@ def liveliest(flight: Flight, axis: int) -> slice:
 def _draw_excerpt(case: Case, axis: int, width_in: float) -> Figure:
     flight = case.flight
     part = liveliest(flight, axis)
-    figure, (axes,) = style.panels(width_in, 1, 2.7)
+    figure, axes = style.panels(width_in, 2, 2.0)
     time = flight.time_s[part]
     raw = flight.accel_b_mps2[part, axis]
-    axes.plot(time, raw, color=style.MUTED, lw=0.7, alpha=0.6, label="raw")
-    for kind in KINDS:
-        filtered = apply(kind, case.fusion.sensing, flight.rate_hz, flight.accel_b_mps2)
-        axes.plot(time, filtered[part, axis], color=COLOURS[kind], label=kind.capitalize())
-    axes.set(xlabel="time (s)", ylabel=f"specific force {AXIS_NAMES[axis]} (m/s²)")
-    style.legend_above(axes)
+    axes[0].plot(time, raw, color=style.MUTED, lw=0.7, alpha=0.6, label="raw")
+    filtered = {
+        kind: apply(kind, case.fusion.sensing, flight.rate_hz, flight.accel_b_mps2)[part, axis]
+        for kind in KINDS
+    }
+    for kind, line in filtered.items():
+        dashes = (0, (4, 2)) if kind == "chebyshev" else "-"
+        axes[0].plot(time, line, color=COLOURS[kind], ls=dashes, label=kind.capitalize())
+    axes[0].set_ylabel(f"specific force {AXIS_NAMES[axis]} (m/s²)")
+    style.legend_above(axes[0])
+    difference = filtered["chebyshev"] - filtered["butterworth"]
+    axes[1].plot(time, difference, color=style.GREEN)
+    axes[1].axhline(0.0, color=style.MUTED, lw=0.7)
+    axes[1].set(xlabel="time (s)", ylabel="difference (m/s²)")
     return figure
 
 

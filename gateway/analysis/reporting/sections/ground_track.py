@@ -60,6 +60,13 @@ def gps_interpolation(case: Case) -> Section | None:
                 f"Latitude and longitude over {EXCERPT_S:.0f} s: fixes held until the next one as "
                 "they arrive, interpolated between the times at which they were valid, and fused.",
             ),
+            Picture(
+                "fig13_residuals",
+                lambda width: _draw_residuals(case, width),
+                "The whole flight: how far north and east the held fixes and the fused track are "
+                "from the interpolated GPS. The axis ends at what 99.5 % of the held values "
+                "reach; the first seconds, in which the estimator settles, do not count.",
+            ),
         ],
     )
 
@@ -210,5 +217,28 @@ def _draw_coordinates(case: Case, width_in: float) -> Figure:
         panel.yaxis.get_major_formatter().set_useOffset(False)
     axes[0].set_ylabel("latitude (deg)")
     axes[1].set(ylabel="longitude (deg)", xlabel="time (s)")
+    style.legend_above(axes[0])
+    return figure
+
+
+def _draw_residuals(case: Case, width_in: float) -> Figure:
+    flight, frame = case.flight, case.frame
+    assert frame is not None
+    fixes = fixes_of(flight)
+    straight = interpolate(fixes, flight.time_us)
+    base = frame.place(straight.lat_deg, straight.lon_deg)
+    newest = np.searchsorted(fixes.arrival_us, flight.time_us, side="right") - 1
+    held = frame.place(fixes.lat_deg[newest], fixes.lon_deg[newest]) - base
+    fused = frame.place(case.track.lat_deg, case.track.lon_deg) - base
+    held[~flight.scored], fused[~flight.scored] = np.nan, np.nan
+    figure, axes = style.panels(width_in, 2, 1.6)
+    for panel, axis, name in zip(axes, (0, 1), ("north (m)", "east (m)"), strict=True):
+        style.draw(panel, flight.time_s, held[:, axis], style.ORANGE, "held", lw=0.8)
+        style.draw(panel, flight.time_s, fused[:, axis], style.BLUE, "fused", lw=1.0)
+        panel.set_ylabel(name)
+        if np.isfinite(held[:, axis]).any():
+            limit = float(np.nanquantile(np.abs(held[:, axis]), 0.995)) + 1.0
+            panel.set_ylim(-limit, limit)
+    axes[-1].set_xlabel("time (s)")
     style.legend_above(axes[0])
     return figure

@@ -1,9 +1,10 @@
-"""Alpha and beta: the paper's ReportTable I on this flight, beside the paper's own figures."""
+"""Alpha and beta: the paper's Table I on this flight, beside the paper's own figures."""
 
 from typing import Final
 
 import numpy as np
 import pandas as pd
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from gateway.analysis.blending import PAPER_TABLE, WEIGHTS, blend_table, grows
@@ -25,14 +26,14 @@ def weights(case: Case) -> Section | None:
     if not (_is_judged(thinned) and _is_judged(full)):
         return None
     return Section(
-        "Alpha and beta: ReportTable I",
+        "Alpha and beta: Table I",
         _lead(thinned),
         [
             Picture(
                 "table1_heat_map",
                 lambda width: _draw_heat_map(thinned, width),
                 "Mean error against interpolated GPS, metres, on this flight and in the paper. "
-                "Light is good. Each map has its own scale.",
+                "Light is good. All four maps have one scale, which is logarithmic.",
             )
         ],
         [
@@ -106,11 +107,16 @@ def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
         ("paper, latitude", PAPER_TABLE, "north_m"),
         ("paper, longitude", PAPER_TABLE, "east_m"),
     ]
-    for panel, (title, source, column) in zip(axes.ravel(), grids, strict=True):
-        grid = source.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
-        panel.imshow(grid, cmap=COLOUR_MAP, origin="lower", aspect="auto")
+    values = {
+        title: source.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
+        for title, source, column in grids
+    }
+    every = np.concatenate([grid.ravel() for grid in values.values()])
+    scale = LogNorm(float(np.nanmin(every)), float(np.nanmax(every)))
+    for panel, (title, grid) in zip(axes.ravel(), values.items(), strict=True):
+        panel.imshow(grid, cmap=COLOUR_MAP, norm=scale, origin="lower", aspect="auto")
         for (row, col), value in np.ndenumerate(grid):
-            dark = value > grid.min() + 0.5 * (grid.max() - grid.min())
+            dark = scale(value) > 0.5
             panel.text(
                 col, row, f"{value:.1f}", ha="center", va="center",
                 color="#ffffff" if dark else "#000000",

@@ -1,0 +1,175 @@
+"""What a pilot wants to know of a flight: when, how far, how high, how fast, and what was lost."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from gateway.analysis.flight_arrays import Flight, FlightTrack, FloatArray, LocalFrame, fixes_of
+from gateway.units import US_PER_S
+
+AIRBORNE_MPS: Final = 3.0
+"""Faster than a person carries the aircraft about."""
+AIRBORNE_M: Final = 3.0
+HELD_S: Final = 2.0
+"""So long must it fly, or stand, before it counts."""
+OUTAGE_S: Final = 1.0
+"""A longer silence of the GPS is an outage."""
+LINK_LOSS_S: Final = 0.5
+"""A longer silence of the IMU is a loss of the link."""
+LONGEST_STEP_M: Final = 200.0
+"""Between two samples; more is a jump of the position, not a way that was flown."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightEvent:
+    """Something that happened at one moment."""
+
+    time_s: float
+    """Since the first sample."""
+    kind: str
+    """A word for its mark on the timeline: flight, gps or link."""
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class PilotFigures:
+    """One flight as a pilot tells it; NaN where it cannot be told."""
+
+    began_unix_s: float
+    airborne_s: float
+    distance_m: float
+    """Over ground, while airborne."""
+    highest_m: float
+    """Above the first fix."""
+    fastest_mps: float
+    """Over ground."""
+    climb_mps: float
+    """Greatest, over a second."""
+    farthest_m: float
+    """From the first fix."""
+    gps_outages_s: tuple[tuple[float, float], ...]
+    """Begin and end of each, since the first sample."""
+    link_losses_s: tuple[tuple[float, float], ...]
+    events: tuple[FlightEvent, ...]
+    """In the order of their times."""
+
+
+def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> PilotFigures:
+    """Sum up one flight.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : FlightTrack
+        As it was fused, at the times of the flight's samples.
+    frame : LocalFrame
+        Metres about the first fix.
+
+    Returns
+    -------
+    PilotFigures
+    """
+    seconds = flight.time_s
+    place = frame.place(track.lat_deg, track.lon_deg)
+    height_m = np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan)
+    speed_mps = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
+    airborne = _held(seconds, (speed_mps > AIRBORNE_MPS) & (height_m > AIRBORNE_M))
+    outages = _gaps(flight.seconds(fixes_of(flight).arrival_us), flight.duration_s, OUTAGE_S)
+    losses = _gaps(seconds, flight.duration_s, LINK_LOSS_S)
+    return PilotFigures(
+        began_unix_s=_began_unix_s(flight),
+        airborne_s=float(np.diff(seconds)[airborne[1:]].sum()),
+        distance_m=_distance_m(place, airborne),
+        highest_m=_greatest(height_m),
+        fastest_mps=_greatest(speed_mps),
+        climb_mps=_greatest(_smoothed(-track.vel_n_mps[:, 2], round(flight.rate_hz))),
+        farthest_m=_greatest(np.hypot(place[:, 0], place[:, 1])),
+        gps_outages_s=outages,
+        link_losses_s=losses,
+        events=tuple(
+            sorted(
+                [
+                    *_flight_events(seconds, airborne, height_m, speed_mps),
+                    *_gap_events(outages, "gps", "GPS"),
+                    *_gap_events(losses, "link", "link"),
+                ],
+                key=lambda event: event.time_s,
+            )
+        ),
+    )
+
+
+def _began_unix_s(flight: Flight) -> float:
+    """Return the civil time of the first sample, as the first fix that knows it tells."""
+    for fix in flight.fixes:
+        if fix.utc_us is not None:
+            return float(fix.utc_us - fix.time_us + flight.time_us[0]) / US_PER_S
+    return float("nan")
+
+
+def _greatest(values: FloatArray) -> float:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
+
+
+def _smoothed(values: FloatArray, count: int) -> FloatArray:
+    """Average over so many samples, unknown ones left out."""
+    known = np.isfinite(values)
+    window = np.ones(max(count, 1))
+    total = np.convolve(np.where(known, values, 0.0), window, "same")
+    number = np.convolve(known.astype(float), window, "same")
+    return np.where(number > 0, total / np.maximum(number, 1.0), np.nan)
+
+
+def _held(seconds: FloatArray, state: np.ndarray) -> np.ndarray:
+    """Drop what lasts less than `HELD_S`, first the pauses and then the hops."""
+    found = np.asarray(state, bool).copy()
+    for wanted in (False, True):
+        edges = np.flatnonzero(np.diff(found)) + 1
+        for begin, end in zip([0, *edges], [*edges, len(found)], strict=True):
+            inner = begin > 0 and end < len(found)
+            if found[begin] == wanted and inner and seconds[end - 1] - seconds[begin] < HELD_S:
+                found[begin:end] = not wanted
+    return found
+
+
+def _distance_m(place: FloatArray, airborne: np.ndarray) -> float:
+    steps = np.hypot(*np.diff(place, axis=0).T)
+    flown = airborne[1:] & np.isfinite(steps) & (steps < LONGEST_STEP_M)
+    return float(steps[flown].sum()) if flown.any() else 0.0
+
+
+def _gaps(
+    times_s: FloatArray, duration_s: float, longest_s: float
+) -> tuple[tuple[float, float], ...]:
+    """Find the silences between the first of some times and the end of the flight."""
+    if not len(times_s):
+        return ()
+    ends = np.append(times_s[1:], duration_s)
+    return tuple(
+        (float(begin), float(end))
+        for begin, end in zip(times_s, ends, strict=True)
+        if end - begin > longest_s
+    )
+
+
+def _flight_events(
+    seconds: FloatArray, airborne: np.ndarray, height_m: FloatArray, speed_mps: FloatArray
+) -> list[FlightEvent]:
+    events = []
+    for index in np.flatnonzero(np.diff(airborne)) + 1:
+        text = "in the air" if airborne[index] else "on the ground"
+        events.append(FlightEvent(float(seconds[index]), "flight", text))
+    if np.isfinite(height_m).any():
+        top = int(np.nanargmax(height_m))
+        events.append(FlightEvent(float(seconds[top]), "flight", f"highest, {height_m[top]:.0f} m"))
+    if np.isfinite(speed_mps).any():
+        top = int(np.nanargmax(speed_mps))
+        events.append(
+            FlightEvent(float(seconds[top]), "flight", f"fastest, {speed_mps[top]:.1f} m/s")
+        )
+    return events
+
+
+def _gap_events(gaps: tuple[tuple[float, float], ...], kind: str, name: str) -> list[FlightEvent]:
+    return [FlightEvent(begin, kind, f"{name} lost for {end - begin:.1f} s") for begin, end in gaps]

@@ -1,0 +1,195 @@
+"""The page for people who fly: the flight in figures, on a map, and over time."""
+
+from datetime import UTC, datetime
+from typing import Final
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from gateway.analysis.case import Case
+from gateway.analysis.flight_arrays import FloatArray, fixes_of
+from gateway.analysis.metrics import euler_rad
+from gateway.analysis.pilot_figures import FlightEvent, PilotFigures, pilot_figures
+from gateway.analysis.reporting import style
+from gateway.analysis.reporting.page import Fact, Picture, ReportTable, Section
+
+COLOUR_MAP: Final = "viridis"
+LINE_POINTS: Final = 1500
+EVENT_COLOURS: Final = {"flight": style.GREEN, "gps": style.ORANGE, "link": style.RED}
+EVENT_NAMES: Final = {"flight": "flight", "gps": "GPS lost", "link": "link lost"}
+KNOTS_PER_MPS: Final = 1.943844
+FEET_PER_M: Final = 3.28084
+
+
+def figures_of(case: Case) -> PilotFigures | None:
+    """Sum the flight up; None without GPS."""
+    return None if case.frame is None else pilot_figures(case.flight, case.track, case.frame)
+
+
+def pilot_facts(figures: PilotFigures) -> list[Fact]:
+    """Choose the numbers for the head of the page."""
+    minutes, seconds = divmod(round(figures.airborne_s), 60)
+    facts = [
+        Fact(f"{minutes}:{seconds:02d}", "minutes in the air"),
+        Fact(f"{figures.distance_m / 1000:.2f} km", "flown over ground"),
+        Fact(f"{figures.highest_m:.0f} m", "highest above the first fix"),
+        Fact(f"{figures.fastest_mps:.1f} m/s", "fastest over ground"),
+        Fact(f"{figures.farthest_m:.0f} m", "farthest from the first fix"),
+        Fact(_sum_text(figures.gps_outages_s), "GPS outages"),
+        Fact(_sum_text(figures.link_losses_s), "link losses"),
+    ]
+    if np.isfinite(figures.began_unix_s):
+        began = datetime.fromtimestamp(figures.began_unix_s, UTC)
+        facts.insert(0, Fact(f"{began:%Y-%m-%d %H:%M}", "UTC, first sample"))
+    return facts
+
+
+def the_flight(case: Case) -> Section | None:
+    """Build the section; None without GPS."""
+    figures = figures_of(case)
+    if figures is None:
+        return None
+    lat, lon = fixes_of(case.flight).lat_deg[0], fixes_of(case.flight).lon_deg[0]
+    return Section(
+        "The flight",
+        f"From {lat:.5f}, {lon:.5f}, by the estimator `{case.chosen}`. In the air means faster "
+        "than 3 m/s and 3 m above the first fix, for two seconds or more.",
+        [
+            Picture(
+                "flight_map",
+                lambda width: _draw_map(case, width),
+                "The track from above, coloured by height above the first fix. The triangle is "
+                "the start, the square the end, the rings are the events of the timeline.",
+            ),
+            Picture(
+                "flight_over_time",
+                lambda width: _draw_over_time(case, figures, width),
+                "Height, ground speed, roll and pitch over the whole flight. Below: take-off and "
+                "landing, the highest and the fastest moment, and where GPS or link were lost, "
+                "which is shaded in every panel.",
+            ),
+        ],
+        [
+            ReportTable("flight_figures", _figures_table(case, figures), "The flight in figures."),
+            ReportTable("flight_events", _events_table(figures.events), "Events.", digits=1),
+        ],
+    )
+
+
+def _sum_text(gaps: tuple[tuple[float, float], ...]) -> str:
+    if not gaps:
+        return "none"
+    return f"{len(gaps)}, {sum(end - begin for begin, end in gaps):.1f} s"
+
+
+def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
+    longest = max((end - begin for begin, end in figures.gps_outages_s), default=0.0)
+    rows = [
+        ("recorded", case.flight.duration_s, "s", ""),
+        ("in the air", figures.airborne_s, "s", ""),
+        ("distance over ground", figures.distance_m, "m", ""),
+        ("highest above the first fix", figures.highest_m, "m", _feet(figures.highest_m)),
+        ("fastest over ground", figures.fastest_mps, "m/s", _knots(figures.fastest_mps)),
+        ("fastest climb over a second", figures.climb_mps, "m/s", _feet(60 * figures.climb_mps)),
+        ("farthest from the first fix", figures.farthest_m, "m", ""),
+        ("GPS outages", float(len(figures.gps_outages_s)), "", f"longest {longest:.1f} s"),
+        ("link losses", float(len(figures.link_losses_s)), "", ""),
+    ]
+    return pd.DataFrame(rows, columns=["figure", "value", "unit", "also"])
+
+
+def _feet(metres: float) -> str:
+    return f"{metres * FEET_PER_M:.0f} ft"
+
+
+def _knots(mps: float) -> str:
+    return f"{mps * KNOTS_PER_MPS:.1f} kn"
+
+
+def _events_table(events: tuple[FlightEvent, ...]) -> pd.DataFrame:
+    rows = [(event.text, event.time_s) for event in events]
+    return pd.DataFrame(rows, columns=["event", "at, s"])
+
+
+def _draw_map(case: Case, width_in: float) -> Figure:
+    frame, track = case.frame, case.track
+    assert frame is not None
+    step = max(1, len(track.lat_deg) // LINE_POINTS)
+    place = frame.place(track.lat_deg[::step], track.lon_deg[::step])
+    height = track.alt_amsl_m[::step] - frame.alt_m
+    known = np.isfinite(place).all(axis=1) & np.isfinite(height)
+    place, height = place[known], height[known]
+    figure = Figure(figsize=(width_in, width_in * 0.66 if width_in >= style.WIDE_IN else 4.0))
+    axes = figure.subplots()
+    if len(place) > 1:
+        points = place[:, ::-1].reshape(-1, 1, 2)
+        segments = np.concatenate([points[:-1], points[1:]], axis=1)
+        line = LineCollection(list(segments), cmap=mpl.colormaps[COLOUR_MAP], lw=2.0)
+        line.set_array(height[1:])
+        axes.add_collection(line)
+        axes.autoscale_view()
+        bar = figure.colorbar(line, ax=axes, fraction=0.04, pad=0.02)
+        bar.set_label("height above the first fix (m)")
+        bar.outline.set_visible(False)
+        axes.plot(place[0, 1], place[0, 0], "^", color=style.GREEN, ms=8, label="start")
+        axes.plot(place[-1, 1], place[-1, 0], "s", color=style.RED, ms=7, mfc="none", label="end")
+        _mark_events(axes, case)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="east of the first fix (m)", ylabel="north of the first fix (m)")
+    style.legend_outside(figure, axes, 5 if width_in >= style.WIDE_IN else 3)
+    return figure
+
+
+def _mark_events(axes: Axes, case: Case) -> None:
+    figures, frame, track = figures_of(case), case.frame, case.track
+    assert figures is not None
+    assert frame is not None
+    for kind, colour in EVENT_COLOURS.items():
+        times = np.array([event.time_s for event in figures.events if event.kind == kind])
+        index = np.minimum(np.searchsorted(case.flight.time_s, times), len(track.lat_deg) - 1)
+        place = frame.place(track.lat_deg[index], track.lon_deg[index])
+        if len(place):
+            axes.plot(
+                place[:, 1], place[:, 0], "o", color=colour, ms=8, mfc="none", mew=1.4,
+                label=EVENT_NAMES[kind],
+            )  # fmt: skip
+
+
+def _draw_over_time(case: Case, figures: PilotFigures, width_in: float) -> Figure:
+    frame, track = case.frame, case.track
+    assert frame is not None
+    figure, axes = style.panels(width_in, 5, 1.2)
+    roll, pitch, _ = (np.degrees(angle) for angle in euler_rad(track.q_nb).T)
+    lines: tuple[tuple[str, FloatArray], ...] = (
+        (
+            "height (m)",
+            np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan),
+        ),
+        ("speed (m/s)", np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])),
+        ("roll (deg)", roll),
+        ("pitch (deg)", pitch),
+    )
+    for panel, (label, values) in zip(axes, lines, strict=False):
+        style.draw(panel, case.flight.time_s, values, style.BLUE, label, lw=1.0)
+        panel.set_ylabel(label)
+    gaps = (("gps", figures.gps_outages_s), ("link", figures.link_losses_s))
+    for panel in axes:
+        for kind, found in gaps:
+            for begin, end in found:
+                panel.axvspan(begin, end, color=EVENT_COLOURS[kind], alpha=0.25, lw=0)
+    _timeline(axes[-1], figures.events)
+    axes[-1].set_xlabel("time (s)")
+    return figure
+
+
+def _timeline(axes: Axes, events: tuple[FlightEvent, ...]) -> None:
+    heights = {"flight": 2.0, "gps": 1.0, "link": 0.0}
+    for kind, height in heights.items():
+        times = [event.time_s for event in events if event.kind == kind]
+        axes.plot(times, [height] * len(times), "|", color=EVENT_COLOURS[kind], ms=11, mew=2.0)
+    axes.set(ylim=(-0.6, 2.6), yticks=list(heights.values()))
+    axes.set_yticklabels([EVENT_NAMES[kind] for kind in heights])
