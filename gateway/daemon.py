@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -29,6 +30,7 @@ from gateway.edges.operator.service import ServiceNotifier, set_realtime_priorit
 from gateway.edges.receiver.pty_port import PtyPort
 from gateway.edges.receiver.serial_port import SerialPort
 from gateway.flightlog.recording_budget import RecordingBudget
+from gateway.flightlog.session import SessionState
 from gateway.flightlog.table.table import TableHeader
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
@@ -42,10 +44,11 @@ from gateway.records import (
 )
 from gateway.replay import header_for
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.status import Snapshot
+from gateway.status import AircraftStatus, Snapshot, Way
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
+from gateway.vehicle.mark import distance_and_bearing
 from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
 
 log = logging.getLogger(__name__)
@@ -221,7 +224,14 @@ class Daemon:
                 if (mark := a.vehicle.mark) is not None
             ),
             simulated=self._receiver is not None,
+            aircraft=tuple(_status_of(one) for _, one in aircraft),
+            recorder=self._recorder.status(),
         )
+
+    def toggle_recording(self) -> None:
+        """Start the recorder if it is idle, or stop it, whatever the settings say."""
+        idle = self._recorder.status().state == SessionState.IDLE
+        (self._recorder.record if idle else self._recorder.stop)()
 
     def _reload_or_refuse(self) -> str:
         try:
@@ -339,3 +349,28 @@ class Daemon:
     def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
         now_us = self.now_us()
         self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))
+
+
+def _status_of(aircraft: Aircraft) -> AircraftStatus:
+    """Gather what the operator wants to see of an aircraft beside its state."""
+    vehicle, state = aircraft.vehicle, aircraft.state
+    home, here = vehicle.telemetry.home, None
+    if state is not None and math.isfinite(state.lat_deg + state.lon_deg):
+        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+    return AircraftStatus(
+        aircraft.vehicle_id,
+        vehicle.telemetry.fix,
+        _way(here, None if home is None else home.place),
+        _way(here, vehicle.places.mark.place),
+        vehicle.health.boards.statuses,
+    )
+
+
+def _way(here: Place | None, there: Place | None) -> Way | None:
+    if there is None:
+        return None
+    place = (there.lat_deg, there.lon_deg, there.alt_amsl_m)
+    if here is None:
+        return Way(*place, None, None)
+    distance_m, bearing_rad = distance_and_bearing(here, there)
+    return Way(*place, distance_m, math.degrees(bearing_rad) % 360.0)

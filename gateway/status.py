@@ -2,8 +2,46 @@
 
 from dataclasses import dataclass
 
-from gateway.records import LinkReport, NavState
+from gateway.records import GpsFix, LinkReport, NavState, NodeStatus
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """What the recorder does."""
+
+    state: str
+    name: str
+    part: int
+    part_bytes: int
+    free_bytes: int
+    reason: str
+    folder: str
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The way to a place."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    distance_m: float | None
+    """Over ground; None while the aircraft's own place is not known."""
+    bearing_deg: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class AircraftStatus:
+    """What is known of one aircraft beside its state."""
+
+    vehicle_id: int
+    fix: GpsFix | None
+    """The newest, good or not."""
+    home: Way | None
+    mark: Way | None
+    boards: tuple[NodeStatus, ...]
+    """The newest report of each node about itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,3 +67,5 @@ class Snapshot:
     """Vehicle id, latitude, longitude in degrees and height AMSL in m of each marked place."""
     simulated: bool = False
     """Whether the receiver is the simulated one."""
+    aircraft: tuple[AircraftStatus, ...] = ()
+    recorder: RecorderStatus | None = None

@@ -11,6 +11,7 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.opening import lay_out, open_flights
@@ -26,7 +27,7 @@ OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 LIMIT_S = 60
 
 
-def recording() -> list[TlogRecord]:
+def recording(step_us: int = 1) -> list[TlogRecord]:
     """Vehicle 3 tells its parameters, and station 255 arms it."""
     vehicle, station = mavlink.MAVLink(None, 3, 1), mavlink.MAVLink(None, 255, 190)
     said: list[tuple[Any, Any]] = [(vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
@@ -38,7 +39,7 @@ def recording() -> list[TlogRecord]:
     said += [(station, arm), (vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
     records = []
     for i, (who, message) in enumerate(said):
-        records.append(TlogRecord(START_US + i, bytes(message.pack(who))))
+        records.append(TlogRecord(START_US + i * step_us, bytes(message.pack(who))))
         who.seq = (who.seq + 1) % 256
     return records
 
@@ -152,3 +153,33 @@ async def test_every_parameter_arrives_and_none_looks_lost(
     ]
     # What was played before ended with 27; the answers go on from there.
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(28, 28 + PARAMETERS))
+
+
+async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station: Station) -> None:
+    (tmp_path / "a.tlog").write_bytes(make_tlog(recording(step_us=10_000_000)))
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url), paused=True)
+    await daemon.start()
+    for key, state, speed, loop in (
+        ("space", "playing", 1.0, False),
+        ("+", "playing", 2.0, False),
+        ("=", "playing", 4.0, False),
+        ("-", "playing", 2.0, False),
+        ("l", "playing", 2.0, True),
+        ("space", "paused", 2.0, True),
+        (".", "paused", 2.0, True),
+        ("x", "paused", 2.0, True),
+    ):
+        steer(daemon, key)
+        status = daemon.edge.status()
+        assert (status.state, status.speed, status.loop) == (state, speed, loop), key
+    steer(daemon, "home")
+    for key, position_s in (("up", 60), ("right", 70), ("left", 60), ("down", 0), ("left", 0)):
+        steer(daemon, key)
+        assert daemon.edge.status().position_s == position_s
+    for _ in range(20):
+        steer(daemon, "+")
+    assert daemon.edge.status().speed == 100.0
+    assert not daemon.ended.is_set()
+    steer(daemon, "q")
+    assert daemon.ended.is_set()
+    daemon.close()

@@ -15,6 +15,7 @@ from gateway.units import US_PER_S
 PANEL: Final = "A gateway that runs"
 UNKNOWN: Final = "—"
 US_PER_MS: Final = 1000
+MV_PER_V: Final = 1000
 
 Record = Mapping[str, Any]
 """What a dataclass becomes on the control socket."""
@@ -40,7 +41,7 @@ def status(*, json: JsonOption = False) -> None:
     console.print(_summary(snapshot), markup=False)
     if nodes := snapshot["report"]["nodes"]:
         console.print()
-        console.print(_nodes(nodes))
+        console.print(_nodes(nodes, snapshot))
     _print_clients(console, snapshot)
 
 
@@ -107,6 +108,12 @@ def _summary(snapshot: Record) -> str:
         f"{_number(state['alt_amsl_m'], '.1f')} m"
         for vehicle_id, state in snapshot["states"]
     ]
+    lines += [
+        f"aircraft {one['vehicle_id']}: {what} {way['distance_m']:.0f} m, {way['bearing_deg']:.0f}°"
+        for one in snapshot["aircraft"]
+        for what in ("home", "mark")
+        if (way := one[what]) is not None and way["distance_m"] is not None
+    ]
     hub = snapshot["hub"]
     counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
     lines.append("MAVLink frames: " + ", ".join(counts))
@@ -116,15 +123,33 @@ def _summary(snapshot: Record) -> str:
     return "\n".join(lines)
 
 
-def _nodes(nodes: Sequence[Record]) -> Table:
-    table = table_of("node", "rate Hz", "received", "lost", "restarts")
+def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
+    heads = ("supply V", "bus errors", "unsent", "resent", "overruns", "firmware")
+    table = table_of("node", "rate Hz", "received", "lost", "restarts", *heads)
+    boards = {_node_name(b): b for one in snapshot["aircraft"] for b in one["boards"]}
+    receiver = snapshot["report"]["receiver"]
     for node in nodes:
+        overruns = UNKNOWN if receiver is None else receiver["pipes"][node["pipe"]]["overruns"]
         table.add_row(
-            f"{node['node']['vehicle_id']}.{node['node']['node_id']}",
+            _node_name(node),
             _number(node["rate_hz"], ".0f"),
             *(str(node[key]) for key in ("received", "lost", "restarts")),
+            *_board(boards.get(_node_name(node)), str(overruns)),
         )
     return table
+
+
+def _node_name(record: Record) -> str:
+    return f"{record['node']['vehicle_id']}.{record['node']['node_id']}"
+
+
+def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
+    """Show what a node reported of itself."""
+    if board is None:
+        return (*(UNKNOWN,) * 4, overruns, UNKNOWN)
+    counts = (str(board[key]) for key in ("bus_errors", "radio_failed", "radio_retries"))
+    supply = f"{board['supply_mv'] / MV_PER_V:.2f}" if board["supply_mv"] else UNKNOWN
+    return (supply, *counts, overruns, ".".join(map(str, board["firmware_version"])))
 
 
 def _print_clients(console: Console, snapshot: Record) -> None:

@@ -23,6 +23,7 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.warm_up import make_ready
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
+from gateway.edges.operator.keyboard import Keyboard
 from gateway.edges.operator.live_view import LiveView, summary_line
 
 log = logging.getLogger(__name__)
@@ -131,11 +132,28 @@ def _reload(daemon: Daemon) -> None:
 async def _live_view(
     daemon: Daemon, view: LiveView, stopped: asyncio.Event, panel: PanelProcess | None
 ) -> None:
+    held = False
+
+    def on_key(key: str) -> None:
+        nonlocal held
+        if key == "q":
+            stopped.set()
+        elif key == "r":
+            daemon.toggle_recording()
+        elif key == "space":
+            held = not held
+
+    keyboard = Keyboard(on_key)
     # No thread of rich's own: it draws when it is told to, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
-        while not await _is_set_within(stopped, VIEW_INTERVAL_S):
-            view.link = "" if panel is None else panel.link
-            live.update(view.draw(daemon.snapshot()), refresh=True)
+        keyboard.start()
+        try:
+            while not await _is_set_within(stopped, VIEW_INTERVAL_S):
+                view.link = "" if panel is None else panel.link
+                if not held:
+                    live.update(view.draw(daemon.snapshot()), refresh=True)
+        finally:
+            keyboard.close()
 
 
 async def _log_lines(daemon: Daemon, stopped: asyncio.Event) -> None:

@@ -3,13 +3,15 @@
 import asyncio
 import signal
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import Annotated, Any, Final
 
 import typer
+from rich.console import Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
 
 from gateway.cli.live.run import (
     EndpointOption,
@@ -40,7 +42,14 @@ from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.edges.disk.player_edge import PlayerStatus
 from gateway.edges.operator.control_socket import ControlError
-from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, check_speed
+from gateway.edges.operator.keyboard import Keyboard
+from gateway.flightlog.playback import (
+    AS_FAST_AS_POSSIBLE,
+    GREATEST_SPEED,
+    LEAST_SPEED,
+    PlayState,
+    check_speed,
+)
 from gateway.flights.opening import lay_out, open_flights
 from gateway.flights.reading import FlightError, ReadOptions
 from gateway.player import (
@@ -52,6 +61,10 @@ from gateway.player import (
 
 VIEW_INTERVAL_S: Final = 0.25
 FASTEST: Final = "max"
+KEYS: Final = (
+    "space pause   ← → 10 s   ↓ ↑ 1 min   + − speed   . step   home begin   l loop   q quit"
+)
+LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
 
 
 def register(app: typer.Typer) -> None:
@@ -196,6 +209,35 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
         daemon.close()
 
 
+def steer(daemon: PlayerDaemon, key: str) -> None:
+    """Do what a key of the terminal says; other keys do nothing."""
+    edge = daemon.edge
+    match key:
+        case "q":
+            daemon.ended.set()
+        case "space" if edge.status().state == PlayState.PLAYING:
+            edge.pause()
+        case "space":
+            edge.resume()
+        case "+" | "=" | "-":
+            edge.set_speed(_next_speed(edge.status().speed, faster=key != "-"))
+        case ".":
+            edge.step()
+        case "l":
+            edge.set_loop(not edge.status().loop)
+        case "home":
+            edge.seek(0.0)
+        case _ if key in LEAPS_S:
+            edge.seek(LEAPS_S[key], relative=True)
+
+
+def _next_speed(speed: float | None, *, faster: bool) -> float:
+    """Return twice or half the speed, within what is offered; None is as fast as possible."""
+    if speed is None:
+        return AS_FAST_AS_POSSIBLE if faster else GREATEST_SPEED
+    return min(max(speed * (2.0 if faster else 0.5), LEAST_SPEED), GREATEST_SPEED)
+
+
 async def _watch(daemon: PlayerDaemon) -> None:
     """Show the place until the end."""
     console = console_of()
@@ -203,7 +245,13 @@ async def _watch(daemon: PlayerDaemon) -> None:
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}")
     )
     task = progress.add_task("", total=1.0, at="")
-    with Live(progress, console=console, auto_refresh=False, transient=True) as live:
+    shown = Group(progress, Text(KEYS, style="dim"))
+    keyboard = Keyboard(lambda key: steer(daemon, key))
+    with (
+        Live(shown, console=console, auto_refresh=False, transient=True) as live,
+        closing(keyboard),
+    ):
+        keyboard.start()
         while not daemon.ended.is_set():
             status = daemon.edge.status()
             progress.update(

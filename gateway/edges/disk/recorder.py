@@ -16,7 +16,6 @@ import contextlib
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -39,25 +38,13 @@ from gateway.flightlog.table.part import PENDING_LIMIT, Part
 from gateway.flightlog.table.table import TableHeader, TableMark
 from gateway.flightlog.tlog.stamps import CivilClock
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
+from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderStatus:
-    """What the recorder does."""
-
-    state: str
-    name: str
-    part: int
-    part_bytes: int
-    free_bytes: int
-    reason: str
-    folder: str
 
 
 class Recorder:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 
 from gateway.edges.disk.player_edge import PlayerEdge, PlayerStatus
-from gateway.edges.disk.recorder import Recorder, RecorderStatus
+from gateway.edges.disk.recorder import Recorder
 from gateway.edges.disk.recordings import (
     Recording,
     RecordingError,
@@ -21,7 +21,7 @@ from gateway.flightlog.moment import parse_moment
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
 from gateway.flightlog.session import SessionState
 from gateway.routing.client_table import ClientStats
-from gateway.status import Snapshot
+from gateway.status import RecorderStatus, Snapshot
 from gateway.vehicle.home import Place
 
 

@@ -1,24 +1,28 @@
 """The live view in the terminal: link, aircraft and clients at a glance.
 
-It is made for 80 columns and upwards. Where the rows do not suffice, the end is cut off; so what
-matters most comes first, and last the rates of the messages.
+Tables that are wider than the terminal are broken into several below each other, so that all is
+legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates stand beside the aircraft.
+Where the rows do not suffice, the end is cut off; so what matters most comes first, and last the
+rates of the messages.
 """
 
 import logging
 import math
 from collections import deque
+from collections.abc import Mapping
 from typing import Final
 
 from pymavlink.dialects.v20 import common as mavlink
+from rich.cells import cell_len
 from rich.columns import Columns
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
-from gateway.records import LinkReport, NavFlags, NavState, NodeLink
+from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, ListenerStats
-from gateway.status import Snapshot
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
 from gateway.units import US_PER_S
 
 SILENT_US: Final = 2 * US_PER_S
@@ -28,6 +32,15 @@ RATE_SNAPSHOTS: Final = 11
 """Rates are told over so many views: a message of 1 Hz must not flicker between 0 and 2."""
 RATE_NAME: Final = 22
 """Letters of the longest usual name, so that names and figures stand below each other."""
+
+SIDE_BY_SIDE: Final = 150
+"""Columns of a terminal from which on two halves are wide enough."""
+GAP: Final = 2
+KEYS: Final = "q quit   r record or stop   space hold the picture"
+FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")
+MB: Final = 1e6
+GB: Final = 1e9
+MV_PER_V: Final = 1e3
 
 FLAG_WORDS: Final = (
     (NavFlags.ATTITUDE_VALID, "attitude", "green"),
@@ -79,22 +92,80 @@ class LiveView:
             To be shown by a rich `Live` or `Console`.
         """
         self._snapshots.append(snapshot)
-        previous = self._snapshots[0]
-        parts: list[RenderableType] = [_link_line(snapshot)]
+        top: list[RenderableType] = [_link_line(snapshot), *_recorder_line(snapshot.recorder)]
         if self.link:
-            parts.append(Text.assemble("panel  ", (self.link, "bold cyan")))
-        parts.append(Text())
+            top.append(Text.assemble("panel  ", (self.link, "bold cyan")))
+        flying: list[RenderableType] = []
+        boards = {s.node: s for one in snapshot.aircraft for s in one.boards}
         if snapshot.report.nodes:
-            parts.append(_nodes(snapshot.report))
+            flying.append(_nodes(snapshot.report, boards))
+        beside = {one.vehicle_id: one for one in snapshot.aircraft}
         for vehicle_id, state in snapshot.states:
-            parts += [Text(), _aircraft(vehicle_id, state), _flags(state)]
+            flying += [Text(), _aircraft(vehicle_id, state, beside.get(vehicle_id)), _flags(state)]
         if not snapshot.states:
-            parts.append(Text("No aircraft heard yet.", style="dim"))
-        parts += [Text(), _clients(snapshot), *_ports(snapshot), *_troubles(snapshot), Text()]
-        parts += [Text(line, style=style) for line, style in self.log.lines]
+            flying.append(Text("No aircraft heard yet.", style="dim"))
+        others: list[RenderableType] = [_clients(snapshot)]
+        others += [*_ports(snapshot), *_troubles(snapshot), Text()]
+        others += [Text(line, style=style) for line, style in self.log.lines]
         if snapshot.sent:
-            parts += [Text("MAVLink sent, Hz", style="bold italic"), _rates(snapshot, previous)]
-        return Group(*parts)
+            rates = _rates(snapshot, self._snapshots[0])
+            others += [Text("MAVLink sent, Hz", style="bold italic"), rates]
+        keys = Text(KEYS, style="dim")
+        return Group(*top, keys, _Halves(Group(*flying), Group(*others)))
+
+
+class _Halves:
+    """Two parts side by side where the terminal is wide, below each other elsewhere."""
+
+    def __init__(self, left: RenderableType, right: RenderableType) -> None:
+        self._left, self._right = left, right
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if options.max_width < SIDE_BY_SIDE:
+            yield Group(self._left, Text(), self._right)
+            return
+        grid = Table.grid(expand=True, padding=(0, 2 * GAP, 0, 0))
+        grid.add_column(ratio=1)
+        grid.add_column(ratio=1)
+        grid.add_row(self._left, self._right)
+        yield grid
+
+
+class _Grid:
+    """A table that is broken into several below each other where it is too wide.
+
+    The first column has the table's own name at its head, and stands in each of them.
+    """
+
+    def __init__(self, *heads: str) -> None:
+        self._heads = heads
+        self._rows: list[tuple[str | Text, ...]] = []
+
+    def add_row(self, *cells: str | Text) -> None:
+        """Add a row, a cell a column."""
+        self._rows.append(cells)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        widths = [
+            max(cell_len(str(text)) for text in column)
+            for column in zip(self._heads, *self._rows, strict=True)
+        ]
+        begin = 1
+        while begin < len(widths):
+            end, room = begin + 1, options.max_width - widths[0] - GAP - widths[begin]
+            while end < len(widths) and room >= GAP + widths[end]:
+                room -= GAP + widths[end]
+                end += 1
+            yield self._table([0, *range(begin, end)])
+            begin = end
+
+    def _table(self, columns: list[int]) -> Table:
+        table = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0))
+        for column in columns:
+            table.add_column(self._heads[column], justify="right" if column else "left")
+        for row in self._rows:
+            table.add_row(*(row[column] for column in columns))
+        return table
 
 
 def summary_line(snapshot: Snapshot) -> str:
@@ -116,14 +187,6 @@ def summary_line(snapshot: Snapshot) -> str:
     return "; ".join(parts)
 
 
-def _table(title: str, *columns: str) -> Table:
-    """Begin a table whose first column has the table's own name at its head."""
-    table = Table(box=None, pad_edge=False)
-    for number, column in enumerate((title, *columns)):
-        table.add_column(column, justify="left" if number == 0 else "right")
-    return table
-
-
 def _link_line(snapshot: Snapshot) -> Text:
     report = snapshot.report
     up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
@@ -139,26 +202,48 @@ def _link_line(snapshot: Snapshot) -> Text:
     return line
 
 
-def _nodes(report: LinkReport) -> Table:
-    columns = ("pipe", "rate Hz", "received", "lost", "lost %", "dup", "restarts", "ppm")
-    table = _table("node", *columns, "age s")
+def _recorder_line(recorder: RecorderStatus | None) -> list[Text]:
+    if recorder is None:
+        return []
+    free = f"{recorder.free_bytes / GB:.1f} GB free"
+    if recorder.reason:
+        return [Text(f"not recorded: {recorder.reason}", style="red")]
+    if recorder.state != "recording":
+        return [Text(f"recorder {recorder.state}, {free}", style="dim")]
+    size = f"{recorder.part_bytes / MB:.1f} MB, {free}"
+    return [Text(f"recording {recorder.name}, part {recorder.part}: {size}", style="green")]
+
+
+def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
+    """Show radio, supply in V, bus errors, failed and repeated sends, overruns, firmware."""
+    heads = ("Hz", "lost", "lost %", "age s", "supply", "bus", "unsent", "resent", "over")
+    grid = _Grid("node", *heads, "restarts", "fw")
     for node in report.nodes:
-        table.add_row(*_node_cells(node), _age(report.time_us, node.last_time_us))
-    return table
+        pipes = report.receiver.pipes if report.receiver is not None else ()
+        overruns = str(pipes[node.pipe].overruns) if node.pipe < len(pipes) else UNKNOWN
+        total = node.received + node.lost
+        grid.add_row(
+            f"{node.node.vehicle_id}.{node.node.node_id}",
+            f"{node.rate_hz:.0f}",
+            str(node.lost),
+            f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
+            _age(report.time_us, node.last_time_us),
+            *_board_cells(boards.get(node.node), overruns, node),
+        )
+    return grid
 
 
-def _node_cells(node: NodeLink) -> tuple[str, ...]:
-    total = node.received + node.lost
+def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tuple[str, ...]:
+    if board is None:
+        return (*(UNKNOWN,) * 4, overruns, str(node.restarts), UNKNOWN)
     return (
-        f"{node.node.vehicle_id}.{node.node.node_id}",
-        str(node.pipe),
-        f"{node.rate_hz:.0f}",
-        str(node.received),
-        str(node.lost),
-        f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
-        str(node.duplicates),
+        f"{board.supply_mv / MV_PER_V:.2f}" if board.supply_mv else UNKNOWN,
+        str(board.bus_errors),
+        str(board.radio_failed),
+        str(board.radio_retries),
+        overruns,
         str(node.restarts),
-        f"{node.clock_skew_ppm:+.0f}",
+        ".".join(map(str, board.firmware_version)),
     )
 
 
@@ -167,14 +252,13 @@ def _age(now_us: int, then_us: int) -> Text:
     return Text(f"{age_us / US_PER_S:.1f}", style="red" if age_us > SILENT_US else "")
 
 
-def _aircraft(vehicle_id: int, state: NavState) -> Table:
+def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) -> _Grid:
     roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
     north, east, down = state.vel_n_mps
-    table = _table(
-        "aircraft",
-        *("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "m/s", "climb"),
-    )
-    table.add_row(
+    heads = ("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "m/s", "climb")
+    fixes = ("fix", "satellites", "±h m", "±v m")
+    grid = _Grid("aircraft", *heads, *fixes, "home m", "home at°", "mark m", "mark at°")
+    grid.add_row(
         str(vehicle_id),
         _figure(roll, "+.1f"),
         _figure(pitch, "+.1f"),
@@ -184,8 +268,29 @@ def _aircraft(vehicle_id: int, state: NavState) -> Table:
         _figure(state.alt_amsl_m, ".1f"),
         _figure(math.hypot(north, east), ".1f"),
         _figure(-down, "+.1f"),
+        *_fix_cells(known.fix if known else None),
+        *_way_cells(known.home if known else None),
+        *_way_cells(known.mark if known else None),
     )
-    return table
+    return grid
+
+
+def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
+    if fix is None:
+        return (UNKNOWN,) * 4
+    name = FIX_NAMES[fix.fix_type] if fix.fix_ok else FIX_NAMES[0]
+    return (
+        Text(name, style="" if fix.fix_ok else "red"),
+        str(fix.satellites),
+        _figure(fix.h_acc_m, ".1f"),
+        _figure(fix.v_acc_m, ".1f"),
+    )
+
+
+def _way_cells(way: Way | None) -> tuple[str, str]:
+    if way is None or way.distance_m is None or way.bearing_deg is None:
+        return UNKNOWN, UNKNOWN
+    return _figure(way.distance_m, ".0f"), _figure(way.bearing_deg, ".0f")
 
 
 def _flags(state: NavState) -> Text:
@@ -212,8 +317,8 @@ def _message_name(message_id: int) -> str:
     return str(message_id) if kind is None else str(kind.msgname)
 
 
-def _clients(snapshot: Snapshot) -> Table:
-    table = _table("client", "state", "sent", "dropped", "received", "heard s ago")
+def _clients(snapshot: Snapshot) -> _Grid:
+    table = _Grid("client", "state", "sent", "dropped", "received", "heard s ago")
     for client in snapshot.clients:
         table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
     return table

@@ -181,6 +181,7 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
             for node in report.nodes
         ]
         yield f"node_{field}{suffix}", kind, meaning, nodes
+    yield from _board_families(snapshot)
     for field in ("published", "forwarded", "duplicates", "looped", "unroutable", "unserved"):
         yield f"hub_{field}_total", "counter", f"Frames {field}.", [({}, getattr(hub, field))]
     ports = [({"name": port.name, "endpoint": port.endpoint}, port) for port in snapshot.listeners]
@@ -195,6 +196,37 @@ def _families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]
     ):
         yield f"{name}_total", "counter", meaning, [({}, float(count))]
     yield from _client_families(snapshot.clients, now_us)
+
+
+def _board_families(snapshot: Snapshot) -> Iterator[tuple[str, str, str, list[Sample]]]:
+    """Yield what the nodes report of their own boards."""
+    boards = [board for one in snapshot.aircraft for board in one.boards]
+    labels = [
+        {"vehicle": str(board.node.vehicle_id), "node": str(board.node.node_id)} for board in boards
+    ]
+    for name, kind, meaning, values in (
+        ("supply_volts", "gauge", "Supply of a node.", [b.supply_mv / 1e3 for b in boards]),
+        ("bus_errors_total", "counter", "Failed words with a sensor, 16 bits.",
+         [b.bus_errors for b in boards]),
+        ("radio_failed_total", "counter", "Payloads that no acknowledgement came for, 16 bits.",
+         [b.radio_failed for b in boards]),
+        ("radio_retries_total", "counter", "Payloads that were sent again, 16 bits.",
+         [b.radio_retries for b in boards]),
+        ("loop_max_seconds", "gauge", "Longest loop of a node in the last second.",
+         [b.loop_max_us / US_PER_S for b in boards]),
+    ):  # fmt: skip
+        yield f"node_{name}", kind, meaning, list(zip(labels, map(float, values), strict=True))
+    versions: list[Sample] = [
+        ({**label, "firmware": ".".join(map(str, board.firmware_version))}, 1.0)
+        for label, board in zip(labels, boards, strict=True)
+    ]
+    yield "node_info", "gauge", "Firmware of a node.", versions
+    receiver = snapshot.report.receiver
+    overruns: list[Sample] = [
+        ({"pipe": str(number)}, float(pipe.overruns))
+        for number, pipe in enumerate(receiver.pipes if receiver is not None else ())
+    ]
+    yield "receiver_overruns_total", "counter", "Payloads the receiver had no room for.", overruns
 
 
 def _client_families(

@@ -62,7 +62,7 @@ class Telemetry:
         """Height of the first good fix, whoever sets home."""
         self._sample: ImuSample | None = None
         self._baro: BaroSample | None = None
-        self._fix: GpsFix | None = None
+        self.fix: GpsFix | None = None
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
         self._batteries: dict[int, Stream] = {}
@@ -103,7 +103,7 @@ class Telemetry:
             self.add(added.message_id, lambda _, build=added.build: build(self._newest()))  # type: ignore[misc]
 
     def _newest(self) -> NewestRecords:
-        return NewestRecords(self.state, self._sample, self._baro, self._fix)
+        return NewestRecords(self.state, self._sample, self._baro, self.fix)
 
     def knows(self, message_id: int) -> bool:
         """Return whether the vehicle ever sends a message."""
@@ -149,7 +149,7 @@ class Telemetry:
 
     def on_gps(self, fix: GpsFix) -> list[Any]:
         """Take in a GPS fix, tell it if due, and set home by the first good one."""
-        self._fix = fix
+        self.fix = fix
         if fix.utc_us is not None:
             self._unix_offset_us = fix.utc_us - fix.time_us
         stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
@@ -227,9 +227,9 @@ class Telemetry:
         return messages.highres_imu(self._sample, self._mag_b_ut, self._baro, updated)
 
     def _gps_raw(self, now_us: int) -> Any:
-        if self._fix is None or not self.health.is_alive(GPS, now_us):
+        if self.fix is None or not self.health.is_alive(GPS, now_us):
             return messages.gps_absent(now_us)
-        return messages.gps_raw_int(self._fix)
+        return messages.gps_raw_int(self.fix)
 
     def _scaled_pressure(self, _now_us: int) -> Any:
         return None if self._baro is None else messages.scaled_pressure(self._baro)

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import clients
 from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams, socket_path
-from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink
+from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.status import Snapshot
+from gateway.status import AircraftStatus, Snapshot, Way
 
 pytestmark = pytest.mark.io
 
@@ -73,6 +73,15 @@ SNAPSHOT = Snapshot(
     clients=(CLIENT, RADIO),
     sent=((30, 9),),
     hub=HubCounters(published=9, looped=1),
+    aircraft=(
+        AircraftStatus(
+            1,
+            None,
+            Way(47.0, 8.0, 500.0, 1234.4, 271.2),
+            Way(47.0, 8.0, 1.0, None, None),
+            (NodeStatus(0, NodeId(1, 2), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290),),
+        ),
+    ),
     listeners=(OPEN, CLOSED),
     refused=3,
 )
@@ -143,12 +152,15 @@ def test_status_for_people(gateway: Gateway) -> None:
     text = run("status").output
     assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in text
     assert "aircraft 1: 47.500000 —, — m" in text
+    assert "aircraft 1: home 1234 m, 271°" in text
+    assert "mark" not in text
     assert "MAVLink frames: 9 published, 1 looped" in text
     assert "requests: 3 refused" in text
     assert "tablet" in text
     assert "255.190" in text
     assert "radio: No such device" in text
     rows = [line.split() for line in text.splitlines()]
+    assert ["1.2", "60", "100", "7", "1", "3.29", "12", "3", "450", "—", "1.4"] in rows
     assert ["udp-listen:0.0.0.0:14551", "open", "1", "0"] in rows
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
 

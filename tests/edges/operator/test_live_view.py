@@ -17,11 +17,13 @@ from gateway.records import (
     NavState,
     NodeId,
     NodeLink,
+    NodeStatus,
     PipeCounters,
     ReceiverStatus,
 )
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.status import Snapshot
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from tests.vehicle.samples import FIX
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
 RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)
@@ -159,3 +161,61 @@ def test_summary_line() -> None:
         "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
         "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 clients"
     )
+
+
+BOARD = NodeStatus(0, NodeId(1, 0), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290)
+WELL_KNOWN = replace(
+    SNAPSHOT,
+    aircraft=(
+        AircraftStatus(
+            1, FIX, Way(-7.76, 110.37, 150.0, 1234.4, 271.2), Way(-7.7, 110.3, 1.0, 88.0, 3.0),
+            (BOARD,),
+        ),
+    ),
+    recorder=RecorderStatus("recording", "alps", 2, 12_300_000, 4_100_000_000, "", ""),
+)  # fmt: skip
+FIGURES = {
+    "supply": "3.29", "bus": "12", "unsent": "3", "resent": "450", "fw": "1.4",
+    "fix": "3D", "satellites": "11", "±h m": "1.2", "home m": "1234", "home at°": "271",
+    "mark m": "88", "mark at°": "3", "roll°": "-12.0", "longitude°": "110.372834",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [200, 150, 100, 80, 60, 40])
+def test_everything_is_legible_at_any_width(width: int) -> None:
+    text = text_of(WELL_KNOWN, width=width)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    for head, figure in FIGURES.items():
+        at = next(i for i, line in enumerate(lines) if head in line)
+        end = lines[at].index(head) + len(head)
+        # A figure ends where its head does: none is cut off or shoved aside.
+        assert lines[at + 1][:end].split()[-1] == figure, head
+    assert "recording alps, part 2: 12.3 MB" in " ".join(text.split())
+
+
+def test_a_wide_terminal_is_used() -> None:
+    wide, narrow = (text_of(WELL_KNOWN, width=w).splitlines() for w in (160, 100))
+    (line,) = (line for line in wide if "lost %" in line)
+    assert "client" in line
+    assert len(wide) < len(narrow)
+
+
+@pytest.mark.parametrize(
+    ("recorder", "text"),
+    [
+        (replace(WELL_KNOWN.recorder, state="idle"), "recorder idle, 4.1 GB free"),
+        (replace(WELL_KNOWN.recorder, reason="disk is full"), "not recorded: disk is full"),
+    ],
+)
+def test_the_recorder_is_told(recorder: RecorderStatus, text: str) -> None:
+    assert text in text_of(replace(WELL_KNOWN, recorder=recorder))
+
+
+def test_what_is_not_known_is_no_figure() -> None:
+    unknown = AircraftStatus(1, None, None, Way(1.0, 2.0, 3.0, None, None), ())
+    lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
+    for head in ("supply", "fix", "home m", "mark m", "mark at°"):
+        at = next(i for i, line in enumerate(lines) if head in line)
+        end = lines[at].index(head) + len(head)
+        assert lines[at + 1][:end].split()[-1] == "—", head

@@ -7,9 +7,9 @@ import pytest
 
 from gateway.edges.operator import prometheus
 from gateway.edges.operator.prometheus import MetricsServer, prometheus_text
-from gateway.records import LinkReport, NodeId, NodeLink
+from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.status import Snapshot
+from gateway.status import AircraftStatus, Snapshot
 
 NODE = NodeLink(
     node=NodeId(1, 2),
@@ -53,6 +53,7 @@ CLIENT = ClientStats(
     heard_us=1_000_000,
     round_trip_us=1500,
 )
+BOARD = NodeStatus(0, NodeId(1, 2), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290)
 SNAPSHOT = Snapshot(
     time_us=3_000_000,
     report=REPORT,
@@ -65,6 +66,7 @@ SNAPSHOT = Snapshot(
     ),
     refused=5,
     forged=6,
+    aircraft=(AircraftStatus(1, None, None, None, (BOARD,)),),
 )
 PORT = '{name="here",endpoint="tcp-listen:0.0.0.0:1?name=here"}'
 LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
@@ -78,6 +80,11 @@ LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
         'mavgate_receiver_faults_total{kind="crc"} 4',
         'mavgate_node_lost_total{vehicle="1",node="2"} 3',
         'mavgate_node_rate_hz{vehicle="1",node="2"} 60',
+        'mavgate_node_supply_volts{vehicle="1",node="2"} 3.29',
+        'mavgate_node_bus_errors_total{vehicle="1",node="2"} 12',
+        'mavgate_node_radio_failed_total{vehicle="1",node="2"} 3',
+        'mavgate_node_radio_retries_total{vehicle="1",node="2"} 450',
+        'mavgate_node_info{vehicle="1",node="2",firmware="1.4"} 1',
         "mavgate_hub_published_total 9",
         f"mavgate_client_sent_total{LABELS} 5000",
         f"mavgate_client_round_trip_seconds{LABELS} 0.0015",
