@@ -9,6 +9,7 @@
     ws:HOST:PORT             connect by WebSocket, and connect again when it breaks
     ws-listen:HOST:PORT      serve every program and page that connects by WebSocket
     wss:, wss-listen:        the same within TLS
+    zenoh:tcp/HOST:7447      a fleet, through a Zenoh router; needs ?site=NAME
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
 IPv6 addresses stand in brackets. Options follow as in any URL:
@@ -39,6 +40,13 @@ MAX_MESSAGE_ID: Final = (1 << 24) - 1
 MIN_RATE_HZ: Final = 0.001
 _HOST: Final = re.compile(r"[\w.-]+")
 
+SITE_KEYS: Final = "site"
+LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
+"""How Zenoh names a place."""
+RAW_KEYS: Final = "mavlink_raw"
+SITE_NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+"""What may stand between two slashes of a Zenoh key and means only itself there."""
+
 NO_MESSAGES: Final = -1
 """An interval that stops a message."""
 
@@ -56,6 +64,7 @@ class EndpointKind(StrEnum):
     WS_LISTEN = "ws-listen"
     WSS = "wss"
     WSS_LISTEN = "wss-listen"
+    ZENOH = "zenoh"
     SERIAL = "serial"
 
 
@@ -78,6 +87,7 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WSS: frozenset({"path"}),
     EndpointKind.WS_LISTEN: frozenset({"origins"}),
     EndpointKind.WSS_LISTEN: frozenset({"origins"}),
+    EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
 }
 """What only some kinds know."""
 
@@ -99,7 +109,7 @@ class Endpoint:
     kind: str
     """An `EndpointKind`, or one of `ADDED_KINDS`."""
     host: str
-    """Address or name without brackets; device of a serial port; whole place of an added kind."""
+    """Address or name without brackets; device of a serial port; otherwise the whole place."""
     port: int
     """Port number; the baud rate of a serial port; 0 of an added kind."""
     place: str
@@ -119,12 +129,18 @@ class Endpoint:
     """Pages of other machines that may connect by WebSocket, as browsers name them."""
     path: str = "/"
     """What a WebSocket server is asked for."""
+    site: str = ""
+    """What a fleet calls this place."""
+    keys: str = SITE_KEYS
+    """Where a fleet finds the frames: `site`, or `mavlink_raw` as mavlink-server has it."""
+    config: str = ""
+    """Zenoh's own configuration file; empty for none."""
 
     @property
     def address(self) -> str:
         """Where it is: `HOST:PORT`, or the device of a serial port."""
-        has_port = self.kind != EndpointKind.SERIAL and self.kind not in ADDED_KINDS
-        return host_and_port(self.host, self.port) if has_port else self.host
+        whole = self.kind in (EndpointKind.SERIAL, EndpointKind.ZENOH) or self.kind in ADDED_KINDS
+        return self.host if whole else host_and_port(self.host, self.port)
 
     def passes(self, message_id: int) -> bool:
         """Return whether the lists let a message out to this endpoint."""
@@ -170,6 +186,8 @@ def parse_endpoint(url: str) -> Endpoint:
             trusted=_yes_or_no(options.get("trusted")),
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
+            config=options.get("config", ""),
+            **_fleet_keys(kind, options),
         )
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
@@ -218,6 +236,10 @@ def _split_place(kind: str, place: str) -> tuple[str, int]:
         if not device:
             raise ValueError(f"write {kind}:DEVICE:BAUD, as in {kind}:/dev/ttyUSB0:57600")
         return device, _number(baud, "baud rate", MIN_BAUD, MAX_BAUD)
+    if kind is EndpointKind.ZENOH:
+        if not LOCATOR.fullmatch(place):
+            raise ValueError(f"{place!r} is no place of a router; write {kind}:tcp/HOST:7447")
+        return place, 0
     host, _, port = place.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     if not host or (":" in host and not bracketed):
@@ -336,6 +358,17 @@ def _origins(text: str) -> frozenset[str]:
                 f"origin {origin!r} is not {NULL_ORIGIN} or like https://example.org:8080"
             )
     return origins
+
+
+def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
+    if kind != EndpointKind.ZENOH:
+        return {}
+    site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
+    if keys not in (SITE_KEYS, RAW_KEYS):
+        raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}")
+    if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
+        raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
+    return {"site": site, "keys": keys}
 
 
 def _path(text: str) -> str:

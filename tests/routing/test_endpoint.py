@@ -113,6 +113,15 @@ def test_options_of_a_websocket() -> None:
     assert parse_endpoint("wss:127.0.0.1:1").path == "/"
 
 
+def test_a_site_of_a_fleet() -> None:
+    endpoint = parse_endpoint("zenoh:tcp/[::1]:7447?site=field-1&config=/etc/zenoh.json5&rate=30:5")
+    assert (endpoint.host, endpoint.site, endpoint.keys) == ("tcp/[::1]:7447", "field-1", "site")
+    assert endpoint.address == "tcp/[::1]:7447"
+    assert endpoint.config == "/etc/zenoh.json5"
+    assert endpoint.interval_us == {30: 200_000}
+    assert parse_endpoint("zenoh:tls/h:7447?keys=mavlink_raw").keys == "mavlink_raw"
+
+
 def test_lists() -> None:
     allowing = parse_endpoint("udp:h:1?allow=HEARTBEAT,ATTITUDE&deny=ATTITUDE")
     assert [allowing.passes(message_id) for message_id in (0, 30, 33)] == [True, False, False]
@@ -143,6 +152,12 @@ def test_lists() -> None:
         ("ws-listen:127.0.0.1:1?origins=https://example.org/page", "https://example.org:8080"),
         ("ws-listen:localhost:1", "no address"),
         ("ws:h:1?path=raw", "begin with /"),
+        ("zenoh:tcp/h:7447", "site"),
+        ("zenoh:tcp/h:7447?site=a/b", "a/b"),
+        ("zenoh:tcp/h:7447?site=*", "letters"),
+        ("zenoh:h:7447?site=a", "tcp/HOST"),
+        ("zenoh:tcp/h:7447?site=a&keys=other", "mavlink_raw"),
+        ("udp:h:1?site=a", "site"),
         ("ws:h:1?path=/a b", "spaces"),
         ("udp:h:1?deny=NO_SUCH_MESSAGE", "NO_SUCH_MESSAGE"),
         ("udp:h:1?rate=ATTITUDE", "hertz"),

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from gateway.edges.hub.client import Client, HubContext
+from gateway.edges.hub.fleet_link.zenoh_client import ZenohClient
 from gateway.edges.hub.group import GroupClient
 from gateway.edges.hub.listener import Listener
 from gateway.edges.hub.radio import RadioClient
@@ -22,6 +23,7 @@ CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.TCP: TcpClient,
     EndpointKind.WS: WsClient,
     EndpointKind.WSS: WsClient,
+    EndpointKind.ZENOH: ZenohClient,
     EndpointKind.SERIAL: RadioClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {

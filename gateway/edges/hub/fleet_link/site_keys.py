@@ -1,0 +1,35 @@
+"""The keys under which a fleet finds its sites.
+
+| key                          | what                                                        |
+| ---------------------------- | ----------------------------------------------------------- |
+| `mavlink/SITE/SYSTEM/out`    | frames of a system of the site                              |
+| `mavlink/SITE/SYSTEM/in`     | frames for a system of the site; `0` is for all             |
+| `mavlink/SITE/site/SESSION`  | a token that lives as long as the site's session does       |
+| `mavlink_raw/out`, `…/in`    | the same without sites, as mavlink-server has it            |
+"""
+
+from typing import Final
+
+ROOT: Final = "mavlink"
+ALL_SYSTEMS: Final = "*"
+
+
+def out_key(site: str, system: object) -> str:
+    """Return where frames of a system of a site are published."""
+    return f"{ROOT}/{site}/{system}/out"
+
+
+def in_key(site: str, system: object) -> str:
+    """Return where frames for a system of a site are published."""
+    return f"{ROOT}/{site}/{system}/in"
+
+
+def presence_key(site: str, session: object) -> str:
+    """Return the token of one session of a site."""
+    return f"{ROOT}/{site}/site/{session}"
+
+
+def site_of(key: str) -> str:
+    """Return the site that a key belongs to; empty if it is none of ours."""
+    parts = key.split("/")
+    return parts[1] if len(parts) == 4 and parts[0] == ROOT else ""

@@ -1,0 +1,197 @@
+"""A fleet as one client of the hub: all frames of this site go there, and its wishes come back.
+
+The session finds its router again by itself. While it has none nothing is sent and nothing waits,
+so that nothing old ever arrives as new.
+"""
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+from gateway.edges.hub.client import Client
+from gateway.edges.hub.fleet_link.site_keys import ALL_SYSTEMS, in_key, out_key, presence_key
+from gateway.edges.hub.fleet_link.zenoh_session import (
+    HOW_TO_ADD,
+    PATIENT_IDS,
+    Inlet,
+    Outlets,
+    open_session,
+    session_config,
+)
+from gateway.edges.hub.listener import RETRY_US
+from gateway.edges.hub.udp import PACK_DELAY_S
+from gateway.routing.endpoint import RAW_KEYS, Endpoint
+from gateway.routing.outbox import Packer
+from gateway.wire.mavlink_splitter import origin_of, split_datagram
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+RAW_OUT: Final = "mavlink_raw/out"
+RAW_IN: Final = "mavlink_raw/in"
+
+
+class ZenohClient(Client):
+    """A fleet behind a router."""
+
+    _session: "zenoh.Session | None" = None
+    _task: asyncio.Task[None] | None = None
+    _outlets: Outlets | None = None
+    _retry_us = 0
+    _flush_timer: asyncio.TimerHandle | None = None
+
+    def __post_init__(self) -> None:
+        """Begin without a session; the first tick opens it."""
+        super().__post_init__()
+        self._namesakes: set[str] = set()
+        self._packers: dict[str, Packer] = {}
+        self._inlets: list[Inlet[Any]] = []
+        self._declared: list[object] = []
+
+    @property
+    def queued(self) -> int:
+        """Frames that wait for a congested link and must not be lost."""
+        return self._outlets.queued if self._outlets is not None else 0
+
+    def transmit(self, frame: bytes, message_id: int) -> None:
+        """Publish one frame, or gather it with others."""
+        if self.state != "open" or self._outlets is None:
+            self.counters.dropped += 1
+            return
+        key = RAW_OUT if self._is_raw else out_key(self.endpoint.site, origin_of(frame)[0])
+        if message_id in PATIENT_IDS:
+            self._publish(key, [frame], patient=True)
+        elif self.endpoint.pack_bytes:
+            self._pack(key, frame)
+        else:
+            self._publish(key, [frame], patient=False)
+
+    def tick(self, now_us: int) -> None:
+        """Open the session, and see whether it has a router."""
+        if self._session is None:
+            if self._task is None and now_us >= self._retry_us:
+                self._retry_us = now_us + RETRY_US
+                self._task = self.loop.create_task(self._open())
+            return
+        is_linked = bool(self._session.info.routers_zid())
+        if is_linked and self.state != "open":
+            self.become("open")
+            self.context.greet(self)
+        elif not is_linked and self.state == "open":
+            self.become("connecting")
+            self._packers.clear()
+        self._tell_namesakes()
+
+    def close(self) -> None:
+        """End the session; it says good-bye by itself, which may take a moment."""
+        if self._task is not None:
+            self._task.cancel()
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+        for inlet in self._inlets:
+            inlet.close()
+        if self._outlets is not None:
+            self._outlets.close()
+            self._outlets = None
+        if self._session is not None:
+            self.loop.run_in_executor(None, self._session.close)
+            self._session = None
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Take over changed options; another site or file needs the endpoint to be added anew."""
+        self._flush()
+        self._packers.clear()
+        super().reconfigure(endpoint)
+
+    @property
+    def _is_raw(self) -> bool:
+        return self.endpoint.keys == RAW_KEYS
+
+    async def _open(self) -> None:
+        try:
+            config = session_config(self.endpoint.host, self.endpoint.config)
+            session = await asyncio.to_thread(open_session, config)
+        except ModuleNotFoundError:
+            self.become("unreachable")
+            self.reason = HOW_TO_ADD
+        except (OSError, ValueError) as error:
+            self.become("unreachable", error)
+        else:
+            self._session = session
+            self._outlets = Outlets(session)
+            self._declare(session)
+            self.tick(self.context.now_us())
+        finally:
+            self._task = None
+
+    def _declare(self, session: "zenoh.Session") -> None:
+        """Tell the router what we take, and that we are here."""
+        import zenoh
+
+        inlet: Inlet[bytes] = Inlet(self._take)
+        presence: Inlet[tuple[bool, str]] = Inlet(self._note_session)
+        self._inlets = [inlet, presence]
+        self._namesakes.clear()
+        wanted = RAW_IN if self._is_raw else in_key(self.endpoint.site, ALL_SYSTEMS)
+        self._declared = [
+            session.declare_subscriber(wanted, lambda sample: inlet.put(sample.payload.to_bytes()))
+        ]
+        if self._is_raw:
+            return
+        site, liveliness = self.endpoint.site, session.liveliness()
+        here = zenoh.SampleKind.PUT
+        self._declared += [
+            liveliness.declare_token(presence_key(site, session.zid())),
+            liveliness.declare_subscriber(
+                presence_key(site, "*"),
+                lambda sample: presence.put((sample.kind == here, str(sample.key_expr))),
+                history=True,
+            ),
+        ]
+
+    def _take(self, data: bytes) -> None:
+        self.receive(split_datagram(data), len(data), self.context.now_us())
+
+    def _note_session(self, news: tuple[bool, str]) -> None:
+        is_here, key = news
+        session = key.rpartition("/")[2]
+        if self._session is None or session == str(self._session.zid()):
+            return
+        if is_here:
+            self._namesakes.add(session)
+        else:
+            self._namesakes.discard(session)
+        self._tell_namesakes()
+
+    def _tell_namesakes(self) -> None:
+        """Say for as long as it lasts that somebody else bears our name."""
+        text = f"another site is called {self.endpoint.site!r} too" if self._namesakes else ""
+        if self.state != "open" or text == self.reason:
+            return
+        self.reason = text
+        if text:
+            log.warning("%s: %s; rename one of them", self.name, text)
+
+    def _pack(self, key: str, frame: bytes) -> None:
+        packer = self._packers.setdefault(key, Packer(self.endpoint.pack_bytes))
+        self._publish(key, packer.add(frame), patient=False)
+        if self._flush_timer is None:
+            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+
+    def _flush(self) -> None:
+        self._flush_timer = None
+        for key, packer in self._packers.items():
+            self._publish(key, packer.flush(), patient=False)
+
+    def _publish(self, key: str, frames: list[bytes], *, patient: bool) -> None:
+        if not frames or self._outlets is None:
+            return
+        data = b"".join(frames)
+        if self._outlets.publish(key, data, patient=patient):
+            self.counters.sent += len(frames)
+            self.counters.bytes_sent += len(data)
+        else:
+            self.counters.dropped += len(frames)

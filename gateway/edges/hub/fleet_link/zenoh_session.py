@@ -1,0 +1,219 @@
+"""A Zenoh session beside an event loop that never waits for it.
+
+Zenoh calls back on a thread of its own: what comes is put aside there and taken by the loop, a
+bounded number at a time. What may be dropped is published by the loop itself, for Zenoh then never
+waits. What may not be is published by a thread, since Zenoh waits while a link is congested.
+"""
+
+import asyncio
+import logging
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
+
+from gateway.routing.outbox import BULK_IDS
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+HOW_TO_ADD: Final = "the fleet is an extra: pip install 'mavgate[fleet]'"
+MAX_WAITING: Final = 4096
+"""What has come and was not taken yet: more than a second of a hundred aircraft."""
+AT_ONCE: Final = 64
+"""Taken in one turn of the loop, so that a flood cannot starve the others."""
+MAX_PATIENT: Final = 1024
+"""What waits for a congested link and must not be lost: a whole parameter list."""
+PATIENT_IDS: Final = BULK_IDS | {75, 76, 77, 253}
+"""Parameters, missions, files, commands, their answers, texts: none of them comes again."""
+
+Item = TypeVar("Item")
+
+
+def session_config(place: str, file: str, mode: str = "client") -> "zenoh.Config":
+    """Return how a session is to be opened.
+
+    Parameters
+    ----------
+    place : str
+        A locator, as `tcp/127.0.0.1:7447`: to connect to, or where a router listens.
+    file : str
+        Zenoh's own configuration file, which rules all but mode and place; empty for none.
+    mode : str
+        `client`, or `router` for one that others connect to.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Zenoh is not installed.
+    ValueError
+        If the file or the place is none.
+    """
+    import zenoh
+
+    listens = "listen" if mode == "router" else "connect"
+    try:
+        if file:
+            config = zenoh.Config.from_file(Path(file).expanduser())
+        else:
+            config = zenoh.Config()
+            # Only where it was told to: no site joins a stranger's network by itself.
+            config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("scouting/gossip/enabled", "false")
+        config.insert_json5("mode", f'"{mode}"')
+        config.insert_json5(f"{listens}/endpoints", f'["{place}"]')
+        drop = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+        config.insert_json5(drop, "0")
+    except zenoh.ZError as error:
+        raise ValueError(f"zenoh: {_words(error)}") from None
+    return config
+
+
+def open_session(config: "zenoh.Config") -> "zenoh.Session":
+    """Open a session; waits, so not on the loop.
+
+    Raises
+    ------
+    OSError
+        If there is nobody at the place.
+    """
+    import zenoh
+
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise OSError(_words(error)) from None
+
+
+class Inlet(Generic[Item]):
+    """Hands items from a thread to the loop, in order; when too many wait the oldest go.
+
+    Parameters
+    ----------
+    take : callable
+        Called on the loop with each item.
+    """
+
+    def __init__(self, take: Callable[[Item], None]) -> None:
+        self._take = take
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[Item] = deque(maxlen=MAX_WAITING)
+        self._is_due = False
+        self._is_closed = False
+        self.dropped = 0
+
+    def put(self, item: Item) -> None:
+        """Take an item from any thread."""
+        if self._is_closed:
+            return
+        self.dropped += len(self._waiting) == MAX_WAITING
+        self._waiting.append(item)
+        if not self._is_due:
+            self._is_due = True
+            try:
+                self._loop.call_soon_threadsafe(self._drain)
+            except RuntimeError:
+                # The loop has ended meanwhile.
+                self._is_closed = True
+
+    def close(self) -> None:
+        """Take nothing more."""
+        self._is_closed = True
+        self._waiting.clear()
+
+    def _drain(self) -> None:
+        # Before the queue is looked at: what comes from now on wakes us again.
+        self._is_due = False
+        for _ in range(AT_ONCE):
+            if not self._waiting:
+                return
+            self._take(self._waiting.popleft())
+        if self._waiting and not self._is_due:
+            self._is_due = True
+            self._loop.call_soon(self._drain)
+
+
+class Outlets:
+    """Publishes under many keys, each declared when it is first used.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        An open session.
+    """
+
+    def __init__(self, session: "zenoh.Session") -> None:
+        import zenoh
+
+        self._zenoh = zenoh
+        self._session = session
+        self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
+        self._waiting: queue.Queue[tuple[zenoh.Publisher, bytes] | None] = queue.Queue(MAX_PATIENT)
+        self._thread = threading.Thread(target=self._publish, name="zenoh-patient", daemon=True)
+        self._thread.start()
+
+    def publish(self, key: str, payload: bytes, *, patient: bool) -> bool:
+        """Publish without waiting; return whether it was taken.
+
+        Parameters
+        ----------
+        key : str
+            Where.
+        payload : bytes
+            Some frames.
+        patient : bool
+            Whether it waits for a congested link, and is not dropped.
+        """
+        publisher = self._publishers.get((key, patient)) or self._declare(key, patient=patient)
+        if not patient:
+            publisher.put(payload)
+            return True
+        try:
+            self._waiting.put_nowait((publisher, payload))
+        except queue.Full:
+            return False
+        return True
+
+    @property
+    def queued(self) -> int:
+        """How many wait for a congested link."""
+        return self._waiting.qsize()
+
+    def close(self) -> None:
+        """Publish nothing more; what waits is lost."""
+        while True:
+            try:
+                self._waiting.put_nowait(None)
+                break
+            except queue.Full:
+                self._waiting.get_nowait()
+
+    def _declare(self, key: str, *, patient: bool) -> "zenoh.Publisher":
+        control, priority = self._zenoh.CongestionControl, self._zenoh.Priority
+        publisher = self._session.declare_publisher(
+            key,
+            congestion_control=control.BLOCK if patient else control.DROP,
+            priority=priority.INTERACTIVE_HIGH if patient else priority.DATA,
+            express=True,
+        )
+        self._publishers[key, patient] = publisher
+        return publisher
+
+    def _publish(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            publisher, payload = item
+            try:
+                publisher.put(payload)
+            except self._zenoh.ZError as error:
+                log.debug("not published: %s", error)
+                if self._session.is_closed():
+                    return
+
+
+def _words(error: Exception) -> str:
+    """Return what Zenoh says, without where in its source it says so."""
+    return str(error).partition(" at /")[0].strip()

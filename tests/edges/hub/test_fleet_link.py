@@ -1,0 +1,285 @@
+"""A site's endpoint, with real sessions and a real router in another process."""
+
+import asyncio
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from gateway.edges.hub.fleet_link import zenoh_session
+from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inlet
+from gateway.wire.mavlink_splitter import message_id_of
+from tests.edges.hub.conftest import Rig
+
+pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+
+ROUTER = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+session = zenoh.open(config)
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+
+class Router:
+    """A router as a process that can be killed, stopped and started again at the same place."""
+
+    def __init__(self) -> None:
+        with socket.socket() as place:
+            place.bind(("127.0.0.1", 0))
+            self.place = f"tcp/127.0.0.1:{place.getsockname()[1]}"
+        self.process: subprocess.Popen[str] | None = None
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", ROUTER, self.place],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "open\n"
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None
+
+    def signal(self, number: signal.Signals) -> None:
+        assert self.process is not None
+        self.process.send_signal(number)
+
+
+@pytest.fixture
+def router() -> Iterator[Router]:
+    router = Router()
+    yield router
+    router.kill()
+
+
+class Far:
+    """Somebody else at the router, who notes what comes."""
+
+    def __init__(self, place: str, *keys: str) -> None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([place]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+        self.got: list[tuple[str, bytes]] = []
+        self._subscribers = [self.session.declare_subscriber(key, self._note) for key in keys]
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        self.got.append((str(sample.key_expr), sample.payload.to_bytes()))
+
+    def messages(self, message_id: int) -> list[bytes]:
+        return [data for _, data in self.got if message_id_of(data) == message_id]
+
+
+@pytest.fixture
+def visit(router: Router) -> Iterator[Callable[..., Far]]:
+    visitors: list[Far] = []
+
+    def make(*keys: str) -> Far:
+        visitors.append(Far(router.place, *keys))
+        return visitors[-1]
+
+    yield make
+    for visitor in visitors:
+        visitor.session.close()
+
+
+async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
+    """Let the hub tick until something holds: Zenoh's own threads take their time."""
+    async with asyncio.timeout(30):
+        while not condition():
+            rig.clock.us += 100_000
+            rig.tick(hub)
+            await asyncio.sleep(0.01)
+
+
+async def open_site(rig: Rig, router: Router, options: str = "site=field") -> Any:
+    hub = rig.hub(f"zenoh:{router.place}?{options}")
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    await until(rig, hub, lambda: hub.clients()[0].state == "open")
+    return hub
+
+
+async def until_heard(rig: Rig, hub: Any, far: Far) -> None:
+    """Publish until the subscription has reached the site."""
+
+    def said() -> bool:
+        hub.send(rig.out(rig.vehicle.attitude()))
+        return bool(far.got)
+
+    await until(rig, hub, said)
+
+
+class TestSite:
+    async def test_both_ways(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
+        hub = await open_site(rig, router)
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        assert far.got[0][0] == "mavlink/field/1/out"
+        said = rig.sender(255, 190).command(1, 1)
+        far.session.put("mavlink/field/1/in", said)
+        await until(rig, hub, lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].trusted
+        far.session.put("mavlink/field/1/in", b"no MAVLink")
+        await until(rig, hub, lambda: hub.clients()[0].bytes_garbage == 10)
+        far.session.put("mavlink/other/1/in", said)
+        far.session.put("mavlink/field/1/in", rig.sender(255, 190).heartbeat())
+        await until(rig, hub, lambda: hub.clients()[0].received == 2)
+
+    async def test_an_autopilot_behind_it_has_keys_of_its_own(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router)
+        hub.add("udp-listen:127.0.0.1:0?trusted=yes")
+        station = rig.station(hub.listening_ports()[0])
+        far = visit("mavlink/field/7/out")
+        autopilot = rig.sender(7)
+
+        def heard() -> bool:
+            station.say(autopilot.heartbeat())
+            return bool(far.got)
+
+        await until(rig, hub, heard)
+        assert far.got[0][0] == "mavlink/field/7/out"
+
+    async def test_filters_rates_and_packing(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        await until(rig, hub, lambda: not hub._clients[1]._flush_timer)
+        for _ in range(5):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.attitude()))
+        size = len(rig.vehicle.attitude())
+        await until(rig, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
+        assert not far.messages(27)
+
+    async def test_untrusted(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
+        hub = await open_site(rig, router, "site=field&trusted=no")
+        far = visit()
+        far.session.put("mavlink/field/1/in", rig.sender(255, 190).command(1, 1))
+        await until(rig, hub, lambda: bool(rig.incoming))
+        assert not rig.incoming[0].trusted
+
+    async def test_the_keys_of_mavlink_server(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router, "keys=mavlink_raw")
+        far = visit("mavlink_raw/out")
+        await until_heard(rig, hub, far)
+        far.session.put("mavlink_raw/in", rig.sender(255, 190).command(1, 1))
+        await until(rig, hub, lambda: bool(rig.incoming))
+
+
+class TestTrouble:
+    async def test_the_router_goes_and_comes_back(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router)
+        hub.add("udp-listen:127.0.0.1:0")
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        router.kill()
+        await until(rig, hub, lambda: hub.clients()[0].state == "connecting")
+        dropped, before = hub.clients()[0].dropped, len(far.messages(27))
+        for _ in range(500):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.command(1, 1)))
+        assert hub.clients()[0].dropped == dropped + 1000
+        assert hub.clients()[0].queued == 0
+        router.start()
+        await until(rig, hub, lambda: hub.clients()[0].state == "open")
+        heard = len(far.got)
+        await until(rig, hub, lambda: said_again(rig, hub, far, heard))
+        assert len(far.messages(27)) == before, "what was old is not delivered as new"
+        assert not far.messages(76)
+        numbers = [data[4] for data in far.messages(30)]
+        assert len(set(numbers)) == len(numbers), "no frame twice"
+
+    async def test_no_router_yet(self, rig: Rig) -> None:
+        with socket.socket() as place:
+            place.bind(("127.0.0.1", 0))
+            port = place.getsockname()[1]
+        hub = rig.hub(f"zenoh:tcp/127.0.0.1:{port}?site=field")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert "Unable to connect" in hub.clients()[0].reason
+
+    async def test_a_router_that_stalls_holds_nobody_up(self, rig: Rig, router: Router) -> None:
+        hub = await open_site(rig, router)
+        router.signal(signal.SIGSTOP)
+        loop = asyncio.get_running_loop()
+        begin = loop.time()
+        for _ in range(5000):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.command(1, 1)))
+        assert loop.time() - begin < 5.0
+        assert hub.clients()[0].queued <= zenoh_session.MAX_PATIENT
+        router.signal(signal.SIGCONT)
+
+    async def test_two_sites_of_one_name_are_told_on_both(self, rig: Rig, router: Router) -> None:
+        first, second = [await open_site(rig, router) for _ in range(2)]
+        for hub in (first, second):
+            await until(rig, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023
+        second.close()
+        await until(rig, first, lambda: first.clients()[0].reason == "")
+
+    async def test_without_zenoh_it_says_how_to_install_it(
+        self, rig: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "zenoh", None)
+        hub = rig.hub("zenoh:tcp/127.0.0.1:7447?site=field")
+        await until(rig, hub, lambda: bool(hub.clients()[0].reason))
+        assert "pip install 'mavgate[fleet]'" in hub.clients()[0].reason
+
+    async def test_a_file_that_is_none(self, rig: Rig, tmp_path: Path) -> None:
+        file = tmp_path / "zenoh.json5"
+        file.write_text("{")
+        hub = rig.hub(f"zenoh:tcp/127.0.0.1:7447?site=field&config={file}")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert "zenoh" in hub.clients()[0].reason
+
+
+def said_again(rig: Rig, hub: Any, far: Far, heard: int) -> bool:
+    hub.send(rig.out(rig.vehicle.attitude()))
+    return len(far.got) > heard
+
+
+class TestInlet:
+    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest(self) -> None:
+        taken: list[int] = []
+        inlet = Inlet(taken.append)
+        for n in range(MAX_WAITING + 10):
+            inlet.put(n)
+        most = 0
+        while len(taken) < MAX_WAITING:
+            before = len(taken)
+            await asyncio.sleep(0)
+            most = max(most, len(taken) - before)
+        assert taken == list(range(10, MAX_WAITING + 10))
+        assert inlet.dropped == 10
+        assert most <= 2 * AT_ONCE
+        inlet.close()
+        inlet.put(0)
+        await asyncio.sleep(0)
+        assert len(taken) == MAX_WAITING
