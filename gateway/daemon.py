@@ -228,6 +228,10 @@ class Daemon:
             recorder=self._recorder.status(),
         )
 
+    def announce(self, text: str) -> None:
+        """Tell the ground stations an event that is no trouble."""
+        self._announce(False, text)
+
     def toggle_recording(self) -> None:
         """Start the recorder if it is idle, or stop it, whatever the settings say."""
         idle = self._recorder.status().state == SessionState.IDLE

@@ -5,10 +5,12 @@ Vectors become counts in sensor axes, in the finest ranges that hold them; the b
 face up. Heights of the barometer become pressures of the standard atmosphere.
 """
 
+import dataclasses
 import heapq
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain, count
 from operator import attrgetter
 from typing import Final
 
@@ -45,6 +47,7 @@ from gateway.simulator.sensors import (
     to_int16,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
@@ -181,8 +184,39 @@ class RecordedNode(Node):
             yield sent
 
 
+def fly_again(
+    settings: SimulatorSettings,
+    flight: RecordedFlight,
+    on_round: Callable[[int], None],
+    start_unix_us: int = START_UNIX_US,
+) -> Iterator[TimedFrame]:
+    """Fly a recording over and over; the nodes' clocks and numbers go on, as if nobody landed.
+
+    Parameters
+    ----------
+    settings, flight, start_unix_us
+        As for `replay`.
+    on_round : callable
+        Called with the number of the round that begins, from 2, when its first frame is wanted.
+
+    Yields
+    ------
+    TimedFrame
+    """
+    number, end_s = 1, flight.duration_s
+    for frame in replay(settings, flight, start_unix_us, endless=True).frames():
+        if frame.time_s >= end_s:
+            number, end_s = number + 1, end_s + flight.duration_s
+            on_round(number)
+        yield frame
+
+
 def replay(
-    settings: SimulatorSettings, flight: RecordedFlight, start_unix_us: int = START_UNIX_US
+    settings: SimulatorSettings,
+    flight: RecordedFlight,
+    start_unix_us: int = START_UNIX_US,
+    *,
+    endless: bool = False,
 ) -> SimulatedReceiver:
     """Set up the receiver and one aircraft that flies a recording.
 
@@ -193,6 +227,8 @@ def replay(
     flight : RecordedFlight
     start_unix_us : int
         UTC of the first row, which recordings do not tell.
+    endless : bool
+        Begin anew whenever the recording has ended.
 
     Returns
     -------
@@ -200,8 +236,11 @@ def replay(
         Its `frames(flight.duration_s)` end with the recording.
     """
     imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
-    inertial = _imu_payloads(flight, imu_clock)
-    pressures = _baro_payloads(flight, imu_clock)
+    inertial = chain.from_iterable(_imu_payloads(f, imu_clock) for f in _rounds(flight, endless))
+    pressures: Iterator[Sent] = iter(())
+    if np.isfinite(flight.baro_alt_m).any():
+        rounds = _rounds(flight, endless)
+        pressures = chain.from_iterable(_baro_payloads(f, imu_clock) for f in rounds)
     nodes: list[Node] = [
         RecordedNode(
             NodeId(settings.vehicle_id, IMU_NODE),
@@ -213,18 +252,32 @@ def replay(
     ]
     if len(flight.gps_time_s):
         gps_clock = DeviceClock(GPS_BOOT_US, -settings.clock_skew_ppm)
-        gps = _gps_samples(flight, start_unix_us)
-        spacing_s = float(np.median(np.diff(gps.time_s))) if len(gps.time_s) > 1 else 1.0
+        gaps_s = np.diff(flight.gps_time_s)
+        spacing_s = float(np.median(gaps_s)) if len(gaps_s) else 1.0
+        fixes = chain.from_iterable(
+            gps_payloads(_gps_samples(f, start_unix_us), gps_clock, settings.geoid_separation_m)
+            for f in _rounds(flight, endless)
+        )
         nodes.append(
             RecordedNode(
                 NodeId(settings.vehicle_id, GPS_NODE),
                 gps_clock,
                 GPS_SENSORS,
                 round(1.0 / spacing_s),
-                gps_payloads(gps, gps_clock, settings.geoid_separation_m),
+                fixes,
             )
         )
     return SimulatedReceiver(settings, nodes)
+
+
+def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
+    """Yield the flight, and then again, each time behind the one before."""
+    yield flight
+    for number in count(1) if endless else ():
+        begin_s = number * flight.duration_s
+        yield dataclasses.replace(
+            flight, time_s=flight.time_s + begin_s, gps_time_s=flight.gps_time_s + begin_s
+        )
 
 
 def _velocity(columns: Mapping[str, FloatArray], blank: FloatArray) -> FloatArray:

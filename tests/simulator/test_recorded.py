@@ -5,7 +5,7 @@ import pytest
 
 from gateway.edges.disk.tracker_csv import read_flight
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
-from gateway.simulator.recorded import RecordedFlight, replay
+from gateway.simulator.recorded import RecordedFlight, fly_again, replay
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.link import Link
 
@@ -199,3 +199,34 @@ def test_real_flight_comes_through(data_dir) -> None:  # type: ignore[no-untyped
     report = link.report(0, connected=True, port="")
     assert report.faults == ()
     assert report.nodes[0].lost == 0
+
+
+def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
+    link = Link()
+    found: list[RawRecord] = []
+    rounds: list[tuple[int, int]] = []
+
+    def note(number: int) -> None:
+        rounds.append((number, len(found)))
+
+    until_s = 2.5 * flight.duration_s
+    for frame in fly_again(QUIET, flight, note):
+        if frame.time_s > until_s:
+            break
+        found.extend(link.feed(frame.data, round(frame.time_s * 1e6)))
+    assert [number for number, _ in rounds] == [2, 3]
+    first, second = (
+        [r.accel_raw for r in some if isinstance(r, ImuRaw)]
+        for some in (found[: rounds[0][1]], found[rounds[0][1] : rounds[1][1]])
+    )
+    assert len(first) == pytest.approx(ROWS, abs=2)
+    assert second[5:-5] == first[5:-5] or second[6:-5] == first[5:-6]
+    report = link.report(round(until_s * 1e6), connected=True, port="")
+    assert [node.restarts for node in report.nodes] == [0, 0]
+    assert [node.lost for node in report.nodes] == [0, 0]
+
+
+def test_a_flight_without_barometer_and_gps_goes_round_too() -> None:
+    bare = RecordedFlight.from_columns(columns(baro_alt_m=None, gps_lat=None))
+    frames = fly_again(QUIET, bare, lambda _: None)
+    assert sum(1 for _, frame in zip(range(3 * ROWS), frames, strict=False)) == 3 * ROWS

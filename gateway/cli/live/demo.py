@@ -1,9 +1,9 @@
 """`mavgate demo`: the whole gateway on a simulated receiver."""
 
 import asyncio
+import logging
 import tempfile
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -20,22 +20,34 @@ from gateway.cli.live.run import (
 )
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.firmware_bench import BenchError, firmware_line
+from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.panel_process import PanelProcess, is_installed
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    progress_of,
+    read_column_map,
+    refusing,
+)
 from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
     or_refuse,
+    pipeline_settings,
 )
 from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
-from gateway.edges.disk.tracker_csv import FlightFileError, read_flight
+from gateway.edges.disk.tracker_csv import FlightFileError
+from gateway.flights.flown import open_flown
+from gateway.flights.reading import ReadOptions
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
-from gateway.simulator.recorded import replay
+from gateway.simulator.recorded import fly_again
 from gateway.simulator.timed_frame import TimedFrame
+
+log = logging.getLogger(__name__)
 
 
 def register(app: typer.Typer) -> None:
@@ -51,8 +63,11 @@ def demo(
     record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
     flight: Annotated[
         Path | None,
-        typer.Option("--flight", "-f", help="Send a recorded tracker log (CSV) in its place."),
+        typer.Option(
+            "--flight", "-f", help="Send a recording in its place: by its name, or any file."
+        ),
     ] = None,
+    columns: ColumnsOption = None,
     firmware: Annotated[
         bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
     ] = False,
@@ -62,7 +77,8 @@ def demo(
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
-    The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates.
+    The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates. A recording
+    that is flown in its place begins anew at its end, and says so.
     """
 
     def read() -> GatewaySettings:
@@ -70,9 +86,16 @@ def demo(
 
     settings = or_refuse(read)
     make_ready(settings.estimation.estimator)
+    daemons: list[Daemon] = []
+
+    def tell(text: str) -> None:
+        log.info(text)
+        for daemon in daemons:
+            daemon.announce(text)
+
     try:
         if flight is not None:
-            line, aircraft = recorded_line(settings, flight)
+            line, aircraft = recorded_line(settings, flight, columns, tell)
         elif firmware:
             line = firmware_line(settings.simulator, unix_time_us())
             aircraft = calibrated_aircraft(settings)
@@ -89,23 +112,51 @@ def demo(
             recording = replace(settings.recording, mode="always" if record else "manual")
             return replace(settings, aircraft_folder=folder, recording=recording)
 
-        daemon = partial(Daemon, apart(settings), aircraft, lambda: apart(read()), line)
+        def daemon() -> Daemon:
+            daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line))
+            return daemons[0]
+
         page = PanelProcess(config) if panel and is_installed() else None
         asyncio.run(serve(daemon, plain=plain, panel=page))
 
 
 def recorded_line(
-    settings: GatewaySettings, file: Path
+    settings: GatewaySettings,
+    name: Path,
+    columns: Path | None = None,
+    tell: Callable[[str], None] = log.info,
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
-    """Send a log as its nodes would have, and take its calibrated values as they are."""
-    flight = read_flight(file)
+    """Send a recording as its nodes would have, and take its calibrated values as they are.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        Of the gateway that it is sent to.
+    name : Path
+        Name of a recording, or a file.
+    columns : Path, optional
+        Column map of another program's CSV.
+    tell : callable
+        Told of every end.
+    """
+    with refusing():
+        files = files_of([name], folder_of(settings), "tables")
+    with progress_of(files) as advance, refusing():
+        options = ReadOptions(
+            pipeline_settings(settings), columns=read_column_map(columns), progress=advance
+        )
+        flight = open_flown(files, options)
     estimation = settings.estimation
     reference = replace(estimation.reference, gps_latency_s=flight.gps_latency_s)
     aircraft = replace(
         settings.default_aircraft, estimation=replace(estimation, reference=reference)
     )
-    receiver = replay(settings.simulator, flight, unix_time_us())
-    return receiver.frames(flight.duration_s), {settings.simulator.vehicle_id: aircraft}
+
+    def on_round(number: int) -> None:
+        tell(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")
+
+    frames = fly_again(settings.simulator, flight, on_round, unix_time_us())
+    return frames, {settings.simulator.vehicle_id: aircraft}
 
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:

@@ -1,0 +1,95 @@
+"""Any recording as a flight that the simulated receiver sends once more."""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gateway.aircraft import AircraftSettings
+from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.edges.disk.tracker_csv import read_flight
+from gateway.flightlog.table.row import TableRow
+from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, joined_rows, open_rows
+from gateway.records import ImuCalibrated
+from gateway.sensing.chain import SensorChain, pressure_altitude_m
+from gateway.simulator.recorded import RecordedFlight
+from gateway.units import DEG_PER_DEGE7, US_PER_S
+
+COLUMNS: Final = (
+    *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),
+    *("gps_time_s", "gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"),
+)
+BARO: Final = COLUMNS.index("baro_alt_m")
+GPS: Final = COLUMNS.index("gps_time_s")
+IMU: Final = slice(1, BARO)
+
+
+def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
+    """Read a recording as a flight to be sent again.
+
+    Parameters
+    ----------
+    files : list of Path
+        Parts of one recording, a tlog, another program's CSV, or any format with a reader.
+    options : ReadOptions
+        Column map, vehicle, settings.
+
+    Returns
+    -------
+    RecordedFlight
+        Calibrated samples in body axes, so it wants no calibration.
+
+    Raises
+    ------
+    FlightError
+        If there is no flight in it.
+    FlightFileError
+        If it is a tracker log that cannot be read.
+    OSError
+        If it cannot be read at all.
+    """
+    if options.columns is None and kind_of(files[0]) is FileKind.FOREIGN:
+        return read_flight(files[0])
+    table = joined_rows([open_rows(file, options) for file in files])
+    aircraft = aircraft_of(table, options)
+    columns = np.array(_cells(table.plain_rows, aircraft), float).reshape(-1, len(COLUMNS))
+    latency_s = aircraft.estimation.reference.gps_latency_s
+    try:
+        return RecordedFlight.from_columns(dict(zip(COLUMNS, columns.T, strict=True)), latency_s)
+    except ValueError as error:
+        raise FlightError(f"{files[0]}: {error}") from error
+
+
+def _cells(rows: Iterable[TableRow], aircraft: AircraftSettings) -> list[list[float]]:
+    """Lay rows out in the order of `COLUMNS`; what came between two samples is in the later."""
+    chain = SensorChain(aircraft.sensing, aircraft.calibration)
+    found: list[list[float]] = []
+    cells = [math.nan] * len(COLUMNS)
+    for row in rows:
+        if row.baro is not None:
+            cells[BARO] = pressure_altitude_m(row.baro.pressure_pa)
+        if (fix := row.gps) is not None and fix.fix_ok:
+            place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
+            cells[GPS:] = (fix.time_us / US_PER_S, *place, fix.alt_amsl_m, *fix.vel_n_mps)
+        imu = _imu(row, chain)
+        if imu is None or (found and row.time_us / US_PER_S <= found[-1][0]):
+            continue
+        cells[0] = row.time_us / US_PER_S
+        cells[IMU] = [*imu[0], *imu[1], *(imu[2] or (math.nan,) * 3)]
+        found.append(cells)
+        cells = [math.nan] * len(COLUMNS)
+    return found
+
+
+def _imu(
+    row: TableRow, chain: SensorChain
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...] | None] | None:
+    sample: ImuCalibrated | None = row.imu
+    if sample is not None:
+        return sample.accel_b_mps2, sample.gyro_b_radps, sample.mag_b_ut
+    if row.raw is None:
+        return None
+    made = chain.imu(row.raw)
+    return made.accel_b_mps2, made.gyro_b_radps, made.mag_b_ut
