@@ -2,6 +2,7 @@
 
 import ast
 from collections import Counter
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -66,6 +67,11 @@ MAX_FOLDER_FILES = 15
 SOURCES = sorted(ROOT.rglob("*.py"))
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def room_of(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
@@ -92,7 +98,7 @@ class TestSource:
             return
         rooms = {
             parts[1]
-            for module in imported_modules(ast.parse(path.read_text()))
+            for module in imported_modules(tree_of(path))
             if (parts := module.split("."))[0] == "gateway" and len(parts) > 1
         } - {"__version__"}
         assert rooms - {room} <= MAY_IMPORT[room]
@@ -101,7 +107,7 @@ class TestSource:
         folder = str(path.relative_to(ROOT).parent)
         if room_of(path) not in PURE and folder not in PURE_FOLDERS:
             return
-        tree = ast.parse(path.read_text())
+        tree = tree_of(path)
         tops = {module.split(".")[0] for module in imported_modules(tree)}
         assert not tops & IMPURE_MODULES
         calls = {
@@ -112,13 +118,13 @@ class TestSource:
         assert not calls & {"open", "print", "input"}
 
     def test_no_module_wide_state_from_mavutil(self, path: Path) -> None:
-        assert "pymavlink.mavutil" not in imported_modules(ast.parse(path.read_text()))
+        assert "pymavlink.mavutil" not in imported_modules(tree_of(path))
 
     def test_one_idea_a_file(self, path: Path) -> None:
         assert len(path.read_text().splitlines()) <= MAX_FILE_LINES
 
     def test_short_functions(self, path: Path) -> None:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = node.body
                 if ast.get_docstring(node):
@@ -133,7 +139,7 @@ def test_no_stage_knows_an_edge() -> None:
     knowing = {
         room_of(path)
         for path in SOURCES
-        for module in imported_modules(ast.parse(path.read_text()))
+        for module in imported_modules(tree_of(path))
         if module.startswith("gateway.edges")
     }
     assert knowing <= {"edges", "flights", "daemon", "player", "cli", "config", "panel"}
@@ -153,7 +159,7 @@ def test_no_two_public_classes_share_a_name() -> None:
     names = Counter(
         node.name
         for path in SOURCES
-        for node in ast.parse(path.read_text()).body
+        for node in tree_of(path).body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert [name for name, count in names.items() if count > 1] == []
@@ -165,7 +171,7 @@ def test_imports_go_in_no_circle() -> None:
         ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in SOURCES
     }
     graph = {
-        name: imported_modules(ast.parse(path.read_text())) & modules.keys() - {name}
+        name: imported_modules(tree_of(path)) & modules.keys() - {name}
         for name, path in modules.items()
     }
     TopologicalSorter(graph).prepare()
