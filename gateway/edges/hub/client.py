@@ -168,6 +168,9 @@ class HubContext(Protocol):
     def reconfigure(self, client: Client) -> None:
         """Let a client's changed lists and rates hold."""
 
+    def note_buffer(self, client: Client, free_percent: int) -> None:
+        """Take in how much of the buffer of the radio behind a client is free."""
+
     def vanish(self, client: Client) -> None:
         """Forget a client and close it."""
 

@@ -90,8 +90,8 @@ class Express:
         if self._tap is not None:
             self._tap(frame)
 
-    def settle(self) -> int:
-        """Add what passed to the clients' own counters; return how many frames that were."""
+    def settle(self) -> tuple[int, int]:
+        """Add what passed to the clients' own counters; return how many frames and bytes."""
         frames, size = self._frames, self._bytes
         self._frames = self._bytes = 0
         self._source.counters.received += frames
@@ -99,7 +99,7 @@ class Express:
         for client in self._direct:
             client.counters.sent += frames
             client.counters.bytes_sent += size
-        return frames
+        return frames, size
 
 
 class GuardedExpress(Express):

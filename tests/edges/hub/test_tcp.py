@@ -8,6 +8,7 @@ import termios
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import common as dialect
 
 from gateway.routing.client_table import SILENT_AFTER_US
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
@@ -138,6 +139,19 @@ class TestSerial:
         await rig.until(lambda: bool(rig.incoming))
         assert rig.incoming[0].frame == said
         assert hub.clients()[0].bytes_garbage == 5
+
+    async def test_a_radio_that_tells_of_a_full_buffer_is_sent_less(
+        self, rig: Any, line: tuple[int, str]
+    ) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:57600")
+        width = hub._fanout._outlets[1].width
+        radio = rig.sender(51, 68)
+        for count, free in enumerate((100, 10), start=1):
+            report = dialect.MAVLink_radio_status_message(200, 200, free, 30, 30, 0, 0)
+            os.write(near, radio.pack(report))
+            await rig.until(lambda count=count: hub.clients()[0].received == count)
+            assert width.share == (1.0 if free == 100 else 0.7)
 
     async def test_the_attitude_overtakes_and_numbers_stay_in_order(
         self, rig: Any, line: tuple[int, str]
