@@ -147,6 +147,10 @@ class Endpoint:
         whole = self.kind in (EndpointKind.SERIAL, EndpointKind.ZENOH) or self.kind in ADDED_KINDS
         return self.host if whole else host_and_port(self.host, self.port)
 
+    def name_of(self, peer: str) -> str:
+        """Return what a caller of a listening endpoint is called, the name of the port first."""
+        return peer if self.name == self.place else f"{self.name} {peer}"
+
     def passes(self, message_id: int) -> bool:
         """Return whether the lists let a message out to this endpoint."""
         return message_id not in self.deny and (not self.allow or message_id in self.allow)

@@ -17,6 +17,8 @@ class ClientCounters:
 
     sent: int = 0
     dropped: int = 0
+    unheard: int = 0
+    """For a port at which nobody listens."""
     bytes_sent: int = 0
     received: int = 0
     bytes_received: int = 0

@@ -104,7 +104,8 @@ FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
 )
 CLIENT_COUNTERS: Final = (
     ("sent", "Frames sent to a client."),
-    ("dropped", "Frames that did not reach a client: it is too slow, or nobody listens there."),
+    ("dropped", "Frames given up: the client is too slow for them, or out of reach."),
+    ("unheard", "Frames for a port at which nobody listened, as before a station is started."),
     (
         "bytes_sent",
         "Bytes sent to a client; the rate against the width of its link tells its load.",
