@@ -157,6 +157,7 @@ def families(snapshot: Snapshot) -> Iterator[Metric]:
         Names begin with `mavgate_`; what is not known is left out.
     """
     yield from _gateway(snapshot)
+    yield from _refusals(snapshot)
     yield from _nodes(snapshot.report.nodes, snapshot.time_us)
     yield from _boards(snapshot)
     yield from _vehicles(snapshot.states)
@@ -210,6 +211,9 @@ def _gateway(snapshot: Snapshot) -> Iterator[Metric]:
         ("kind",),
         [((kind,), float(count)) for kind, count in report.faults],
     )
+
+
+def _refusals(snapshot: Snapshot) -> Iterator[Metric]:
     for name, count, text in (
         (
             "places_not_kept",

@@ -92,6 +92,26 @@ class TestTcpListen:
 
 
 class TestTcpOut:
+    async def test_a_connection_to_itself_is_a_refusal(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The kernel may draw the wanted port, where nobody listens, as our own."""
+        loop = asyncio.get_running_loop()
+        connect = loop.sock_connect
+
+        async def from_there(sock: socket.socket, address: tuple[str, int]) -> None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            await connect(sock, address)
+
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        monkeypatch.setattr(loop, "sock_connect", from_there)
+        hub = rig.hub(f"tcp:127.0.0.1:{port}")
+        await rig.until(lambda: hub.clients()[0].state in ("refused", "open"))
+        assert hub.clients()[0].state == "refused"
+
     async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
         self, rig: Any
     ) -> None:

@@ -168,6 +168,28 @@ class TestServer:
         server.listen(0)
         assert (server.port, server.listeners()) == (0, ())
 
+    async def test_idle_connections_are_no_more_than_a_few(self) -> None:
+        server = MetricsServer(lambda: SNAPSHOT)
+        server.listen(_free_port())
+        idle = [
+            await asyncio.open_connection("127.0.0.1", server.port)
+            for _ in range(prometheus.MAX_CONNECTIONS)
+        ]
+        while server.listeners()[0].clients < prometheus.MAX_CONNECTIONS:
+            await asyncio.sleep(0)
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        assert await asyncio.wait_for(reader.read(), 5) == b"", "closed without a word"
+        writer.close()
+        idle[0][1].close()
+        while server.listeners()[0].clients == prometheus.MAX_CONNECTIONS:
+            await asyncio.sleep(0)
+        assert (await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 200")
+        for _, other in idle[1:]:
+            other.close()
+        server.close()
+        while any(task.get_coro().__name__ == "_serve" for task in asyncio.all_tasks()):
+            await asyncio.sleep(0)
+
     async def test_a_taken_port_is_told_and_used_when_it_is_free(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
