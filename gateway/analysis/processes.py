@@ -10,6 +10,9 @@ from typing import Any, Final
 
 START: Final = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 
+WAIT_S: Final = 0.2
+"""Between two looks at whether processes have ended."""
+
 
 def cores() -> int:
     """Count the cores that this process may use."""
@@ -40,17 +43,24 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
         yield pool
 
 
-def run_copies(work: Callable[[Any], None], arguments: Iterable[Any]) -> None:
+def run_copies(
+    work: Callable[[Any], None],
+    arguments: Iterable[Any],
+    while_waiting: Callable[[], None] = lambda: None,
+) -> None:
     """Do a work in one process an argument, and wait; one that is killed is not waited for.
 
-    Unlike those of a pool, they end by themselves where this process is killed.
+    Unlike those of a pool, they end by themselves where this process is killed. `while_waiting` is
+    called some times a second.
     """
     processes = [multiprocessing.Process(target=work, args=(a,), daemon=True) for a in arguments]
     with _no_warning_of_threads():
         for process in processes:
             process.start()
     for process in processes:
-        process.join()
+        while process.exitcode is None:
+            process.join(WAIT_S)
+            while_waiting()
 
 
 @contextmanager

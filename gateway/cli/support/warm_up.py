@@ -3,11 +3,15 @@
 import logging
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores, run_copies
+from gateway.cli.support.terminal import console_of
 from gateway.compiled import is_kept
 from gateway.estimation.complementary import complementary_live
 from gateway.estimation.eskf import eskf_live
@@ -40,14 +44,33 @@ def make_ready(estimator: str) -> None:
         return
     log.info("compiling the estimators, up to a minute; later starts take a second")
     begin = time.monotonic()
-    if cores() > 1:
-        # A process each; this one then finds the code that they have kept, or makes it itself.
-        run_copies(_rehearse_apart, OWN_ESTIMATORS)
-    for name in OWN_ESTIMATORS:
-        if name != estimator:
+    with _bar() as show:
+        if cores() > 1:
+            # A process each; this one then finds the code that they have kept, or makes it itself.
+            run_copies(_rehearse_apart, OWN_ESTIMATORS, show)
+        for name in (*OWN_ESTIMATORS, estimator):
             _rehearse(name)
-    _rehearse(estimator)
+            show()
     log.info("compiled in %.0f s", time.monotonic() - begin)
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[], None]]:
+    """Show on a terminal how many estimators are done, and that the others are worked at."""
+    console = console_of(stderr=True)
+    # No thread of its own: the processes that compile are forked from this one.
+    with Progress(
+        TextColumn("compiling the estimators, this once"), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), console=console, transient=True, auto_refresh=False,
+        disable=not console.is_terminal,
+    ) as progress:  # fmt: skip
+        task = progress.add_task("", total=len(STEPS))
+
+        def show() -> None:
+            progress.update(task, completed=sum(is_kept(step) for step in STEPS), refresh=True)
+
+        show()
+        yield show
 
 
 def _rehearse_apart(name: str) -> None:
