@@ -1,8 +1,9 @@
-"""A track for a map: KML and GPX, written piece by piece so that any length fits the memory."""
+"""Tracks for maps: all vehicles of a flight with what happened, as KML and GPX."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import StrEnum
 from typing import Final
 from xml.sax.saxutils import escape
 
@@ -10,6 +11,8 @@ from gateway.units import US_PER_S
 
 INTERVAL_US: Final = US_PER_S // 5
 """A map shows no more than five points a second."""
+COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
+"""Of the vehicles' lines: alpha, blue, green, red."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +24,34 @@ class TrackPoint:
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
+    attitude_deg: tuple[float, float, float] | None = None
+    """Roll, pitch and yaw, where they are known."""
+
+
+class PlaceKind(StrEnum):
+    """What a single place on the map stands for."""
+
+    HOME = "home"
+    MARK = "mark"
+    EVENT = "event"
+
+
+@dataclass(frozen=True, slots=True)
+class MapPlace:
+    """Home, a mark, or where the vehicle was when something happened."""
+
+    kind: PlaceKind
+    name: str
+    at: TrackPoint
+
+
+@dataclass(slots=True)
+class VehicleTrack:
+    """One vehicle on the map."""
+
+    name: str
+    points: list[TrackPoint] = field(default_factory=list)
+    places: list[MapPlace] = field(default_factory=list)
 
 
 def thin_out(points: Iterable[TrackPoint], interval_us: int = INTERVAL_US) -> Iterator[TrackPoint]:
@@ -32,15 +63,15 @@ def thin_out(points: Iterable[TrackPoint], interval_us: int = INTERVAL_US) -> It
             yield point
 
 
-def to_kml(name: str, points: Iterable[TrackPoint]) -> Iterator[str]:
-    """Write a track as KML 2.2: a line with times, at its height above the sea.
+def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
+    """Write a flight as KML 2.2: a folder a vehicle, its track with times and attitude, its places.
 
     Parameters
     ----------
     name : str
-        What the map calls it.
-    points : iterable of TrackPoint
-        In the order of their times.
+        What the map calls the flight.
+    vehicles : iterable of VehicleTrack
+        Each with its points in the order of their times.
 
     Yields
     ------
@@ -52,31 +83,99 @@ def to_kml(name: str, points: Iterable[TrackPoint]) -> Iterator[str]:
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
         'xmlns:gx="http://www.google.com/kml/ext/2.2">\n'
         f"<Document><name>{escape(name)}</name>\n"
-        '<Style id="track"><LineStyle><color>ff0000ff</color><width>3</width></LineStyle></Style>\n'
-        f"<Placemark><name>{escape(name)}</name><styleUrl>#track</styleUrl>\n"
+    )
+    yield from (
+        f'<Style id="track{number}"><LineStyle><color>{colour}</color><width>3</width></LineStyle>'
+        "</Style>\n"
+        for number, colour in enumerate(COLOURS)
+    )
+    for number, vehicle in enumerate(vehicles):
+        yield f"<Folder><name>{escape(vehicle.name)}</name>\n"
+        yield from _kml_track(vehicle, f"#track{number % len(COLOURS)}")
+        yield from map(_kml_place, vehicle.places)
+        yield "</Folder>\n"
+    yield "</Document></kml>\n"
+
+
+def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
+    yield (
+        f"<Placemark><name>{escape(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
         "<gx:Track><altitudeMode>absolute</altitudeMode>\n"
     )
-    for point in points:
-        yield (
-            f"<when>{_iso(point.time_us)}</when>"
-            f"<gx:coord>{point.lon_deg:.7f} {point.lat_deg:.7f} {point.alt_amsl_m:.2f}</gx:coord>\n"
-        )
-    yield "</gx:Track></Placemark></Document></kml>\n"
+    yield from (f"<when>{_iso(point.time_us)}</when>\n" for point in vehicle.points)
+    yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in vehicle.points)
+    if any(point.attitude_deg is not None for point in vehicle.points):
+        # Heading, tilt, roll; an empty element stands for "not known here".
+        yield from (f"<gx:angles>{_kml_angles(p)}</gx:angles>\n" for p in vehicle.points)
+    yield "</gx:Track></Placemark>\n"
 
 
-def to_gpx(name: str, points: Iterable[TrackPoint]) -> Iterator[str]:
-    """Write a track as GPX 1.1; see `to_kml`."""
+def _kml_place(place: MapPlace) -> str:
+    return (
+        f"<Placemark><name>{escape(place.name)}</name><description>{place.kind}</description>"
+        f"<TimeStamp><when>{_iso(place.at.time_us)}</when></TimeStamp>"
+        "<Point><altitudeMode>absolute</altitudeMode>"
+        f"<coordinates>{_kml_coordinates(place.at, ',')}</coordinates></Point></Placemark>\n"
+    )
+
+
+def _kml_coordinates(point: TrackPoint, separator: str) -> str:
+    figures = (f"{point.lon_deg:.7f}", f"{point.lat_deg:.7f}", f"{point.alt_amsl_m:.2f}")
+    return separator.join(figures)
+
+
+def _kml_angles(point: TrackPoint) -> str:
+    if point.attitude_deg is None:
+        return ""
+    roll, pitch, yaw = point.attitude_deg
+    return f"{yaw % 360.0:.1f} {pitch:.1f} {roll:.1f}"
+
+
+def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
+    """Write a flight as GPX 1.1; see `to_kml`.
+
+    Places are waypoints. GPX knows no attitude: it stands among the extensions of each point, in a
+    namespace of its own, which other programs step over.
+    """
+    vehicles = list(vehicles)
     yield (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
-        '<gpx version="1.1" creator="mavgate" xmlns="http://www.topografix.com/GPX/1/1">\n'
-        f"<trk><name>{escape(name)}</name><trkseg>\n"
+        '<gpx version="1.1" creator="mavgate" xmlns="http://www.topografix.com/GPX/1/1" '
+        'xmlns:mavgate="urn:mavgate:attitude:1">\n'
+        f"<metadata><name>{escape(name)}</name></metadata>\n"
     )
-    for point in points:
-        yield (
-            f'<trkpt lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}">'
-            f"<ele>{point.alt_amsl_m:.2f}</ele><time>{_iso(point.time_us)}</time></trkpt>\n"
+    for vehicle in vehicles:
+        yield from (
+            f"<wpt {_gpx_place(place.at)}{_gpx_time(place.at)}<name>{escape(place.name)}</name>"
+            f"<desc>{escape(vehicle.name)}</desc><type>{place.kind}</type></wpt>\n"
+            for place in vehicle.places
         )
-    yield "</trkseg></trk></gpx>\n"
+    for vehicle in vehicles:
+        yield f"<trk><name>{escape(vehicle.name)}</name><trkseg>\n"
+        yield from (
+            f"<trkpt {_gpx_place(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
+            for p in vehicle.points
+        )
+        yield "</trkseg></trk>\n"
+    yield "</gpx>\n"
+
+
+def _gpx_place(point: TrackPoint) -> str:
+    return f'lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}"><ele>{point.alt_amsl_m:.2f}</ele>'
+
+
+def _gpx_time(point: TrackPoint) -> str:
+    return f"<time>{_iso(point.time_us)}</time>"
+
+
+def _gpx_attitude(point: TrackPoint) -> str:
+    if point.attitude_deg is None:
+        return ""
+    roll, pitch, yaw = point.attitude_deg
+    return (
+        f'<extensions><mavgate:attitude roll="{roll:.1f}" pitch="{pitch:.1f}" '
+        f'yaw="{yaw % 360.0:.1f}"/></extensions>'
+    )
 
 
 def _iso(unix_us: int) -> str:

@@ -37,7 +37,6 @@ from gateway.records import (
     GpsFix,
     ImuCalibrated,
     ImuRaw,
-    NavFlags,
     NavState,
     NodeStatus,
 )
@@ -237,19 +236,6 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
             _moved(row.imu, shift_us),
             _moved(row.state, shift_us),
         )
-
-
-def points_of_rows(table: RecordedTable) -> Iterator[TrackPoint]:
-    """Yield the fused positions of a table; its fixes where it has no states."""
-    zero_us = table.header.unix_us_at_zero or 0
-    for row in table.plain_rows:
-        state, fix = row.state, row.gps
-        if state is not None and NavFlags.POSITION_VALID in state.flags:
-            time_us = zero_us + row.time_us
-            yield TrackPoint(time_us, state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        elif state is None and fix is not None and fix.fix_ok:
-            lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
-            yield TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
 
 
 def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:

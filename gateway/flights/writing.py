@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 
 from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.flightlog.mapshape import TrackPoint, thin_out, to_gpx, to_kml
+from gateway.flightlog.mapshape import VehicleTrack, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import (
@@ -17,16 +17,16 @@ from gateway.flightlog.table.table import (
     encode_line,
 )
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import (
     NO_RECORDING,
     FlightError,
     Line,
     ReadOptions,
     RecordedTable,
+    aircraft_of,
     joined_rows,
     open_rows,
-    points_of_frames,
-    points_of_rows,
     recorded_frames,
 )
 from gateway.flights.refusion import Refusion
@@ -147,22 +147,22 @@ def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
 
 
 def _write_kml(flight: FlightToWrite) -> Iterator[bytes]:
-    return (piece.encode() for piece in to_kml(flight.title, _points(flight)))
+    return (piece.encode() for piece in to_kml(flight.title, _vehicles(flight)))
 
 
 def _write_gpx(flight: FlightToWrite) -> Iterator[bytes]:
-    return (piece.encode() for piece in to_gpx(flight.title, _points(flight)))
+    return (piece.encode() for piece in to_gpx(flight.title, _vehicles(flight)))
 
 
-def _points(flight: FlightToWrite) -> Iterator[TrackPoint]:
+def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
     if flight.is_mavlink:
-        points = points_of_frames(flight.frames(), flight.options.system_id)
+        found = tracks_of_frames(flight.frames(), flight.options.system_id)
     else:
-        points = points_of_rows(flight.table())
-    first = next(points, None)
-    if first is None:
+        table = flight.table()
+        found = tracks_of_table(table, aircraft_of(table, flight.options))
+    if not found:
         raise FlightError(f"{flight.title}: nothing to draw, for the flight tells no position")
-    return thin_out(chain([first], points))
+    return found
 
 
 add_writer(".tlog", _write_tlog)
