@@ -6,14 +6,16 @@
 
 .PHONY: demo test lint deb lock firmware clean
 
+BROWSER_PACKAGES := chromium
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck
 
 demo: .venv/.run
 	.venv/bin/mavgate demo
 
-# Tests that need the AVR tool chain skip, and say so, where it could not be installed.
+# Tests that need the AVR tool chain or a browser skip, and say so, where it could not be installed.
 test: .venv/.dev
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
+	-@tools/apt_install.sh $(BROWSER_PACKAGES)
 	.venv/bin/pytest -q -n 2 --dist loadgroup
 
 lint: .venv/.dev

@@ -218,11 +218,6 @@ class Daemon:
             places_not_kept=self._places.failures,
             refused=self._pipeline.refused,
             forged=self._pipeline.forged,
-            marks=tuple(
-                (key, mark.lat_deg, mark.lon_deg, mark.alt_amsl_m)
-                for key, a in aircraft
-                if (mark := a.vehicle.mark) is not None
-            ),
             simulated=self._receiver is not None,
             aircraft=tuple(_status_of(one) for _, one in aircraft),
             recorder=self._recorder.status(),

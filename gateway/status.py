@@ -63,8 +63,6 @@ class Snapshot:
     """Requests to change something, of clients that may not."""
     forged: int = 0
     """Requests whose signature was wrong, old, or there before."""
-    marks: tuple[tuple[int, float, float, float], ...] = ()
-    """Vehicle id, latitude, longitude in degrees and height AMSL in m of each marked place."""
     simulated: bool = False
     """Whether the receiver is the simulated one."""
     aircraft: tuple[AircraftStatus, ...] = ()

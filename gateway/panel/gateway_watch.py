@@ -51,21 +51,24 @@ class GatewayWatch:
         """Ask now."""
         try:
             status = await self._control.ask("status")
-            self.recorder = await self._control.ask("record.status")
         except ControlError:
             self.status = self.before = self.recorder = None
             return
-        self.before, self.status = self.status, status
-        marks = {
-            system_id: Spot(lat_deg, lon_deg, NAN if alt_amsl_m is None else alt_amsl_m)
-            for system_id, lat_deg, lon_deg, alt_amsl_m in status["marks"]
-        }
-        for system_id, vehicle in self._fleet.vehicles.items():
-            if system_id in marks or any(system_id == key for key, _ in status["states"]):
-                vehicle.told_mark = marks.get(system_id)
+        self.before, self.status, self.recorder = self.status, status, status["recorder"]
+        for aircraft in status["aircraft"]:
+            vehicle = self._fleet.vehicles.get(aircraft["vehicle_id"])
+            if vehicle is not None:
+                vehicle.told_mark = _spot_of(aircraft["mark"])
 
     async def _watch(self) -> None:
         while True:
             with suppress(OSError):
                 await self.refresh()
             await asyncio.sleep(INTERVAL_S)
+
+
+def _spot_of(mark: dict[str, Any] | None) -> Spot | None:
+    if mark is None:
+        return None
+    alt_amsl_m = NAN if mark["alt_amsl_m"] is None else mark["alt_amsl_m"]
+    return Spot(mark["lat_deg"], mark["lon_deg"], alt_amsl_m)

@@ -1,6 +1,7 @@
 """The panel's process: builds the parts, serves the page, ends them in order."""
 
 import asyncio
+import errno
 import hashlib
 import inspect
 import logging
@@ -12,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import uvicorn
 from fastapi import FastAPI
 from nicegui import ui
@@ -85,7 +87,7 @@ def run_panel(
         If the port or the certificate cannot be used.
     """
     os.nice(NICENESS)
-    sock = _bound(settings)
+    sock = _bound(settings, or_any=attached)
     parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
     lock = PageLock(settings.password, settings.viewer_password)
@@ -210,7 +212,7 @@ def _end_with_input(server: uvicorn.Server) -> None:
     loop.add_reader(source, on_input)
 
 
-def _bound(settings: PanelSettings) -> socket.socket:
+def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:
     family = socket.AF_INET6 if ":" in settings.address else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -219,6 +221,9 @@ def _bound(settings: PanelSettings) -> socket.socket:
     except OSError as error:
         sock.close()
         place = f"{settings.address}:{settings.port}"
+        if or_any and error.errno == errno.EADDRINUSE:
+            log.warning("%s is in use; the panel takes another port", place)
+            return _bound(msgspec.structs.replace(settings, port=0), or_any=False)
         raise PanelError(f"panel on {place}: {error.strerror}; --port takes another") from error
     return sock
 

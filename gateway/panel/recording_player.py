@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 RECORDED_ID: Final = 201
 TWIN_ID: Final = 202
 """Beyond the 31 of a gateway's aircraft, below the ground stations'."""
-READY_S: Final = 60.0
+READY_S: Final = 120.0
 """A table of hours is opened in some seconds; a first start compiles."""
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25

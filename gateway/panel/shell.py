@@ -85,7 +85,8 @@ class _Page:
         self._panels: dict[str, ui.element] = {}
         self._buttons: dict[str, ui.button] = {}
         self._dark = ui.dark_mode(None)
-        self._shown_ids: list[int] = []
+        self._names: dict[int, str] = {}
+        self._chips: list[tuple[str, str]] = []
 
     def build(self) -> None:
         """Make everything; a view is made when it is shown first."""
@@ -104,6 +105,7 @@ class _Page:
         ui.timer(STATE_S, self._refresh)
         self._refresh()
         self.show(VIEWS[0].key)
+        ui.run_javascript(f"mavgate.units = {self._context.units.system!r}")
         ui.on("view", lambda event: self.show(event.args))
 
     def show(self, key: str) -> None:
@@ -167,23 +169,23 @@ class _Page:
 
     def _on_choice(self, event: Any) -> None:
         self._context.select(event.value)
-        ui.run_javascript(f"mavgate.select({event.value})")
+        ui.run_javascript(f"mavgate.select({'null' if event.value is None else event.value})")
 
     def _refresh(self) -> None:
         fleet, context = self._context.fleet, self._context
-        ids = sorted(fleet.vehicles)
-        if ids != self._shown_ids:
-            self._shown_ids = ids
-            if context.system_id not in ids:
-                context.system_id = None
-            names = {key: fleet.vehicles[key].title for key in ids}
-            self._choice.set_options(names)
-            if context.system_id is None and ids:
-                self._choice.value = ids[0]
-        self._state.clear()
-        with self._state:
-            for text, kind in _state_of(context):
-                ui.label(text).classes(f"chip {kind}")
+        names = {key: fleet.vehicles[key].title for key in sorted(fleet.vehicles)}
+        if names != self._names:
+            played = [key for key in names.keys() - self._names.keys() if key in fleet.origins]
+            self._names = names
+            wanted = min(played, default=context.system_id)
+            first = next(iter(names), None)
+            self._choice.set_options(names, value=wanted if wanted in names else first)
+        if (chips := _state_of(context)) != self._chips:
+            self._chips = chips
+            self._state.clear()
+            with self._state:
+                for text, kind in chips:
+                    ui.label(text).classes(f"chip {kind}")
 
 
 def _mode_of(context: ViewContext) -> str:

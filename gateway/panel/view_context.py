@@ -7,7 +7,7 @@ One `ViewContext` belongs to one open page (browser tab).
 Two ways lead from the aircraft to the screen:
 
 *What moves* is drawn in the browser. The page opens one WebSocket (`feed.py`), over which the
-`Instant` of every aircraft comes up to 25 times a second, and hands it to `window.mavgate`:
+`Instant` of every aircraft comes up to 30 times a second, and hands it to `window.mavgate`:
 
     const stop = mavgate.subscribe((state) => { ... });   // state: newest Instant, by its names
     mavgate.state          the selected aircraft's newest, or null

@@ -297,11 +297,6 @@ class Vehicle:
         answers = self._recording.update(trouble, now_us, recording=recording)
         return self._finish(answers) if answers else []
 
-    @property
-    def mark(self) -> Place | None:
-        """The marked place."""
-        return self.places.mark.place
-
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
         """Mark a place (its height may be NaN), or clear the mark.
 

@@ -25,6 +25,7 @@ ARGUMENTS = [
 Found = TypeVar("Found")
 START_LIMIT_S = 120.0
 """A first start compiles."""
+START_LIMIT_MS = 120_000
 WAIT_MS = 30_000
 """What is on the page by then, or not: a busy machine is slow, and nothing here sleeps."""
 DESKTOP = {"width": 1440, "height": 900}
@@ -42,8 +43,8 @@ gps_first_fix_s = 0.5
 port = 0
 tiles_folder = "{folder}/tiles"
 map_styles = [
-  {{name = "Field", url = "{folder}/field.mbtiles"}},
-  {{name = "Other", url = "{folder}/other.mbtiles"}},
+  {{name = "Field", url = "{folder}/field.mbtiles", max_zoom = 4}},
+  {{name = "Other", url = "{folder}/other.mbtiles", max_zoom = 4}},
 ]
 """
 

@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from gateway.edges.operator.control_socket import request
-from tests.panel.browsing import WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
 
 pytestmark = [
     pytest.mark.io,
@@ -66,9 +66,9 @@ def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
     step = view.locator("canvas.map-grid").get_attribute("data-step")
     for _ in range(3):
         view.locator(".leaflet-control-zoom-out").click()
-        page.wait_for_timeout(300)
-    wide = view.locator("canvas.map-grid").get_attribute("data-step")
-    assert float(wide or 0) > float(step or 0)
+    page.wait_for_function(
+        f"document.querySelector('[data-view=map] .map-grid').dataset.step > {float(step or 0)}"
+    )
     expect(view.locator(".craft[data-selected='true']")).to_be_visible()
     expect(view.locator(".pin.home")).to_be_visible()
 
@@ -97,10 +97,10 @@ def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
     )
     expect(view.locator(".pin.mark")).to_be_visible()
     socket = demo.log.parent / "mavgate" / "run.sock"
-    ((vehicle_id, lat_deg, lon_deg, _),) = request(socket, "status")["marks"]
+    (aircraft,) = request(socket, "status")["aircraft"]
     told = json.loads(page.evaluate("JSON.stringify(mavgate.state.mark)"))
-    assert vehicle_id == 1
-    assert (told["lat_deg"], told["lon_deg"]) == pytest.approx((lat_deg, lon_deg), abs=2e-7)
+    where = (aircraft["mark"]["lat_deg"], aircraft["mark"]["lon_deg"])
+    assert (told["lat_deg"], told["lon_deg"]) == pytest.approx(where, abs=2e-7)
     canvas.click(position={"x": 400, "y": 300})
     page.get_by_text("Clear the mark").click()
     expect(view.locator("[data-role='way']")).to_have_count(0)
@@ -118,9 +118,11 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
     state = view.locator("[data-role='recorder']")
     expect(state).to_have_text("idle")
     view.get_by_label("Start recording").click()
+    page.evaluate("window.begun_us = mavgate.state.time_us")
     expect(state).to_have_text("recording")
     expect(page.locator(".chips").get_by_text("REC")).to_be_visible()
-    page.wait_for_timeout(6000)
+    # Longer than two heartbeats, so that the recording tells what flies.
+    page.wait_for_function("mavgate.state.time_us > window.begun_us + 5e6")
     view.get_by_label("Stop recording").click()
     expect(state).to_have_text("idle")
     view.get_by_label("Name of the recording").fill("morning flight")
@@ -165,7 +167,11 @@ def _move_in_time(page: Page, row: object) -> None:
     expect(slider).to_have_attribute("aria-valuenow", half)
     page.wait_for_function("Object.values(mavgate.vehicles).some((v) => v.origin === 'recorded')")
     view.get_by_text("re-fused twin").click()
-    page.wait_for_function("Object.values(mavgate.vehicles).some((v) => v.origin === 're-fused')")
+    # The table is fused by a process that may have to compile first.
+    page.wait_for_function(
+        "Object.values(mavgate.vehicles).some((v) => v.origin === 're-fused')",
+        timeout=START_LIMIT_MS,
+    )
     expect(slider).to_be_visible()
     view.get_by_label("Close the recording").click()
     expect(slider).to_be_hidden()

@@ -1,4 +1,4 @@
-"""One moment of one aircraft, in SI units: what the browser draws, 25 times a second."""
+"""One moment of one aircraft, in SI units: what the browser draws, 30 times a second."""
 
 import msgspec
 

@@ -20,8 +20,8 @@ class FlightScene(Element, component=WEB / "flight_scene.js"):
 def build(context: ViewContext) -> None:
     """Build the view."""
     with ui.element("div").classes("flight"):
-        with ui.element("div").classes("flight-display card"):
-            FlightDisplay()
+        with ui.element("div").classes("flight-instruments card"):
+            FlightDisplay().classes("fill")
         with ui.element("div").classes("flight-map card"):
             FlightMap(context, full=False)
         with ui.element("div").classes("flight-scene card"):

@@ -9,6 +9,8 @@ const TAIL = 6000; // points of a path
 const STEP_M = 1.5; // between them
 const AHEAD_S = 0.25; // no pose is foretold further
 const FRAME_MS = 30;
+const SLOWEST_MS = 300;
+const LATE_MS = 45; // between two turns of the browser's own
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "Beside" };
 const SPAN_M = 2; // of the models
 const COLOURS = { recorded: "recorded", "re-fused": "twin" };
@@ -188,7 +190,8 @@ export default {
     this.renderer.setScissorTest(true);
     this.aircraft = {};
     this.origin = null;
-    this.drawn_ms = 0;
+    this.drawn_ms = this.asked_ms = 0;
+    this.pace_ms = FRAME_MS;
     this.swing = { azimuth: 0, elevation: 14, distance: 6.5 };
     this.build_world();
     this.observer = new ResizeObserver(() => this.resize());
@@ -201,7 +204,11 @@ export default {
     this.resize();
     const draw = (now_ms) => {
       this.handle = requestAnimationFrame(draw);
-      if (now_ms - this.drawn_ms < FRAME_MS || !this.$el.offsetParent) return;
+      // A machine that draws in software falls behind: then the 3D gives way to the instruments.
+      const late = now_ms - this.asked_ms > LATE_MS;
+      this.asked_ms = now_ms;
+      this.pace_ms = Math.min(SLOWEST_MS, Math.max(FRAME_MS, this.pace_ms * (late ? 1.25 : 0.97)));
+      if (now_ms - this.drawn_ms < this.pace_ms || !this.$el.offsetParent) return;
       this.drawn_ms = now_ms;
       this.draw();
     };
@@ -234,9 +241,9 @@ export default {
       }
       const home = new THREE.Group();
       this.pad = new THREE.Mesh(new THREE.RingGeometry(2.2, 3, 40), new THREE.MeshBasicMaterial({ side: THREE.DoubleSide }));
-      this.pole = new THREE.Mesh(new THREE.CylinderGeometry(0.12, 0.12, 6, 8), new THREE.MeshBasicMaterial());
+      this.pole = new THREE.Mesh(new THREE.CylinderGeometry(0.03, 0.03, 2, 8), new THREE.MeshBasicMaterial());
       this.pole.rotation.x = Math.PI / 2;
-      this.pole.position.z = 3;
+      this.pole.position.z = 1;
       home.add(this.pad, this.pole);
       this.beacon = new THREE.Mesh(new THREE.CylinderGeometry(0.5, 0.5, 60, 10), new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.55 }));
       this.beacon.rotation.x = Math.PI / 2;
@@ -361,6 +368,7 @@ export default {
       for (const craft of Object.values(this.aircraft)) if (craft.state) this.pose(craft, now_ms);
       const craft = this.aircraft[mavgate.selected];
       const { clientWidth: width, clientHeight: height } = this.canvas;
+      if (craft?.shown) this.fine.position.set(...[craft.shown.x, craft.shown.y].map((v) => Math.round(v / 10) * 10), 0);
       const stacked = height > width * 0.75;
       this.views.forEach((view, i) => {
         const camera = this.cameras[i];

@@ -1,0 +1,72 @@
+"""Draw docs/pictures/panel_*.png: the panel on the simulated flight, in a real Chromium."""
+
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from playwright.sync_api import Page, sync_playwright
+
+PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+START_S = 180.0
+AIRBORNE_M = 60.0
+CONFIG = """
+aircraft_folder = "{folder}/aircraft"
+[hub]
+endpoints = []
+[recording]
+folder = "{folder}/recordings"
+[panel]
+port = 0
+tiles_folder = "{folder}/tiles"
+map_styles = []
+"""
+SHOTS = (("flight", "dark"), ("map", "light"))
+SIZE = {"width": 1440, "height": 900}
+
+
+def draw(page: Page, view: str) -> None:
+    """Wait until something flies, and photograph a view."""
+    page.wait_for_function(
+        f"mavgate.state && mavgate.state.alt_home_m > {AIRBORNE_M}", timeout=START_S * 1000
+    )
+    page.locator(f".rail button[data-view='{view}']").click()
+    page.wait_for_timeout(4000)
+    target = PICTURES / f"panel_{view}.png"
+    page.screenshot(path=target)
+    print(target)
+
+
+def main() -> None:
+    """Start the demo, draw, end it."""
+    with tempfile.TemporaryDirectory() as folder:
+        config, log = Path(folder, "gateway.toml"), Path(folder, "log")
+        config.write_text(CONFIG.format(folder=folder))
+        command = [sys.executable, "-m", "gateway.cli", "demo", "--plain", "--config", str(config)]
+        with log.open("w") as output:
+            demo = subprocess.Popen(command, stdout=output, stderr=output)
+        try:
+            until = time.monotonic() + START_S
+            while not (link := re.search(r"panel: (http://\S+)", log.read_text())):
+                if time.monotonic() > until:
+                    sys.exit(log.read_text())
+                time.sleep(0.2)
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+                for view, scheme in SHOTS:
+                    page = browser.new_page(viewport=SIZE, color_scheme=scheme)
+                    page.goto(link[1])
+                    draw(page, view)
+                    page.close()
+                browser.close()
+        finally:
+            demo.terminate()
+            demo.wait(20)
+
+
+if __name__ == "__main__":
+    main()
