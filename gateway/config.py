@@ -18,6 +18,7 @@ import tomlkit
 from gateway.aircraft import AircraftSettings
 from gateway.edges.receiver.serial_port import SerialSettings
 from gateway.estimation.select import EstimationSettings
+from gateway.fleet.fleet_settings import FleetSettings
 from gateway.flightlog.session import RecordingSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
@@ -41,6 +42,7 @@ class GatewaySettings(Settings, frozen=True):
     estimation: EstimationSettings = EstimationSettings()
     recording: RecordingSettings = RecordingSettings()
     panel: PanelSettings = PanelSettings()
+    fleet: FleetSettings = FleetSettings()
     simulator: SimulatorSettings = SimulatorSettings()
     aircraft_folder: Annotated[
         str,

@@ -37,7 +37,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"wire", "vehicle", "flightlog", "routing", "simulator", "status", "output"},
     "analysis": FOUNDATION | STAGES | JOINED | {"replay", "output"},
     "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis"},
-    "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "output"},
+    "fleet": FOUNDATION | STAGES | {"edges"},
+    "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "fleet", "output"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
     "extensions": set(),
     "player": FOUNDATION | STAGES | JOINED | {"edges", "flights", "config"},
@@ -45,7 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"replay", "status", "edges", "flights", "config", "daemon", "player", "analysis"}
-    | {"extensions", "panel", "output"},
+    | {"extensions", "panel", "fleet", "output"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
@@ -142,7 +143,7 @@ def test_no_stage_knows_an_edge() -> None:
         for module in imported_modules(tree_of(path))
         if module.startswith("gateway.edges")
     }
-    assert knowing <= {"edges", "flights", "daemon", "player", "cli", "config", "panel"}
+    assert knowing <= {"edges", "flights", "daemon", "player", "cli", "config", "panel", "fleet"}
 
 
 def test_no_folder_outgrows_a_glance() -> None:

@@ -37,6 +37,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "live.panel",
         "Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.",
     ),
+    "fleet": CommandEntry(
+        "live.fleet", "Show the vehicles of many sites here, through a Zenoh router."
+    ),
     "calibrate": CommandEntry(
         "live.calibrate",
         "Calibrate an aircraft's sensors and save the result with its residuals.",

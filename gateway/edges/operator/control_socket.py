@@ -32,7 +32,11 @@ GROUP: Final = "mavgate"
 MOST_GATEWAYS: Final = 9
 """Of one user that can be told apart: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
-STARTERS: Final = {"run": "`mavgate run` or `mavgate demo`", "play": "`mavgate play`"}
+STARTERS: Final = {
+    "run": "`mavgate run` or `mavgate demo`",
+    "play": "`mavgate play`",
+    "fleet": "`mavgate fleet`",
+}
 """What opens which socket."""
 
 _CREDENTIALS: Final = struct.Struct("3i")

@@ -1,0 +1,165 @@
+"""Frames of a site with the ids that its vehicles have here, and back.
+
+Changed are the sender in the header and the system that a message addresses; the checksum is made
+anew. A signature covers both: with the site's key it is checked first and made anew, with the link
+and the time stamp that it had; without the key a signed frame passes only if nothing changes.
+"""
+
+import hashlib
+import hmac
+from dataclasses import dataclass
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx
+
+from gateway.fleet.id_map import IdMap
+from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
+from gateway.wire.mavlink_splitter import (
+    SIGNATURE_SIZE,
+    START_V2,
+    is_signed,
+    message_id_of,
+    origin_of,
+    sequence_of,
+    target_of,
+)
+
+HASH_BYTES: Final = 6
+SEQUENCE_MASK: Final = 0xFF
+MAX_LOST: Final = 128
+"""A greater step is a restart rather than a loss."""
+
+
+@dataclass(slots=True)
+class TranslationCounters:
+    """Frames that could not pass."""
+
+    unmapped: int = 0
+    """No id is left for their vehicle."""
+    unknown: int = 0
+    """Their message is unknown, so that no checksum can be made."""
+    signed: int = 0
+    """They are signed, would change, and there is no passphrase."""
+    forged: int = 0
+    """Their signature is not of the site's passphrase."""
+
+
+@dataclass(slots=True)
+class VehicleTraffic:
+    """What came of one vehicle."""
+
+    frames: int = 0
+    lost: int = 0
+    """By the gaps in its sequence numbers."""
+    heard_us: int = 0
+    since_us: int = 0
+
+
+class _CannotPassError(Exception):
+    """A frame stays here; the argument names the counter."""
+
+
+class FrameTranslation:
+    """The frames of one site.
+
+    Parameters
+    ----------
+    site : str
+        Its name.
+    ids : IdMap
+        Shared by all sites.
+    key : bytes, optional
+        32 bytes, of the site's passphrase.
+    """
+
+    def __init__(self, site: str, ids: IdMap, key: bytes | None = None) -> None:
+        self._site = site
+        self._ids = ids
+        self._key = key
+        self._sequences: dict[tuple[int, int], int] = {}
+        self.counters = TranslationCounters()
+        self.traffic: dict[int, VehicleTraffic] = {}
+        """By system id at the site."""
+
+    def from_site(self, frame: bytes, now_us: int) -> bytes | None:
+        """Return a frame of the site as it is to be seen here; None if it cannot pass."""
+        origin = origin_of(frame)
+        own_id = self._ids.id_of(self._site, origin[0])
+        if own_id is None:
+            self.counters.unmapped += 1
+            return None
+        self._note(frame, origin, now_us)
+        target = target_of(frame)[0]
+        return self._rewritten(frame, own_id, self._ids.known_id(self._site, target) or target)
+
+    def to_site(self, frame: bytes) -> tuple[int, bytes] | None:
+        """Return the system at the site that a frame is for (0: all) and the frame for it."""
+        sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
+        there = self._id_there(target)
+        changed = self._rewritten(frame, sender, there)
+        return None if changed is None else (there, changed)
+
+    def _id_there(self, own_id: int) -> int:
+        vehicle = self._ids.vehicle_of(own_id)
+        return vehicle[1] if vehicle is not None and vehicle[0] == self._site else own_id
+
+    def _rewritten(self, frame: bytes, sender: int, target: int) -> bytes | None:
+        try:
+            return rewrite(frame, sender, target, self._key)
+        except _CannotPassError as error:
+            counter = str(error)
+            setattr(self.counters, counter, getattr(self.counters, counter) + 1)
+            return None
+
+    def _note(self, frame: bytes, origin: tuple[int, int], now_us: int) -> None:
+        traffic = self.traffic.setdefault(origin[0], VehicleTraffic(since_us=now_us))
+        traffic.frames += 1
+        traffic.heard_us = now_us
+        sequence = sequence_of(frame)
+        if (before := self._sequences.get(origin)) is not None:
+            gap = sequence - before - 1 & SEQUENCE_MASK
+            traffic.lost += gap if gap < MAX_LOST else 0
+        self._sequences[origin] = sequence
+
+
+def rewrite(frame: bytes, sender: int, target: int, key: bytes | None) -> bytes:
+    """Return a frame of another sender to another target; the same object if nothing changes.
+
+    Parameters
+    ----------
+    frame : bytes
+        A complete frame.
+    sender, target : int
+        System ids; a message that addresses nobody keeps doing so.
+    key : bytes or None
+        What signatures are checked and made with.
+
+    Raises
+    ------
+    _CannotPassError
+        If it cannot be changed.
+    """
+    signed = is_signed(frame)
+    if signed and key is not None:
+        wanted = hashlib.sha256(key + frame[:-HASH_BYTES]).digest()[:HASH_BYTES]
+        if not hmac.compare_digest(wanted, frame[-HASH_BYTES:]):
+            raise _CannotPassError("forged")
+    if sender == origin_of(frame)[0] and target == target_of(frame)[0]:
+        return frame
+    message_id = message_id_of(frame)
+    if message_id not in CRC_EXTRA:
+        raise _CannotPassError("unknown")
+    if signed and key is None:
+        raise _CannotPassError("signed")
+    version_2 = frame[0] == START_V2
+    changed = bytearray(frame[: -SIGNATURE_SIZE if signed else len(frame)])
+    changed[5 if version_2 else 3] = sender
+    offset = TARGET_OFFSETS.get(message_id, (NO_TARGET, NO_TARGET))[0]
+    if NO_TARGET < offset < frame[1]:
+        changed[(10 if version_2 else 6) + offset] = target
+    crc = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(bytes(changed[1:-2])))
+    changed[-2:] = crc.to_bytes(2, "little")
+    if not signed or key is None:
+        return bytes(changed)
+    body = bytes(changed) + frame[-SIGNATURE_SIZE:-HASH_BYTES]
+    return body + hashlib.sha256(key + body).digest()[:HASH_BYTES]

@@ -1,0 +1,93 @@
+"""Which system id a vehicle of a site has here: two fields both have an aircraft 1."""
+
+from collections.abc import Mapping
+from typing import Final
+
+FIRST_ID: Final = 1
+LAST_ID: Final = 249
+"""From 250 on there are ground stations."""
+
+Vehicle = tuple[str, int]
+"""Site and system id there."""
+
+
+class IdMap:
+    """System ids given once and kept.
+
+    A vehicle keeps the id that it has at its site if nobody else has it here, else it gets the
+    lowest that is free.
+
+    Parameters
+    ----------
+    known : mapping
+        Ids given before, by vehicle.
+    """
+
+    def __init__(self, known: Mapping[Vehicle, int] | None = None) -> None:
+        self._ids: dict[Vehicle, int] = {}
+        self._vehicles: dict[int, Vehicle] = {}
+        self.version = 0
+        """Counts the changes, so that the keeper knows when to write."""
+        self.unmapped: set[Vehicle] = set()
+        """Vehicles for which there is no id left."""
+        for vehicle, own_id in (known or {}).items():
+            self._give(vehicle, own_id)
+
+    def id_of(self, site: str, system_id: int) -> int | None:
+        """Return the id of a vehicle here, giving it one if it is new; None if none is left."""
+        vehicle = (site, system_id)
+        own_id = self._ids.get(vehicle)
+        if own_id is not None or not system_id or vehicle in self.unmapped:
+            return own_id
+        wanted = [system_id, *range(FIRST_ID, LAST_ID + 1)]
+        own_id = next((each for each in wanted if self._is_free(each)), None)
+        if own_id is None:
+            self.unmapped.add(vehicle)
+        else:
+            self._give(vehicle, own_id)
+        return own_id
+
+    def known_id(self, site: str, system_id: int) -> int | None:
+        """Return the id of a vehicle here, if it has one."""
+        return self._ids.get((site, system_id))
+
+    def vehicle_of(self, own_id: int) -> Vehicle | None:
+        """Return whose id it is."""
+        return self._vehicles.get(own_id)
+
+    def set_by_hand(self, site: str, system_id: int, own_id: int) -> None:
+        """Give a vehicle an id; whoever had it gets another.
+
+        Raises
+        ------
+        ValueError
+            If it is none for a vehicle.
+        """
+        if not FIRST_ID <= own_id <= LAST_ID:
+            raise ValueError(f"id {own_id} is not {FIRST_ID} to {LAST_ID}")
+        holder = self._vehicles.get(own_id)
+        if holder == (site, system_id):
+            return
+        former = self._ids.get((site, system_id))
+        if former is not None:
+            del self._vehicles[former]
+        if holder is not None:
+            del self._ids[holder]
+        self._give((site, system_id), own_id)
+        if holder is not None and former is not None:
+            self._give(holder, former)
+        elif holder is not None:
+            self.id_of(*holder)
+
+    def items(self) -> list[tuple[Vehicle, int]]:
+        """Return all vehicles with their ids, in the order of the ids."""
+        return sorted(self._ids.items(), key=lambda item: item[1])
+
+    def _is_free(self, own_id: int) -> bool:
+        return FIRST_ID <= own_id <= LAST_ID and own_id not in self._vehicles
+
+    def _give(self, vehicle: Vehicle, own_id: int) -> None:
+        self._ids[vehicle] = own_id
+        self._vehicles[own_id] = vehicle
+        self.unmapped.discard(vehicle)
+        self.version += 1

@@ -1,0 +1,221 @@
+"""Sites and a fleet with real sessions: two ways, presence, loops, names, and the kept ids."""
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.edges.operator.control_socket import request
+from gateway.fleet.fleet_server import FleetServer
+from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
+from gateway.routing.hub_settings import HubSettings
+from gateway.vehicle.signing import key_from_passphrase
+from tests.edges.hub.conftest import Rig, Sender, Station, rig
+
+__all__ = ["rig"]
+
+pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+
+STATUSTEXT, COMMAND_LONG = 253, 76
+
+
+class World:
+    """A fleet that is a router, sites of one aircraft 1 each, and one ground station."""
+
+    def __init__(self, rig: Rig, fleet: FleetServer, place: str, station: Station) -> None:
+        self.rig = rig
+        self.fleet = fleet
+        self.place = place
+        self.station = station
+        self.sites: dict[str, Any] = {}
+        self.heard: dict[str, list[Any]] = {}
+        self.vehicles: dict[str, Sender] = {}
+        self.got: list[Any] = []
+
+    def open_site(self, name: str, options: str = "") -> Any:
+        incoming: list[Any] = []
+        rig = Rig()
+        rig.clock = self.rig.clock
+        rig.incoming = incoming
+        hub = rig.hub(f"zenoh:{self.place}?site={name}{options}")
+        self.rig.closing += rig.closing
+        self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
+        return hub
+
+    def say(self) -> None:
+        """Let every vehicle and the station speak, and take what the station gets."""
+        for name, hub in self.sites.items():
+            if hub._timer is not None:
+                self.rig.tick(hub)
+                hub.send(self.rig.out(self.vehicles[name].heartbeat()))
+                hub.send(self.rig.out(self.vehicles[name].attitude()))
+        self.station.say(self.station.sender.heartbeat())
+        reader = mavlink.MAVLink(None)
+        while True:
+            try:
+                data = self.station.socket.recv(65536)
+            except BlockingIOError:
+                return
+            self.got += reader.parse_buffer(data) or []
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(30):
+            while not condition():
+                self.rig.clock.us += 100_000
+                self.say()
+                await asyncio.sleep(0.01)
+
+    def systems(self) -> set[int]:
+        return {m.get_srcSystem() for m in self.got if m.get_type() == "ATTITUDE"}
+
+    def commands(self, name: str) -> list[Any]:
+        link = mavlink.MAVLink(None)
+        found = [link.decode(bytearray(each.frame)) for each in self.heard[name]]
+        return [message for message in found if message.get_type() == "COMMAND_LONG"]
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    with socket.socket() as place:
+        place.bind(("127.0.0.1", 0))
+        port = place.getsockname()[1]
+    return FleetSettings(
+        listen=f"tcp/127.0.0.1:{port}",
+        sites=("field-*",),
+        ids_file=str(tmp_path / "fleet.json"),
+        site=(SiteSettings(name="field-s", passphrase="secret"),),
+    )
+
+
+@pytest.fixture
+async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
+    fleet = FleetServer(settings, HubSettings(endpoints=("udp-listen:127.0.0.1:0",)))
+    await fleet.start()
+    station = rig.station(fleet._hub.listening_ports()[0])
+    world = World(rig, fleet, settings.listen, station)
+    async with asyncio.timeout(20):
+        while fleet._session is None:
+            await asyncio.sleep(0.01)
+    yield world
+    await fleet.close()
+    for close in rig.closing:
+        close()
+    rig.closing.clear()
+    await asyncio.sleep(0.1)
+
+
+async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: World) -> None:
+    for name in ("field-a", "field-b", "office"):
+        world.open_site(name)
+    await world.until(lambda: len(world.systems()) == 2)
+    ids = {site["name"]: site["vehicles"][0]["id"] for site in world.fleet.status()["sites"]}
+    assert set(ids) == {"field-a", "field-b"}
+    assert set(ids.values()) == world.systems() == {1, 2}
+    world.station.say(world.station.sender.command(ids["field-b"], 1))
+    await world.until(lambda: bool(world.commands("field-b")))
+    (command,) = world.commands("field-b")
+    assert (command.target_system, command.get_srcSystem()) == (1, 255)
+    assert not world.commands("field-a")
+    ack = mavlink.MAVLink_command_ack_message(512, 0, 0, 0, 255, 190)
+    hub, vehicle = world.sites["field-b"], world.vehicles["field-b"]
+    hub.send(world.rig.out(vehicle.pack(ack)))
+    await world.until(lambda: any(m.get_type() == "COMMAND_ACK" for m in world.got))
+    answer = next(m for m in world.got if m.get_type() == "COMMAND_ACK")
+    assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b"], 255)
+
+
+async def test_one_sites_frames_never_reach_another(world: World) -> None:
+    for name in ("field-a", "field-b"):
+        world.open_site(name)
+    await world.until(lambda: len(world.systems()) == 2)
+    before = {name: hub.clients()[0].received for name, hub in world.sites.items()}
+    await world.until(lambda: len(world.got) > 200)
+    for name, hub in world.sites.items():
+        senders = {each.frame[5] for each in world.heard[name]}
+        assert senders <= {255}
+        assert hub.clients()[0].systems == ((255, 190),)
+        assert before[name] <= hub.clients()[0].received
+
+
+async def test_a_site_goes_and_that_is_told_once(world: World) -> None:
+    world.open_site("field-a")
+    world.open_site("field-b")
+    await world.until(lambda: len(world.systems()) == 2)
+    world.sites["field-b"].close()
+    await world.until(lambda: any(m.get_type() == "STATUSTEXT" for m in world.got))
+    for _ in range(20):
+        world.say()
+        await asyncio.sleep(0.01)
+    texts = [m.text for m in world.got if m.get_type() == "STATUSTEXT"]
+    assert texts == ["Site field-b is gone"]
+    gone = {site["name"]: site["is_here"] for site in world.fleet.status()["sites"]}
+    assert gone == {"field-a": True, "field-b": False}
+
+
+async def test_signed_frames_are_checked_and_sealed_anew(world: World) -> None:
+    hub = world.open_site("field-s")
+    world.open_site("field-a")
+    vehicle = world.rig.sender(1, signed=True)
+    vehicle.link.signing.secret_key = key_from_passphrase("secret")
+    world.vehicles["field-s"] = vehicle
+    await world.until(lambda: len(world.systems()) == 2)
+    forged = world.rig.sender(1, signed=True)
+    hub.send(world.rig.out(forged.attitude()))
+
+    def told() -> int:
+        sites = {site["name"]: site for site in world.fleet.status()["sites"]}
+        return int(sites["field-s"]["forged"])
+
+    await world.until(lambda: told() > 0)
+
+
+async def test_garbage_and_names_that_are_none(world: World) -> None:
+    import zenoh
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([world.place]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as stranger:
+        stranger.put("mavlink/field-x/1/out", b"no MAVLink at all")
+        stranger.put("mavlink/field- x/1/out", b"\xfd")
+        await world.until(lambda: bool(world.fleet.status()["left_out"]))
+        sites = {site["name"]: site for site in world.fleet.status()["sites"]}
+        assert sites["field-x"]["bytes_garbage"] == 17
+        assert set(sites) == {"field-x"}
+
+
+async def test_ids_are_kept_shown_and_set_by_hand(world: World, settings: FleetSettings) -> None:
+    world.open_site("field-a")
+    await world.until(lambda: bool(world.systems()))
+    socket_path = world.fleet.control_socket
+    params = {"site": "field-a", "system_id": 1, "own_id": 77}
+    answer = await asyncio.to_thread(request, socket_path, "fleet.id", params)
+    assert answer == ["field-a/1 = 77"]
+    await world.until(lambda: 77 in world.systems())
+    status = await asyncio.to_thread(request, socket_path, "fleet.status", {})
+    assert status["sites"][0]["vehicles"][0]["id"] == 77
+    assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("[]", "object"), ('{"x": 1}', "SITE/SYSTEM"), ('{"a/1": 5, "b/1": 5}', "twice")],
+)
+def test_a_file_of_ids_that_is_none(settings: FleetSettings, text: str, words: str) -> None:
+    Path(settings.ids_file).write_text(text)
+    with pytest.raises(ValueError, match=words):
+        FleetServer(settings, HubSettings())
+
+
+@pytest.mark.parametrize("site", ["a/b", "", "a**", "a b", "$*"])
+def test_patterns_that_are_none(settings: FleetSettings, site: str) -> None:
+    with pytest.raises(ValueError, match="site"):
+        FleetServer(FleetSettings(sites=(site,), ids_file=settings.ids_file), HubSettings())

@@ -1,0 +1,185 @@
+"""Frames with other ids: header, target, checksum and signature, read back by pymavlink."""
+
+import random
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.fleet.frame_translation import FrameTranslation
+from gateway.fleet.id_map import IdMap
+from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_splitter import split_datagram, target_of
+
+KEY = bytes(range(32))
+
+
+def packed(message: Any, system_id: int, *, v1: bool = False, key: bytes | None = None) -> bytes:
+    link = mavlink.MAVLink(None, system_id, 1)
+    if key is not None:
+        link.signing.secret_key = key
+        link.signing.link_id = 3
+        link.signing.timestamp = 123_456
+        link.signing.sign_outgoing = True
+    return bytes(message.pack(link, force_mavlink1=v1))
+
+
+def read(frame: bytes, key: bytes | None = None) -> Any:
+    """Read a frame back; pymavlink raises if the checksum or the signature is wrong."""
+    link = mavlink.MAVLink(None, 255, 0)
+    if key is not None:
+        link.signing.secret_key = key
+        link.signing.timestamp = 1
+    return link.decode(bytearray(frame))
+
+
+def translation(key: bytes | None = None) -> FrameTranslation:
+    """Two sites have an aircraft 1 each; ours is the second, so that it is 2 here."""
+    ids = IdMap()
+    ids.id_of("a", 1)
+    ids.id_of("b", 1)
+    ids.id_of("b", 30)
+    return FrameTranslation("b", ids, key)
+
+
+def attitude() -> Any:
+    return mavlink.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0.25)
+
+
+def command(target: int) -> Any:
+    return mavlink.MAVLink_command_long_message(target, 1, 400, 0, 1, 0, 0, 0, 0, 0, 7)
+
+
+@pytest.mark.parametrize("v1", [False, True])
+def test_from_the_site(v1: bool) -> None:
+    there = translation()
+    got = read(there.from_site(packed(attitude(), 1, v1=v1), 0) or b"")
+    assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
+
+
+@pytest.mark.parametrize("v1", [False, True])
+def test_to_the_site(v1: bool) -> None:
+    system_id, frame = translation().to_site(packed(command(2), 255, v1=v1)) or (0, b"")
+    got = read(frame)
+    assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
+    assert (got.command, got.param7) == (400, 7)
+
+
+def test_an_answer_keeps_the_ground_station_it_is_for() -> None:
+    ack = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190)
+    got = read(translation().from_site(packed(ack, 1), 0) or b"")
+    assert (got.get_srcSystem(), got.target_system, got.target_component) == (2, 255, 190)
+
+
+def test_a_vehicle_that_addresses_another_of_its_site() -> None:
+    """As an autopilot its gimbal, or one aircraft the next."""
+    got = read(translation().from_site(packed(command(1), 30), 0) or b"")
+    assert (got.get_srcSystem(), got.target_system) == (30, 2)
+
+
+def test_what_a_station_says_to_all_stays_as_it_is() -> None:
+    beat = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255)
+    assert translation().to_site(beat) == (0, beat)
+
+
+def test_a_zero_that_version_2_has_cut_off_is_still_nobody() -> None:
+    ack = mavlink.MAVLink_command_ack_message(400, 0)
+    assert read(translation().from_site(packed(ack, 1), 0) or b"").target_system == 0
+
+
+def test_what_does_not_change_passes_byte_for_byte() -> None:
+    there = FrameTranslation("a", IdMap({("a", 1): 1}))
+    frame = packed(attitude(), 1, key=KEY)
+    assert there.from_site(frame, 0) is frame
+
+
+class TestSigned:
+    def test_sealed_anew_with_the_stamp_that_it_had(self) -> None:
+        frame = packed(attitude(), 1, key=KEY)
+        got = translation(KEY).from_site(frame, 0)
+        assert got is not None
+        assert read(got, KEY).get_srcSystem() == 2
+        assert got[-13:-6] == frame[-13:-6]
+
+    def test_to_the_site(self) -> None:
+        found = translation(KEY).to_site(packed(command(2), 255, key=KEY))
+        assert found is not None
+        assert read(found[1], KEY).target_system == 1
+
+    @pytest.mark.parametrize("place", [-1, -10, 15])
+    def test_forged(self, place: int) -> None:
+        frame = bytearray(packed(attitude(), 1, key=KEY))
+        frame[place] ^= 1
+        there = translation(KEY)
+        assert there.from_site(bytes(frame), 0) is None
+        assert there.counters.forged == 1
+
+    def test_without_a_passphrase(self) -> None:
+        there = translation()
+        assert there.from_site(packed(attitude(), 1, key=KEY), 0) is None
+        assert there.counters.signed == 1
+
+
+def test_an_unknown_message_cannot_change() -> None:
+    frame = bytearray(packed(attitude(), 1))
+    frame[7:10] = (16_000_000).to_bytes(3, "little")
+    there = translation()
+    assert there.from_site(bytes(frame), 0) is None
+    assert there.counters.unknown == 1
+
+
+def test_no_id_left() -> None:
+    ids = IdMap()
+    for n in range(260):
+        ids.id_of(f"site-{n}", 1)
+    there = FrameTranslation("site-259", ids)
+    assert there.from_site(packed(attitude(), 1), 0) is None
+    assert there.counters.unmapped == 1
+
+
+def test_system_0_is_nobody() -> None:
+    there = translation()
+    assert there.from_site(packed(attitude(), 0), 0) is None
+    assert there.counters.unmapped == 1
+    assert there.traffic == {}
+
+
+def test_loss_by_the_sequence_numbers() -> None:
+    there = translation()
+    for number in (250, 251, 254, 255, 0, 3, 3):
+        frame = bytearray(packed(attitude(), 1))
+        frame[4] = number
+        there.from_site(bytes(frame), number)
+    assert (there.traffic[1].frames, there.traffic[1].lost) == (7, 4)
+
+
+@pytest.mark.parametrize("message_id", sorted(TARGET_OFFSETS))
+def test_every_message_with_a_target(message_id: int) -> None:
+    """There and back again gives the same bytes; on the way it is for the other system."""
+    kind = mavlink.mavlink_map[message_id]
+    chance = random.Random(message_id)
+    size = sum(
+        length * max(1, count)
+        for length, count in zip(
+            [{"c": 1, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "q": 8, "Q": 8,
+              "f": 4, "d": 8}[chr(code)] for code in kind.native_format[1:]],
+            kind.array_lengths,
+            strict=True,
+        )
+    )  # fmt: skip
+    payload = bytearray(chance.randint(1, 255) for _ in range(size))
+    payload[TARGET_OFFSETS[message_id][0]] = 2
+    frame = bytes((0xFD, size, 0, 0, 9, 255, 190)) + message_id.to_bytes(3, "little") + payload
+    crc = mavlink.x25crc(frame[1:])
+    crc.accumulate(bytes((kind.crc_extra,)))
+    frame += crc.crc.to_bytes(2, "little")
+    there = translation()
+    system_id, changed = there.to_site(frame) or (0, b"")
+    assert system_id == 1
+    assert split_datagram(changed) == [changed]
+    assert target_of(changed)[0] == 1
+    back = there.from_site(changed, 0)
+    assert back is not None
+    assert target_of(back)[0] == 2
+    differing = sum(a != b for a, b in zip(changed, frame, strict=True))
+    assert differing <= 3

@@ -1,0 +1,72 @@
+"""Ids given once and kept."""
+
+import random
+
+import pytest
+
+from gateway.fleet.id_map import FIRST_ID, LAST_ID, IdMap
+
+
+def test_the_first_keeps_its_id_and_the_second_gets_the_lowest_that_is_free() -> None:
+    ids = IdMap()
+    assert ids.id_of("a", 1) == 1
+    assert ids.id_of("b", 1) == 2
+    assert ids.id_of("b", 7) == 7
+    assert ids.id_of("c", 1) == 3
+    assert [ids.id_of(site, 1) for site in "abc"] == [1, 2, 3]
+    assert ids.vehicle_of(2) == ("b", 1)
+    assert ids.vehicle_of(9) is None
+
+
+def test_what_was_kept_holds() -> None:
+    first = IdMap()
+    for site in "abc":
+        first.id_of(site, 1)
+    again = IdMap(dict(first.items()))
+    assert again.id_of("c", 1) == 3
+    assert again.id_of("a", 1) == 1
+
+
+def test_ids_of_ground_stations_are_given_to_nobody() -> None:
+    assert IdMap().id_of("a", 255) == 1
+
+
+def test_more_than_there_are_ids_for() -> None:
+    ids = IdMap()
+    found = [ids.id_of(f"site-{n}", 1) for n in range(300)]
+    given = [own_id for own_id in found if own_id is not None]
+    assert sorted(given) == list(range(FIRST_ID, LAST_ID + 1))
+    assert len(ids.unmapped) == 300 - len(given)
+    ids.set_by_hand("site-299", 1, 5)
+    assert ids.id_of("site-299", 1) == 5
+    assert ids.vehicle_of(5) == ("site-299", 1)
+    assert ("site-299", 1) not in ids.unmapped
+
+
+def test_by_hand() -> None:
+    ids = IdMap()
+    for site in "abc":
+        ids.id_of(site, 1)
+    ids.set_by_hand("c", 1, 1)
+    assert [ids.id_of(site, 1) for site in "abc"] == [3, 2, 1]
+    ids.set_by_hand("d", 1, 9)
+    assert ids.id_of("d", 1) == 9
+    for wrong in (0, 250):
+        with pytest.raises(ValueError, match="1 to 249"):
+            ids.set_by_hand("a", 1, wrong)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_two_share_an_id_whatever_is_done(seed: int) -> None:
+    chance = random.Random(seed)
+    ids = IdMap()
+    for _ in range(400):
+        site, system = f"s{chance.randrange(60)}", chance.randrange(1, 9)
+        if chance.random() < 0.3:
+            ids.set_by_hand(site, system, chance.randint(FIRST_ID, LAST_ID))
+        else:
+            ids.id_of(site, system)
+        given = [own_id for _, own_id in ids.items()]
+        assert len(set(given)) == len(given)
+        for vehicle, own_id in ids.items():
+            assert ids.vehicle_of(own_id) == vehicle
