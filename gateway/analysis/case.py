@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from gateway.analysis.flight_arrays import (
     Flight,
@@ -12,13 +13,16 @@ from gateway.analysis.flight_arrays import (
     LocalFrame,
     local_frame,
 )
-from gateway.analysis.fusion import Sensed, fuse, sense
+from gateway.analysis.fusion import Sensed, fuse, fuse_smoothed, sense
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__
 )
 """Every estimator has a section of settings of its own name."""
+
+SMOOTHED: Final = "smoothed"
+"""Name of the track that knows the whole flight at each of its instants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +33,7 @@ class Case:
     fusion: FusionSettings
     sensed: Sensed
     tracks: dict[str, FlightTrack]
-    """By estimator."""
+    """By estimator, and `SMOOTHED` where that was asked for."""
     frame: LocalFrame | None
     """Metres about the first fix; None in a flight without GPS."""
 
@@ -56,7 +60,9 @@ def with_estimator(fusion: FusionSettings, name: str) -> FusionSettings:
     return msgspec.structs.replace(fusion, estimation=estimation)
 
 
-def make_case(flight: Flight, fusion: FusionSettings | None = None) -> Case:
+def make_case(
+    flight: Flight, fusion: FusionSettings | None = None, *, smooth: bool = False
+) -> Case:
     """Fuse a flight with every estimator.
 
     Parameters
@@ -64,6 +70,8 @@ def make_case(flight: Flight, fusion: FusionSettings | None = None) -> Case:
     flight : Flight
     fusion : FusionSettings, optional
         In place of the flight's own.
+    smooth : bool
+        Add a track that is smoothed from both ends, where the clock allows.
 
     Returns
     -------
@@ -72,4 +80,6 @@ def make_case(flight: Flight, fusion: FusionSettings | None = None) -> Case:
     fusion = fusion or flight.fusion
     sensed = sense(flight, fusion.sensing)
     tracks = {name: fuse(flight, with_estimator(fusion, name), sensed) for name in ESTIMATORS}
+    if smooth and not np.any(np.diff(flight.time_us) < 0):
+        tracks[SMOOTHED] = fuse_smoothed(flight, fusion)
     return Case(flight, fusion, sensed, tracks, local_frame(flight))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from gateway.analysis.flight_arrays import (
@@ -32,6 +33,7 @@ from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.paper.paper import PaperEstimator
 from gateway.estimation.select import make_estimator
+from gateway.estimation.smoothing.smoother import smooth
 from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
@@ -105,6 +107,29 @@ def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None)
     return _fuse_by_sample(flight, estimator, sensed)
 
 
+def fuse_smoothed(flight: Flight, settings: FusionSettings) -> FlightTrack:
+    """Smooth a flight from both ends, over the Kalman filter.
+
+    Parameters
+    ----------
+    flight : Flight
+        Its clock does not go back.
+    settings : FusionSettings
+        Filter settings.
+
+    Returns
+    -------
+    FlightTrack
+        One row per IMU sample.
+    """
+    estimation = msgspec.structs.replace(settings.estimation, estimator="eskf")
+    estimator = make_estimator(estimation)
+    if not isinstance(estimator, KernelEstimator):
+        raise TypeError(f"{type(estimator)} cannot be smoothed")
+    out = smooth(estimator, sample_log(flight, estimator.fix_row))
+    return _track_of_rows(flight, out)
+
+
 def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog:
     """Lay a flight out for the compiled estimators."""
     imu = np.zeros((len(flight.time_us), IMU_COLUMNS))
@@ -124,7 +149,10 @@ def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog
 
 
 def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> FlightTrack:
-    out = estimator.run(sample_log(flight, estimator.fix_row))
+    return _track_of_rows(flight, estimator.run(sample_log(flight, estimator.fix_row)))
+
+
+def _track_of_rows(flight: Flight, out: FloatArray) -> FlightTrack:
     return _track(
         flight,
         out[:, NAV_QUAT : NAV_QUAT + 4],

@@ -5,9 +5,9 @@ from typing import Final
 import numpy as np
 
 from gateway.analysis.blending import make_judge, score
-from gateway.analysis.case import Case, with_estimator
+from gateway.analysis.case import SMOOTHED, Case, with_estimator
 from gateway.analysis.flight_arrays import FloatArray, FusionSettings, fixes_of
-from gateway.analysis.fusion import fuse
+from gateway.analysis.fusion import fuse, fuse_smoothed
 from gateway.analysis.interpolation import withhold
 from gateway.analysis.metrics import errors_over_time, rms
 from gateway.settings import Settings, fields_of
@@ -60,7 +60,10 @@ def summarise(case: Case) -> dict[str, float]:
 def withheld_error_m(case: Case, estimator: str) -> float:
     """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
     judge = make_judge(case.flight, withhold(case.flight, HOLD_OUT))
-    track = fuse(judge.fused, with_estimator(case.fusion, estimator), case.sensed)
+    if estimator == SMOOTHED:
+        track = fuse_smoothed(judge.fused, case.fusion)
+    else:
+        track = fuse(judge.fused, with_estimator(case.fusion, estimator), case.sensed)
     return score(track, judge)["held_m"]
 
 

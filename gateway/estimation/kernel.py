@@ -117,6 +117,11 @@ class KernelEstimator(Generic[State, Gains]):
             raise TypeError(f"not a state of this estimator: {type(state)}")
         self._use(copy_record(state))
 
+    @property
+    def gains(self) -> Gains:
+        """The record of constants."""
+        return self._gains
+
     def snapshot(self) -> bytes:
         """Write down all that is remembered, the place on the Earth included."""
         return msgspec.msgpack.encode((pack_record(self._state), self._earth.state))

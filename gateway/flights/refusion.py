@@ -1,6 +1,6 @@
 """Recorded flights through the pipeline again, as rows or as the frames it would have sent."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -24,11 +24,28 @@ from gateway.flights.reading import (
     joined_rows,
     open_rows,
 )
+from gateway.flights.smoothed import (
+    SmoothedStates,
+    smooth_records,
+    with_smoothed_estimator,
+)
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus, Outgoing
-from gateway.replay import InterpolatedPosition, Replay, header_for
+from gateway.records import (
+    BaroRaw,
+    FusedSample,
+    FusionState,
+    GpsFix,
+    ImuCalibrated,
+    ImuRaw,
+    NavState,
+    NodeStatus,
+    Outgoing,
+)
+from gateway.replay import InterpolatedPosition, Replay, header_for, records_of
 
 SETTLES: Final = "what was remembered at the begin is left aside: {}; the estimator settles anew"
+
+Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
 
 class Refusion:
@@ -40,6 +57,8 @@ class Refusion:
         Anything that `open_rows` reads, of one aircraft.
     options : ReadOptions
         Settings, and how positions are told.
+    smooth : bool
+        Tell the states smoothed from both ends in place of those of the flight.
 
     Raises
     ------
@@ -47,12 +66,17 @@ class Refusion:
         If there is no flight in a file, or they do not belong together.
     """
 
-    def __init__(self, files: Sequence[Path], options: ReadOptions) -> None:
+    def __init__(
+        self, files: Sequence[Path], options: ReadOptions, *, smooth: bool = False
+    ) -> None:
         self._table = table = joined_rows([open_rows(file, options) for file in files])
         self._aircraft, self._zero_us = aircraft_of(table, options), table.header.unix_us_at_zero
         self._recorded = options.choice == "recorded"
-        correct = None
-        if options.position == "interpolated":
+        correct: Callable[[NavState], NavState] | None = None
+        if smooth:
+            self._aircraft = with_smoothed_estimator(self._aircraft)
+            correct = SmoothedStates(*smooth_records(_records_of(files, options), self._aircraft))
+        elif options.position == "interpolated":
             latency_s = self._aircraft.estimation.reference.gps_latency_s
             correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
         common = PipelineSettings(self._aircraft, {}, self._zero_us or 0, correct)
@@ -127,6 +151,13 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
         rows = [event for event in events if isinstance(event, TableRow)]
         zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
     return zero_us + rows[-1].time_us if rows else None
+
+
+def _records_of(files: Iterable[Path], options: ReadOptions) -> Iterator[Record]:
+    """Read all records once more, before the rows."""
+    quiet = replace(options, progress=None)
+    table = joined_rows([open_rows(file, quiet) for file in files])
+    return (record for row in table.plain_rows for record in records_of(row))
 
 
 def _fixes_of(files: Iterable[Path], options: ReadOptions) -> Iterator[GpsFix]:

@@ -52,6 +52,8 @@ class FlightToWrite:
         What the flight is called in the file.
     fuse : bool
         Fuse tables again in place of their recorded states.
+    smooth : bool
+        Fuse them from both ends.
 
     Raises
     ------
@@ -67,9 +69,10 @@ class FlightToWrite:
         limits: Limits = (None, None),
         title: str = "flight",
         fuse: bool = False,
+        smooth: bool = False,
     ) -> None:
         self.files, self.options, self.title = files, options, title
-        self._limits = limits
+        self._limits, self._smooth = limits, smooth
         kinds = {kind_of(file) for file in files}
         self.is_mavlink = kinds == {FileKind.TLOG}
         """Whether the frames are those that were recorded, and the rows are read out of them."""
@@ -100,7 +103,7 @@ class FlightToWrite:
         return self._refusion.remarks if self._refusion else []
 
     def _fused(self) -> Refusion:
-        self._refusion = Refusion(self.files, self.options)
+        self._refusion = Refusion(self.files, self.options, smooth=self._smooth)
         return self._refusion
 
 

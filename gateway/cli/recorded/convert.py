@@ -15,6 +15,7 @@ from gateway.cli.support.recording_options import (
     FromOption,
     PositionOption,
     SettingsOption,
+    SmoothOption,
     ToOption,
     progress_of,
     read_column_map,
@@ -50,6 +51,7 @@ def convert(
     fuse: Annotated[
         bool, typer.Option("--fuse", help="Fuse a table again in place of its recorded states.")
     ] = False,
+    smooth: SmoothOption = False,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
     system: Annotated[
@@ -68,6 +70,8 @@ def convert(
     if write is None:
         refuse(f"{out}: the output must end in {', '.join(WRITERS)}")
     with refusing():
+        if smooth and not fuse:
+            refuse("--smooth smooths what --fuse fuses: give both")
         wanted: Wanted = "tables" if fuse or out.suffix not in FROM_TLOGS else "tlogs"
         files = files_of(files, recordings_folder(config), wanted)
     with progress_of(files) as advance, refusing():
@@ -80,7 +84,9 @@ def convert(
             progress=advance,
         )
         limits = (read_moment(begin), read_moment(end))
-        flight = FlightToWrite(files, options, limits=limits, title=out.stem, fuse=fuse)
+        flight = FlightToWrite(
+            files, options, limits=limits, title=out.stem, fuse=fuse, smooth=smooth
+        )
         inputs = [*files, columns, config]
         size = write_new(out, write(flight), overwrite=force, inputs=inputs)
     for remark in flight.remarks:

@@ -18,6 +18,7 @@ from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     ForceOption,
+    SmoothOption,
     progress_of,
     read_column_map,
     refusing,
@@ -45,6 +46,7 @@ from gateway.flights.reading import (
     open_rows,
 )
 from gateway.flights.refusion import SETTLES
+from gateway.flights.smoothed import smooth_records, with_smoothed_estimator
 from gateway.output import check_output, write_new
 from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import header_for, records_of
@@ -86,6 +88,7 @@ def fuse_log(
     settings: Annotated[
         SettingsChoice, typer.Option("--settings", help="For recordings: those of then or today.")
     ] = "recorded",
+    smooth: SmoothOption = False,
     config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
@@ -114,9 +117,12 @@ def fuse_log(
             aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
         )
         try:
-            chain, running = _begin(table, aircraft)
-            records = (record for row in table.plain_rows for record in records_of(row))
-            time_us, states = fuse(records, chain, running)
+            if smooth:
+                aircraft = with_smoothed_estimator(aircraft)
+                time_us, states = smooth_records(_records(table), aircraft)
+            else:
+                chain, running = _begin(table, aircraft)
+                time_us, states = fuse(_records(table), chain, running)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
         header = header_for(aircraft, table.header.vehicle_id)
@@ -125,8 +131,12 @@ def fuse_log(
             header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
         )
         write_new(out, _lines(header, time_us, states), overwrite=force, inputs=inputs)
-    name = aircraft.estimation.estimator
+    name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
+
+
+def _records(table: RecordedTable) -> Iterator[Record]:
+    return (record for row in table.plain_rows for record in records_of(row))
 
 
 def _begin(table: RecordedTable, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:

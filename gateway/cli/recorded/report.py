@@ -22,6 +22,7 @@ from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
     SettingsOption,
+    SmoothOption,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -59,6 +60,7 @@ def report(
     reference: ReferenceOption = None,
     columns: ColumnsOption = None,
     system: SystemOption = None,
+    smooth: SmoothOption = False,
     settings: SettingsOption = "recorded",
     config: ConfigOption = None,
     force: ForceOption = False,
@@ -92,7 +94,7 @@ def report(
     ) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
-        case = make_case(loaded)
+        case = make_case(loaded, smooth=smooth)
         compared = make_case(other, others) if other is not loaded or others else None
         made = make_report(case, compared)
         progress.update(task, description="drawing", total=count_pictures(made.sections))

@@ -18,6 +18,14 @@ from gateway.flights.reading import FlightError, Position, SettingsChoice
 PANEL: Final = "Recordings"
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
+SmoothOption = Annotated[
+    bool,
+    typer.Option(
+        "--smooth",
+        help="Smooth from both ends (Kalman filter, Rauch-Tung-Striebel); "
+        "an hour of flight takes 300 MB of memory.",
+    ),
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]
 FromOption = Annotated[
     str | None, typer.Option("--from", help="Begin: 80, 1:20 or 2026-06-11T14:25:30Z.")

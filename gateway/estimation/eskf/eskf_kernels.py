@@ -103,17 +103,8 @@ def take_imu(
     if dt > GAP_S:
         bridge_gap(s, p, dt)
         return
-    collect_roughness(s, gyro, accel, dt)
-    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
-    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
-    if not sound_gyro:
-        gyro = substitute_rate(s, dt)
-    else:
-        s.missing_gyro_s = 0.0
-    if not sound_accel:
-        accel = substitute_force(s)
-    integrate(s, gyro, accel, dt)
-    if sound_gyro and sound_accel:
+    sound = move(s, gyro, accel, clipped, dt)
+    if sound:
         moving = is_moving(s, p)
         rested = s.at_rest == 1
         watch_rest(s, p, gyro, accel, moving, dt)
@@ -124,6 +115,22 @@ def take_imu(
     take_substitutes(s, p)
     if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
         take_mag(s, p, (mx, my, mz))
+
+
+@compiled
+def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bool:
+    """Integrate one sample, or what stands in for it; tells whether both sensors were sound."""
+    collect_roughness(s, gyro, accel, dt)
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
+    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    if not sound_gyro:
+        gyro = substitute_rate(s, dt)
+    else:
+        s.missing_gyro_s = 0.0
+    if not sound_accel:
+        accel = substitute_force(s)
+    integrate(s, gyro, accel, dt)
+    return sound_gyro and sound_accel
 
 
 @compiled

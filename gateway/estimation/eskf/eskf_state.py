@@ -88,6 +88,8 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, ReviewState, Way
     fix_vel: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
+    restarts: int
+    """How often a part of the state began anew, and what was before says nothing of it."""
     off_last_m: float
     """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
     contradiction_m: float

@@ -40,6 +40,7 @@ def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: fl
     for k in range(3):
         decorrelate(s.P, VEL + k, p.unaided_var)
         s.vel_n[k] = 0.0
+    s.restarts += 1
     s.aided = 0
     # The integrals in NED stand in the old attitude.
     s.ring_count = 0
@@ -51,6 +52,7 @@ def turn_heading(s: EskfState, turn_rad: float) -> None:
     half = 0.5 * turn_rad
     turn = (math.cos(half), 0.0, 0.0, math.sin(half))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    s.restarts += 1
     # The integrals stand in the old heading.
     s.ring_count = 0
 

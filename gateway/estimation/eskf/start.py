@@ -123,6 +123,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         Its age, s.
     """
     propagate(s, p)
+    s.restarts += 1
     told = is_sound(vel, FASTEST_MPS)
     vel = vel if told else (0.0, 0.0, 0.0)
     for k in range(3):
@@ -141,6 +142,7 @@ def start_height(s: EskfState, p: EskfGains, down_m: float) -> None:
     """Take the height from the first fix that tells one."""
     if s.has_height == 1 or not math.isfinite(down_m):
         return
+    s.restarts += 1
     start_position(s, 2, down_m, p.gps_height_var)
     s.has_height = 1
     if s.baro_known == 1:
@@ -185,6 +187,7 @@ def relock_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> N
 def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
     """Give position and velocity up; from here on the velocity only keeps the attitude level."""
     propagate(s, p)
+    s.restarts += 1
     s.aided = 0
     for k in range(3):
         decorrelate(s.P, VEL + k, p.unaided_var)
@@ -195,6 +198,7 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
 def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     propagate(s, p)
+    s.restarts += 1
     s.fault = 1
     rate = (
         s.gyro_lp[0] - s.gyro_bias_b[0],

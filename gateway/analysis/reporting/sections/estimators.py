@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from gateway.analysis.case import Case
+from gateway.analysis.case import SMOOTHED, Case
 from gateway.analysis.flight_arrays import BoolArray, FlightTrack, Reference, fixes_of
 from gateway.analysis.interpolation import interpolate
 from gateway.analysis.key_figures import HOLD_OUT, withheld_error_m
@@ -15,6 +15,16 @@ from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
 
 COLOURS: Final = {"paper": style.ORANGE, "complementary": style.BLUE, "eskf": style.PINK}
+STORY: Final = (
+    "Every estimator fused the same samples, and is judged against {}. `paper` is the paper's "
+    "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
+    "flight and slowly pulls the horizon over. `complementary` and `eskf` let the GPS velocity "
+    "tell the manoeuvre from gravity."
+)
+SMOOTHED_STORY: Final = (
+    " `smoothed` knows the whole flight at each instant: `eskf` from both ends, which only a "
+    "recording can be."
+)
 OTHER: Final = style.GREEN
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
@@ -34,10 +44,7 @@ def estimators(case: Case) -> Section | None:
         table["withheld fixes, m"] = table["estimator"].map(withheld)
     return Section(
         "Estimators compared",
-        f"Every estimator fused the same samples, and is judged against {reference.story}. "
-        "`paper` is the paper's fusion with its equations corrected: in a turn its accelerometer "
-        "takes the bank for level flight and slowly pulls the horizon over. `complementary` "
-        "and `eskf` let the GPS velocity tell the manoeuvre from gravity.",
+        STORY.format(reference.story) + (SMOOTHED_STORY if SMOOTHED in case.tracks else ""),
         [
             Picture(
                 "estimator_errors",

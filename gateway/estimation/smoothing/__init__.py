@@ -1,0 +1,1 @@
+"""Recordings smoothed from both ends."""

@@ -1,0 +1,153 @@
+"""The Kalman filter over a log, and beside it what it would have foreseen from node to node.
+
+At each node a second state is copied off the filter and moves on by the inertial samples alone.
+At the next node the two differ by what the measurements between have taught: late fixes, compass
+and barometer alike, whatever the order in which they came. With the transition that the copy went
+through, this is all that a smoother needs.
+"""
+
+import math
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import CLIPPED
+from gateway.estimation.eskf.covariance import apply_transition, propagate
+from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, move, take_baro, take_imu
+from gateway.estimation.eskf.eskf_output import write_output
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import (
+    ACCEL_BIAS,
+    BARO_BIAS,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    MAG_BIAS,
+    POS,
+    STATES,
+    TILT,
+    VEL,
+    WANDER,
+    EskfState,
+)
+from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
+from gateway.geometry.geodesy import displacement_m
+from gateway.geometry.quaternion import multiply
+
+
+@compiled
+def foresee(s: EskfState, p: EskfGains, F: FloatArray) -> None:
+    """Propagate the copy's covariance, and the transition with it."""
+    apply_transition(s, F)
+    kept = math.exp(-s.pending_s / p.gps_wander_s)
+    for j in range(STATES):
+        for k in range(3):
+            F[WANDER + k, j] *= kept
+    propagate(s, p)
+
+
+@compiled
+def learned(s: EskfState, copy: EskfState, d: FloatArray) -> None:
+    """Tell by how much the filter's state is another than the one foreseen."""
+    c = as_quat(copy.q_nb)
+    q = multiply(as_quat(s.q_nb), (c[0], -c[1], -c[2], -c[3]))
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    angle = 2.0 * math.atan2(sine, abs(q[0]))
+    share = math.copysign(angle / sine if sine > 1e-12 else 2.0, q[0])
+    north, east = displacement_m(copy.origin_lat, copy.origin_lon, s.origin_lat, s.origin_lon, 0.0)
+    for k in range(3):
+        d[TILT + k] = share * q[1 + k]
+        d[VEL + k] = s.vel_n[k] - copy.vel_n[k]
+        moved = north if k == 0 else (east if k == 1 else 0.0)
+        d[POS + k] = s.pos_n[k] + moved - copy.pos_n[k]
+        d[GYRO_BIAS + k] = s.gyro_bias_b[k] - copy.gyro_bias_b[k]
+        d[ACCEL_BIAS + k] = s.accel_bias_b[k] - copy.accel_bias_b[k]
+        d[WANDER + k] = s.wander_n[k] - copy.wander_n[k]
+        d[MAG_BIAS + k] = s.mag_bias_b[k] - copy.mag_bias_b[k]
+        d[GYRO_SCALE + k] = s.gyro_scale_b[k] - copy.gyro_scale_b[k]
+    d[BARO_BIAS] = s.baro_bias_m - copy.baro_bias_m
+
+
+@compiled
+def begin_node(s: EskfState, p: EskfGains, P: FloatArray, F: FloatArray) -> None:
+    """Keep the covariance of a node; the transition from it begins as none."""
+    propagate(s, p)
+    for i in range(STATES):
+        for j in range(STATES):
+            P[i, j] = s.P[i, j]
+            F[i, j] = 1.0 if i == j else 0.0
+
+
+@compiled
+def move_copy(s: EskfState, p: EskfGains, time_us: int, row: FloatArray, F: FloatArray) -> None:
+    """Move the copy on by one IMU sample, and by nothing else."""
+    dt = (time_us - s.time_us) * 1e-6
+    if s.started == 0 or dt <= 0.0:
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    move(s, (row[3], row[4], row[5]), (row[0], row[1], row[2]), row[CLIPPED], dt)
+    if s.pending_s >= COVARIANCE_S:
+        foresee(s, p, F)
+
+
+@compiled
+def run_forward(
+    states: FloatArray,
+    p: EskfGains,
+    nodes: IntArray,
+    imu_time_us: IntArray,
+    imu: FloatArray,
+    baro_time_us: IntArray,
+    baro_alt_m: FloatArray,
+    gps_time_us: IntArray,
+    gps: FloatArray,
+    out: FloatArray,
+    P: FloatArray,
+    F: FloatArray,
+    foreseen: FloatArray,
+    d: FloatArray,
+    joined: IntArray,
+) -> None:
+    """Run the filter, and a copy of it from each node to the next.
+
+    Parameters
+    ----------
+    states : array of 2 records of EskfState
+        The filter's, and memory for the copy.
+    p : EskfGains
+        Constants.
+    nodes : ndarray of int, shape (m + 1,)
+        Index of the sample at which each of m stretches begins; the end of the last.
+    imu_time_us, imu, baro_time_us, baro_alt_m, gps_time_us, gps : ndarray
+        See `SampleLog`.
+    out : ndarray, shape (n, NAV_COLUMNS)
+        Filled with what the copy tells.
+    P, F, foreseen : ndarray, shape (m, STATES, STATES)
+        Filled: the covariance at each node, the transition to the next, the covariance foreseen.
+    d : ndarray, shape (m, STATES)
+        Filled: what the measurements of each stretch have taught.
+    joined : ndarray of int, shape (m,)
+        Filled: 1 where nothing began anew within the stretch.
+    """
+    s, copy = states[0], states[1]
+    i_baro, i_gps = 0, 0
+    for k in range(nodes.shape[0] - 1):
+        begin_node(s, p, P[k], F[k])
+        states[1] = states[0]
+        for i in range(nodes[k], nodes[k + 1]):
+            now = imu_time_us[i]
+            while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
+                take_baro(s, p, baro_alt_m[i_baro])
+                i_baro += 1
+            while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
+                take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
+                i_gps += 1
+            r = imu[i]
+            take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
+            move_copy(copy, p, now, r, F[k])
+            write_output(s if s.restarts != copy.restarts else copy, out[i])
+        propagate(s, p)
+        foresee(copy, p, F[k])
+        for i in range(STATES):
+            for j in range(STATES):
+                foreseen[k, i, j] = copy.P[i, j]
+        learned(s, copy, d[k])
+        joined[k] = 1 if s.restarts == copy.restarts and s.started == copy.started else 0

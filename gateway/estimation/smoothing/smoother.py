@@ -1,0 +1,175 @@
+"""A recorded flight from both ends: the Rauch-Tung-Striebel smoother over the Kalman filter.
+
+Forwards the filter runs as live. Backwards, each node hears from the next by how much the
+measurements from there on have moved it, as far as the two hang together [1]_. An outage is bridged
+from its end as well as from its begin. Where the filter began anew, as after a lost attitude, what
+came later says nothing of what was before.
+
+References
+----------
+.. [1] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic
+   systems", AIAA Journal 3(8), 1965.
+"""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_POS_STD,
+    NAV_QUAT,
+    NAV_VEL,
+    NAV_VEL_STD,
+)
+from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.smoothing.forward import run_forward
+from gateway.geometry.geodesy import radii_m
+
+NODE_S: Final = 0.2
+"""From node to node; between them the corrections are interpolated."""
+LEAST_VAR: Final = 1e-24
+RIDGE: Final = 1e-9
+"""Share of its own variance that each state foreseen is blurred by, so that all can be divided."""
+BLOCK: Final = 256
+"""Nodes whose gains are computed at once."""
+BYTES_PER_SECOND: Final = round(3 * 8 * STATES * STATES / NODE_S)
+"""Memory that a second of flight takes."""
+
+
+def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
+    """Smooth a whole log.
+
+    Parameters
+    ----------
+    estimator : KernelEstimator
+        The Kalman filter, fresh or in a state to go on from; it is left as it was.
+    log : SampleLog
+        At each IMU sample, the barometer samples and fixes that are not later come first. Takes
+        `BYTES_PER_SECOND` of memory.
+
+    Returns
+    -------
+    ndarray, shape (n, NAV_COLUMNS)
+        One row per IMU sample; flags and rates are the filter's.
+    """
+    state = estimator.state
+    states = np.zeros(2, np.asarray(state).dtype)
+    states[0] = state
+    nodes = _nodes(log.imu_time_us)
+    count = len(nodes) - 1
+    out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+    P, F, foreseen = (np.empty((count, STATES, STATES)) for _ in range(3))
+    d, joined = np.empty((count, STATES)), np.zeros(count, np.int64)
+    run_forward(
+        states, estimator.gains, nodes,
+        log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
+        out, P, F, foreseen, d, joined,
+    )  # fmt: skip
+    begins, ends = _backward(P, F, foreseen, d, joined, states[0]["P"])
+    _correct(out, log.imu_time_us, nodes, begins, ends, P, joined)
+    return out
+
+
+def _nodes(time_us: IntArray) -> IntArray:
+    """Lay the nodes: indices of the first sample in each `NODE_S`, and the end."""
+    if len(time_us) == 0:
+        return np.zeros(1, np.int64)
+    slot = (time_us - time_us[0]) // round(NODE_S * 1e6)
+    firsts = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1) != 0)
+    return np.append(firsts, len(time_us)).astype(np.int64)
+
+
+def _backward(
+    P: FloatArray,
+    F: FloatArray,
+    foreseen: FloatArray,
+    d: FloatArray,
+    joined: IntArray,
+    last_P: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Recurse from the end, whose covariance is `last_P`.
+
+    Returns
+    -------
+    begins, ends : ndarray, shape (m, STATES)
+        By how much the begin of each stretch is off, and what was foreseen for its end; the
+        smoothed covariance at each node takes the place of `P`.
+    """
+    count = len(d)
+    begins, ends = np.zeros((count, STATES)), np.zeros((count, STATES))
+    later, later_P = np.zeros(STATES), last_P
+    for k in range(count - 1, -1, -1):
+        if k % BLOCK == BLOCK - 1 or k == count - 1:
+            first = k - k % BLOCK
+            gains = _gains(P[first : k + 1], F[first : k + 1], foreseen[first : k + 1])
+        if joined[k] == 0:
+            later, later_P = np.zeros(STATES), P[k].copy()
+            continue
+        gain = gains[k - first]
+        ends[k] = d[k] + later
+        later = begins[k] = gain @ ends[k]
+        P[k] += gain @ (later_P - foreseen[k]) @ gain.T
+        later_P = P[k].copy()
+    return begins, ends
+
+
+def _gains(P: FloatArray, F: FloatArray, foreseen: FloatArray) -> FloatArray:
+    """Compute `P F^T foreseen^-1` for many nodes, by correlations, which are all of one size."""
+    scale = np.sqrt(np.maximum(np.diagonal(foreseen, axis1=1, axis2=2), LEAST_VAR))
+    norm = foreseen / (scale[:, :, None] * scale[:, None, :]) + RIDGE * np.eye(STATES)
+    gains = np.linalg.solve(norm, (F @ P) / scale[:, :, None]).transpose(0, 2, 1)
+    return np.asarray(gains / scale[:, None, :])
+
+
+def _correct(
+    out: FloatArray,
+    time_us: IntArray,
+    nodes: IntArray,
+    begins: FloatArray,
+    ends: FloatArray,
+    P: FloatArray,
+    joined: IntArray,
+) -> None:
+    """Move what was foreseen by the corrections between the nodes, and tell the new accuracies."""
+    stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
+    if len(stretch) == 0:
+        return
+    # A stretch begins at the last sample of the one before.
+    start_us = time_us[np.maximum(nodes[:-1] - 1, 0)]
+    length = np.maximum(time_us[nodes[1:] - 1] - start_us, 1)
+    share = ((time_us - start_us[stretch]) / length[stretch])[:, None]
+    off = (1.0 - share) * begins[stretch] + share * ends[stretch]
+    out[:, NAV_QUAT : NAV_QUAT + 4] = _turned(
+        off[:, TILT : TILT + 3], out[:, NAV_QUAT : NAV_QUAT + 4]
+    )
+    out[:, NAV_VEL : NAV_VEL + 3] += off[:, VEL : VEL + 3]
+    known = np.flatnonzero(np.isfinite(out[:, NAV_LAT]))
+    if len(known):
+        lat_deg = float(out[known[0], NAV_LAT])
+        meridian_m, parallel_m = radii_m(lat_deg, 0.0)
+        out[:, NAV_LAT] += np.degrees(off[:, POS] / meridian_m)
+        out[:, NAV_LON] += np.degrees(off[:, POS + 1] / parallel_m)
+    out[:, NAV_ALT] -= off[:, POS + 2]
+    variances = np.diagonal(P, axis1=1, axis2=2)
+    following = variances[np.minimum(stretch + 1, len(variances) - 1)]
+    std = np.sqrt(np.maximum((1.0 - share) * variances[stretch] + share * following, 0.0))
+    for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
+        told = np.isfinite(out[:, column]) & (joined[stretch] == 1)
+        out[told, column : column + 3] = std[told, first : first + 3]
+
+
+def _turned(turn: FloatArray, q: FloatArray) -> FloatArray:
+    """Turn attitudes by small rotation vectors in NED, shape (n, 3) and (n, 4)."""
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    w, v = np.cos(0.5 * angle), turn * (0.5 * np.sinc(0.5 * angle / math.pi))
+    vector = w * q[:, 1:] + q[:, :1] * v + np.cross(v, q[:, 1:])
+    scalar = w * q[:, :1] - np.sum(v * q[:, 1:], axis=1, keepdims=True)
+    return np.hstack([scalar, vector])

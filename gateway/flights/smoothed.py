@@ -1,0 +1,132 @@
+"""Recorded flights smoothed from both ends, in place of what the estimator told as it flew."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from gateway.aircraft import AircraftSettings, make_fusion
+from gateway.estimation.columns import (
+    GPS_COLUMNS,
+    IMU_COLUMNS,
+    GpsRow,
+    ImuRow,
+    imu_row,
+    nav_state,
+)
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.smoothing.smoother import smooth
+from gateway.flights.reading import FlightError
+from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, NavState
+from gateway.sensing.chain import SensorChain
+
+SMOOTHED_ESTIMATOR: Final = "eskf"
+"""The filter that the smoother goes over."""
+
+
+def with_smoothed_estimator(aircraft: AircraftSettings) -> AircraftSettings:
+    """Choose the estimator that can be smoothed."""
+    estimation = msgspec.structs.replace(aircraft.estimation, estimator=SMOOTHED_ESTIMATOR)
+    return msgspec.structs.replace(aircraft, estimation=estimation)
+
+
+def smooth_records(
+    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated], aircraft: AircraftSettings
+) -> tuple[IntArray, FloatArray]:
+    """Smooth the records of one aircraft.
+
+    Parameters
+    ----------
+    records : iterable of record
+        Raw or calibrated samples and fixes, in the order in which they came.
+    aircraft : AircraftSettings
+        Calibration, filters, and the settings of the Kalman filter.
+
+    Returns
+    -------
+    time_us : ndarray, shape (n,)
+        Of the IMU samples.
+    states : ndarray, shape (n, NAV_COLUMNS)
+        See `gateway.estimation.columns`.
+
+    Raises
+    ------
+    FlightError
+        If the clock went back: there is no order to smooth in.
+    """
+    chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
+    if not isinstance(estimator, KernelEstimator):
+        raise TypeError(f"{SMOOTHED_ESTIMATOR} is {type(estimator)}, which cannot be smoothed")
+    log = _gathered(records, chain, estimator)
+    if np.any(np.diff(log.imu_time_us) < 0):
+        raise FlightError("its clock goes back, so it cannot be smoothed; cut it there")
+    return log.imu_time_us, smooth(estimator, log)
+
+
+class SmoothedStates:
+    """Puts the smoothed state of its time in place of each state.
+
+    Parameters
+    ----------
+    time_us : ndarray, shape (n,)
+        In order.
+    states : ndarray, shape (n, NAV_COLUMNS)
+        At these times.
+    """
+
+    def __init__(self, time_us: IntArray, states: FloatArray) -> None:
+        self._time_us, self._states = time_us, states
+
+    def __call__(self, state: NavState) -> NavState:
+        """Look the time up; a state of another time stays."""
+        at = int(np.searchsorted(self._time_us, state.time_us))
+        if at == len(self._time_us) or self._time_us[at] != state.time_us:
+            return state
+        smoothed = nav_state(state.time_us, self._states[at])
+        return replace(smoothed, flags=state.flags)
+
+
+def _gathered(
+    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated],
+    chain: SensorChain,
+    estimator: KernelEstimator[Any, Any],
+) -> SampleLog:
+    imu_us: list[int] = []
+    imu: list[ImuRow] = []
+    baro_us: list[int] = []
+    baro: list[float] = []
+    gps_us: list[int] = []
+    gps: list[GpsRow] = []
+    for record in records:
+        match record:
+            case BaroRaw():
+                baro_us.append(record.time_us)
+                baro.append(chain.baro(record).alt_pressure_m)
+            case GpsFix():
+                gps_us.append(record.time_us)
+                gps.append(estimator.fix_row(record))
+            case ImuRaw():
+                imu_us.append(record.time_us)
+                imu.append(imu_row(chain.imu(record)))
+            case _:
+                imu_us.append(record.time_us)
+                sample = chain.imu_si(
+                    record.time_us,
+                    record.accel_b_mps2,
+                    record.gyro_b_radps,
+                    record.mag_b_ut,
+                    record.temperature_degc,
+                    record.flags,
+                )
+                imu.append(imu_row(sample))
+    return SampleLog(
+        imu_time_us=np.array(imu_us, np.int64),
+        imu=np.array(imu, np.float64).reshape(-1, IMU_COLUMNS),
+        baro_time_us=np.array(baro_us, np.int64),
+        baro_alt_m=np.array(baro, np.float64),
+        gps_time_us=np.array(gps_us, np.int64),
+        gps=np.array(gps, np.float64).reshape(-1, GPS_COLUMNS),
+    )
