@@ -6,6 +6,7 @@ refused with all its errors at once, each with file, key, value and what is allo
 
 import difflib
 import errno
+import stat
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping, MutableMapping
@@ -144,12 +145,7 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
         If the file cannot be written, or what is there is no TOML, which is left alone.
     """
     file = aircraft_file(settings, vehicle_id)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        document = tomlkit.parse(file.read_text(encoding="utf-8")) if file.exists() else None
-    except ValueError as error:
-        raise OSError(errno.EINVAL, "is no TOML: mend or remove it", str(file)) from error
-    document = document or tomlkit.document()
+    document = _document(file)
     values = msgspec.to_builtins(aircraft)
     try:
         msgspec.convert(values, AircraftSettings)
@@ -157,8 +153,56 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
         raise OSError(errno.EINVAL, f"would not be read again: {error}", str(file)) from error
     _write_difference(document, msgspec.to_builtins(settings.default_aircraft), values)
     # It may hold a passphrase, whatever the file had before.
-    write_new(file, [tomlkit.dumps(document).encode()], overwrite=True, rights=PRIVATE)
+    _write_document(file, document, PRIVATE)
     return file
+
+
+def save_endpoint(file: Path, url: str) -> None:
+    """Add an endpoint to those of a settings file, which is made if it is not there.
+
+    Comments and order are kept; the file is replaced whole or not at all.
+
+    Parameters
+    ----------
+    file : Path
+        The settings file.
+    url : str
+        The endpoint.
+
+    Raises
+    ------
+    ConfigError
+        If the file is wrong, or would be with this endpoint.
+    OSError
+        If it cannot be written.
+    """
+    settings = load(file) if file.exists() else GatewaySettings()
+    urls = [*settings.hub.endpoints, url]
+    try:
+        msgspec.structs.replace(settings.hub, endpoints=tuple(urls))
+    except ValueError as error:
+        raise ConfigError(f"{file}: {error}") from error
+    document = _document(file)
+    table = document.setdefault("hub", tomlkit.table())
+    if "endpoints" in table:
+        table["endpoints"].append(url)
+    else:
+        table["endpoints"] = urls
+    # A service must still be able to read what root changed for it.
+    rights = stat.S_IMODE(file.stat().st_mode) if file.exists() else PRIVATE
+    _write_document(file, document, rights)
+
+
+def _document(file: Path) -> Any:
+    try:
+        return tomlkit.parse(file.read_text(encoding="utf-8") if file.exists() else "")
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "is no TOML: mend or remove it", str(file)) from error
+
+
+def _write_document(file: Path, document: Any, rights: int) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_new(file, [tomlkit.dumps(document).encode()], overwrite=True, rights=rights)
 
 
 def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:

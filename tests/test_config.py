@@ -14,6 +14,7 @@ from gateway.config import (
     load_aircraft,
     render,
     save_aircraft,
+    save_endpoint,
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
@@ -233,3 +234,24 @@ def test_a_file_that_is_broken_while_it_runs_is_left_alone(settings: GatewaySett
     with pytest.raises(OSError, match="mend or remove it"):
         save_aircraft(settings, 3, settings.default_aircraft)
     assert file.read_bytes() == b"[vehicle\xff"
+
+
+def test_an_endpoint_is_added_to_the_file_for_good(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "gateway.toml"
+    save_endpoint(file, "tcp-listen:127.0.0.1:5760")
+    assert load(file).hub.endpoints == (
+        *GatewaySettings().hub.endpoints,
+        "tcp-listen:127.0.0.1:5760",
+    )
+    file.write_text('# mine\n[hub]\nendpoints = [\n  "udp:127.0.0.1:1", # here\n]\n')
+    file.chmod(0o644)
+    save_endpoint(file, "udp:127.0.0.1:2")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o644, "a service can still read it"
+    assert load(file).hub.endpoints == ("udp:127.0.0.1:1", "udp:127.0.0.1:2")
+    assert "# mine" in file.read_text()
+    assert "# here" in file.read_text()
+    before = file.read_text()
+    for wrong in ("udp:127.0.0.1:2", "nonsense"):
+        with pytest.raises(ConfigError):
+            save_endpoint(file, wrong)
+    assert file.read_text() == before

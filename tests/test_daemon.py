@@ -1,8 +1,11 @@
 """The composition root: what is recorded of whom."""
 
+import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
@@ -88,3 +91,39 @@ def test_a_stranger_that_asks_without_end_fills_no_disk(
     told = Outgoing(b"telemetry", 30, None)
     daemon._perform([told])
     assert recorded[-1] == b"telemetry", "all the same"
+
+
+@pytest.mark.parametrize("due_us", [0, 999_000_000])
+async def test_what_is_due_is_neither_asked_for_without_rest_nor_forgotten(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, due_us: int
+) -> None:
+    """Something that stays due must not turn the loop into a busy one."""
+    delays: list[float] = []
+    monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
+    monkeypatch.setattr(daemon._pipeline, "next_due_us", lambda: due_us)
+    loop = asyncio.get_running_loop()
+    call_later = loop.call_later
+
+    def note(delay_s: float, *call: Any) -> asyncio.TimerHandle:
+        delays.append(delay_s)
+        return call_later(3600.0, *call)
+
+    monkeypatch.setattr(loop, "call_later", note)
+    daemon._poll()
+    assert 0.001 <= delays[-1] <= 0.1
+    assert daemon._timer is not None
+    daemon._timer.cancel()
+
+
+@pytest.mark.parametrize("estimator", ["complementary", "eskf"])
+async def test_a_reload_tells_of_what_needs_a_new_start(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, estimator: str
+) -> None:
+    now = daemon._settings
+    changed = replace(now, estimation=replace(now.estimation, estimator=estimator))
+    monkeypatch.setattr(daemon, "_read", lambda: changed)
+    told = daemon.reload()
+    assert told.startswith("settings of the hub and of signing applied")
+    assert ("others need a new start" in told) == (estimator != now.estimation.estimator)
+    daemon._metrics.close()
+    daemon._hub.close()

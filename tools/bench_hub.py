@@ -122,6 +122,8 @@ class Latency:
     max_us: float
     cpu_percent: float
     lost: int
+    gap_us: float
+    """The longest time in which a client heard nothing."""
 
 
 def python(code: str) -> Command:
@@ -278,6 +280,8 @@ class Bench:
             max_us=float(times_us.max()),
             cpu_percent=100 * used_ns / elapsed_ns,
             lost=len(sent_ns) * len(stamps) - sum(self._counts),
+            gap_us=max((float(np.diff(row).max()) for row in stamps if len(row) > 1), default=0.0)
+            / 1000,
         )
 
     def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:

@@ -39,7 +39,7 @@ class ClientStats:
     sent: int
     """Frames handed to the network."""
     dropped: int
-    """Frames given up: refused, unreachable, or older than newer ones in a full queue."""
+    """Frames given up: unreachable, or older than newer ones in a full queue."""
     bytes_sent: int
     received: int
     bytes_received: int
@@ -52,6 +52,8 @@ class ClientStats:
     round_trip_us: int | None
     reason: str = ""
     """Why nothing goes out, in the words of the operating system; empty if it does."""
+    unheard: int = 0
+    """Frames for a port at which nobody listened: no loss of the link's."""
 
 
 @dataclass(frozen=True, slots=True)

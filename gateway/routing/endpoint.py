@@ -28,6 +28,9 @@ from gateway.routing.spelling import respell
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
+BITS_PER_BYTE: Final = 10
+"""On a serial line: start bit, eight data bits, stop bit."""
+MAX_BUDGET: Final = 1_000_000_000
 MAX_PACK_BYTES: Final = 1100
 """Routers on the way cut or drop datagrams beyond 1120 bytes."""
 MAX_PORT: Final = 65535
@@ -81,7 +84,7 @@ OPEN_TO_ALL: Final = frozenset(
 """Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that speak within TLS."""
-COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "trusted"})
+COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "budget", "trusted"})
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
     EndpointKind.WSS: frozenset({"path"}),
@@ -123,6 +126,8 @@ class Endpoint:
     """Least time between two frames of a message, by message id."""
     pack_bytes: int = 0
     """Gather frames into datagrams or messages of up to this size; 0 sends each on its own."""
+    budget: int = 0
+    """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers may."""
     origins: frozenset[str] = frozenset()
@@ -142,6 +147,10 @@ class Endpoint:
         whole = self.kind in (EndpointKind.SERIAL, EndpointKind.ZENOH) or self.kind in ADDED_KINDS
         return self.host if whole else host_and_port(self.host, self.port)
 
+    def name_of(self, peer: str) -> str:
+        """Return what a caller of a listening endpoint is called, the name of the port first."""
+        return peer if self.name == self.place else f"{self.name} {peer}"
+
     def passes(self, message_id: int) -> bool:
         """Return whether the lists let a message out to this endpoint."""
         return message_id not in self.deny and (not self.allow or message_id in self.allow)
@@ -155,7 +164,8 @@ def parse_endpoint(url: str) -> Endpoint:
     url : str
         As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
         separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
-        `trusted` (yes or no), and of some kinds `origins` (separated by commas) or `path`.
+        `budget` (bytes a second), `trusted` (yes or no), and of some kinds `origins` (separated by
+        commas) or `path`.
 
     Returns
     -------
@@ -183,6 +193,7 @@ def parse_endpoint(url: str) -> Endpoint:
             deny=_messages(options.get("deny", "")),
             interval_us=_intervals(options.get("rate", "")),
             pack_bytes=_pack_bytes(options.get("pack", "0")),
+            budget=_budget(kind, port, options.get("budget")),
             trusted=_yes_or_no(options.get("trusted")),
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
@@ -335,6 +346,13 @@ def _intervals(text: str) -> dict[int, int]:
         interval = round(US_PER_S / rate_hz) if rate_hz else NO_MESSAGES
         intervals[message_id_from(message)] = interval
     return intervals
+
+
+def _budget(kind: str, baud: int, text: str | None) -> int:
+    """Read the width of a link; a serial line carries no more than its baud rate."""
+    if text is not None:
+        return _number(text, "budget", 0, MAX_BUDGET)
+    return baud // BITS_PER_BYTE if kind == EndpointKind.SERIAL else 0
 
 
 def _pack_bytes(text: str) -> int:

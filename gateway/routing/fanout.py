@@ -10,6 +10,9 @@ gap in the sequence numbers there, which ground stations show as loss of the rad
 frames are numbered anew for those outlets: each outlet remembers how many it was not given, and
 all outlets that lack the same number share one copy, which is signed too if our vehicle signs.
 Frames of other vehicles are never touched; a filter on those does show as loss.
+
+What goes to an outlet of a known width is counted, and thinned once a second so that it fits: see
+`width.py`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -18,6 +21,8 @@ from typing import Final
 
 from gateway.records import ClientInterval
 from gateway.routing.endpoint import NO_MESSAGES, Endpoint
+from gateway.routing.limits.width import HIGH_LATENCY2, HIGH_LATENCY2_BYTES, NARROW, Width
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import (
     key_of,
@@ -50,6 +55,9 @@ class _Outlet:
     client_id: int
     transmit: Transmit
     endpoint: Endpoint
+    width: Width | None = None
+    answered: int = 0
+    """Bytes of answers since the last plan of the width."""
     wishes: dict[tuple[int, int], int] = field(default_factory=dict)
     stamps: dict[tuple[int, int], _Stamp] = field(default_factory=dict)
 
@@ -58,13 +66,23 @@ class _Outlet:
             self.stamps.clear()
         return self.stamps.setdefault(origin, _Stamp())
 
-    def interval_us(self, system: int, message_id: int) -> int:
+    def interval_us(self, key: bytes, plan: "_Plan") -> int:
         """Return the least time between two frames; the settings bound what a client wishes."""
-        if not self.endpoint.passes(message_id):
+        endpoint, message_id, system = self.endpoint, plan.message_id, plan.origin[0]
+        if not endpoint.passes(message_id):
             return NO_MESSAGES
-        limit = self.endpoint.interval_us.get(message_id, 0)
+        if 0 < endpoint.budget < NARROW:
+            if message_id != HIGH_LATENCY2:
+                return NO_MESSAGES
+            return round(HIGH_LATENCY2_BYTES * US_PER_S / endpoint.budget)
+        if message_id == HIGH_LATENCY2 and plan.is_ours and message_id not in endpoint.allow:
+            # All that it says goes there in full.
+            return NO_MESSAGES
+        limit = endpoint.interval_us.get(message_id, 0)
         wish = self.wishes.get((system, message_id), 0)
-        return NO_MESSAGES if NO_MESSAGES in (limit, wish) else max(limit, wish)
+        if NO_MESSAGES in (limit, wish):
+            return NO_MESSAGES
+        return max(limit, wish, self.width.interval_us(key) if self.width else 0)
 
 
 @dataclass(slots=True, eq=False)
@@ -88,6 +106,8 @@ class _Lane:
 @dataclass(slots=True)
 class _Plan:
     message_id: int
+    origin: tuple[int, int]
+    is_ours: bool
     open: list[_Lane] = field(default_factory=list)
     limited: list[_Lane] = field(default_factory=list)
     closed: list[_Stamp] = field(default_factory=list)
@@ -116,22 +136,28 @@ class Fanout:
         self._seal = seal
         self._outlets: dict[int, _Outlet] = {}
         self._plans: dict[bytes, _Plan] = {}
+        self._is_metered = False
+        self._offered: dict[bytes, tuple[int, int, int]] = {}
+        """Message id, frames and bytes of each kind since the last plan of the widths."""
+        self._thinned_us = 0
 
     def add(self, client_id: int, transmit: Transmit, endpoint: Endpoint) -> None:
         """Let an outlet take part from the next frame on."""
-        self._outlets[client_id] = _Outlet(client_id, transmit, endpoint)
-        self._plans.clear()
+        self._outlets[client_id] = _Outlet(client_id, transmit, endpoint, _width(endpoint))
+        self._change()
 
     def remove(self, client_id: int) -> None:
         """Forget an outlet; unknown ids are ignored."""
         if self._outlets.pop(client_id, None):
-            self._plans.clear()
+            self._change()
 
     def reconfigure(self, client_id: int, endpoint: Endpoint) -> None:
         """Let changed lists and rates hold from the next frame on."""
         if outlet := self._outlets.get(client_id):
+            if outlet.endpoint.budget != endpoint.budget:
+                outlet.width = _width(endpoint)
             outlet.endpoint = endpoint
-            self._plans.clear()
+            self._change()
 
     def set_interval(self, wish: ClientInterval) -> None:
         """Take a client's wish for a rate; a wish of a client that has gone is ignored."""
@@ -141,8 +167,10 @@ class Fanout:
 
     def publish(self, frame: bytes, now_us: int) -> None:
         """Send one of our own frames to every outlet that takes it."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=True)
         message_id = plan.message_id
+        if self._is_metered:
+            self.meter(key_of(frame), message_id, 1, len(frame))
         sequence = sequence_of(frame)
         copies = {0: self._seal(frame, sequence)}
         for lane in plan.due(now_us) if plan.limited else plan.open:
@@ -174,6 +202,7 @@ class Fanout:
         for outlet in tuple(self._outlets.values()):
             stamp = outlet.stamp_of(origin)
             if outlet.client_id in client_ids:
+                outlet.answered += len(frame)
                 sequence = sequence_of(frame) - stamp.skipped & SEQUENCE_MASK
                 outlet.transmit(self._seal(frame, sequence), message_id_of(frame))
             else:
@@ -181,7 +210,9 @@ class Fanout:
 
     def forward(self, frame: bytes, source_id: int, now_us: int) -> None:
         """Pass another system's broadcast on to all outlets but the one it came from."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=False)
+        if self._is_metered:
+            self.meter(key_of(frame), plan.message_id, 1, len(frame))
         for lane in plan.open:
             if lane.client_id != source_id:
                 lane.transmit(frame, plan.message_id)
@@ -191,7 +222,7 @@ class Fanout:
 
     def takers(self, frame: bytes, source_id: int) -> list[int] | None:
         """Return who gets all frames like this one from a source; None if that varies."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame)
+        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=False)
         if plan.limited:
             return None
         return [lane.client_id for lane in plan.open if lane.client_id != source_id]
@@ -201,16 +232,67 @@ class Fanout:
         message_id = message_id_of(frame)
         for client_id in client_ids:
             if outlet := self._outlets.get(client_id):
+                outlet.answered += len(frame)
                 outlet.transmit(frame, message_id)
 
-    def _make_plan(self, frame: bytes) -> _Plan:
+    def thin(self, now_us: int) -> bool:
+        """Fit what goes to outlets of a known width into it; to be called once a second or so.
+
+        Returns
+        -------
+        bool
+            Whether somebody who got all frames of a kind gets fewer now, or all of them again.
+        """
+        if not self._is_metered or now_us - self._thinned_us < US_PER_S:
+            return False
+        elapsed_s = (now_us - self._thinned_us) / US_PER_S
+        self._thinned_us = now_us
+        for outlet in self._outlets.values():
+            if outlet.width is not None:
+                outlet.width.plan(self._offered, outlet.answered, elapsed_s)
+                outlet.answered = 0
+        self._offered = {}
+        stale = [key for key, plan in self._plans.items() if self._rethin(key, plan)]
+        for key in stale:
+            del self._plans[key]
+        return bool(stale)
+
+    def _rethin(self, key: bytes, plan: _Plan) -> bool:
+        """Give a plan's lanes their new intervals; return whether one belongs elsewhere now."""
+        is_stale = False
+        for lanes, is_limited in ((plan.open, False), (plan.limited, True)):
+            for lane in lanes:
+                outlet = self._outlets[lane.client_id]
+                if outlet.width is not None:
+                    # In place: a lane that began anew would send at once.
+                    lane.interval_us = outlet.interval_us(key, plan)
+                    is_stale |= (lane.interval_us > 0) != is_limited
+        return is_stale
+
+    def meter(self, key: bytes, message_id: int, frames: int, size: int) -> None:
+        """Note frames that went to all who take them, on whatever way."""
+        _, known_frames, known_size = self._offered.get(key, (0, 0, 0))
+        if self._is_metered and len(self._offered) < MAX_PLANS:
+            self._offered[key] = message_id, known_frames + frames, known_size + size
+
+    def note_buffer(self, client_id: int, free_percent: int) -> None:
+        """Take in how much of the buffer of an outlet's radio is free."""
+        outlet = self._outlets.get(client_id)
+        if outlet is not None and outlet.width is not None:
+            outlet.width.note_buffer(free_percent)
+
+    def _change(self) -> None:
+        self._plans.clear()
+        self._is_metered = any(outlet.width for outlet in self._outlets.values())
+
+    def _make_plan(self, frame: bytes, *, is_ours: bool) -> _Plan:
         if len(self._plans) >= MAX_PLANS:
             self._plans.clear()
-        plan = _Plan(message_id_of(frame))
         origin = origin_of(frame)
+        plan = _Plan(message_id_of(frame), origin, is_ours)
         for outlet in self._outlets.values():
             stamp = outlet.stamp_of(origin)
-            interval_us = outlet.interval_us(origin[0], plan.message_id)
+            interval_us = outlet.interval_us(key_of(frame), plan)
             lane = _Lane(outlet.client_id, outlet.transmit, stamp, interval_us)
             if interval_us == NO_MESSAGES:
                 plan.closed.append(stamp)
@@ -224,3 +306,7 @@ class Fanout:
 
 def _skip(stamp: _Stamp) -> None:
     stamp.skipped = (stamp.skipped + 1) & SEQUENCE_MASK
+
+
+def _width(endpoint: Endpoint) -> Width | None:
+    return Width(endpoint.budget) if endpoint.budget >= NARROW else None

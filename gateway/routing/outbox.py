@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+from gateway.routing.endpoint import BITS_PER_BYTE
 from gateway.routing.routing_table import MAX_ORIGINS, Origin
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
@@ -34,10 +35,6 @@ URGENT_RUN: Final = 4
 """Urgent frames in a row before one of another queue has its turn."""
 
 SEQUENCE_MASK: Final = 0xFF
-BITS_PER_BYTE: Final = 10
-"""Start bit, eight data bits, stop bit."""
-
-
 Waiting = tuple[bytes, int | None]
 """A frame and its step."""
 

@@ -38,6 +38,9 @@ class RateSettings(Settings, frozen=True):
     home_position_hz: Annotated[float, _rate("HOME_POSITION")] = 1.0
     mission_current_hz: Annotated[float, _rate("MISSION_CURRENT")] = 1.0
     radio_status_hz: Annotated[float, _rate("RADIO_STATUS")] = 1.0
+    high_latency2_hz: Annotated[
+        float, _rate("HIGH_LATENCY2, to links of less than 100 bytes a second alone,")
+    ] = 0.2
     battery_status_hz: Annotated[float, _rate("BATTERY_STATUS of each node")] = 1.0
 
 

@@ -32,6 +32,8 @@ OVERHEAD_V2: Final = 12
 SIGNATURE_SIZE: Final = 13
 HEARTBEAT_TYPE_OFFSET: Final = 4
 MAV_TYPE_GCS: Final = 6
+TXBUF_OFFSET: Final = 6
+"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
 
@@ -145,6 +147,12 @@ def is_station_heartbeat(frame: bytes) -> bool:
     """
     begin = 10 if frame[0] == START_V2 else 6
     return frame[1] > HEARTBEAT_TYPE_OFFSET and frame[begin + HEARTBEAT_TYPE_OFFSET] == MAV_TYPE_GCS
+
+
+def free_percent(frame: bytes) -> int:
+    """Return how much of its buffer the sender of a RADIO_STATUS has free."""
+    begin = 10 if frame[0] == START_V2 else 6
+    return frame[begin + TXBUF_OFFSET] if frame[1] > TXBUF_OFFSET else 0
 
 
 def is_signed(frame: bytes) -> bool:

@@ -232,3 +232,9 @@ def test_any_text_is_an_endpoint_that_can_be_used_or_is_refused_by_name(url: str
     assert all(us == NO_MESSAGES or 0 < us < 1 << 40 for us in endpoint.interval_us.values())
     again = parse_endpoint(endpoint.place)
     assert (again.kind, again.host, again.port) == (endpoint.kind, endpoint.host, endpoint.port)
+
+
+def test_a_caller_keeps_the_name_of_its_port() -> None:
+    named = parse_endpoint("udp-listen:0.0.0.0:14551?name=tablets")
+    assert named.name_of("10.0.0.7:3000") == "tablets 10.0.0.7:3000"
+    assert parse_endpoint("udp-listen:0.0.0.0:14551").name_of("10.0.0.7:3000") == "10.0.0.7:3000"

@@ -1,7 +1,7 @@
 """Requests in turns, answers within each client's means; on the manual clock."""
 
 from gateway.records import Incoming
-from gateway.routing.request_queue import (
+from gateway.routing.limits.request_queue import (
     CLIENT_BURST,
     CLIENT_RATE,
     MAX_WAITING,

@@ -1,6 +1,7 @@
 """`mavgate status`, `clients …`, `mark`, `reload`: a gateway that runs, and its clients."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -9,6 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, JsonOption, console_of, table_of
 from gateway.units import US_PER_S
 
@@ -57,13 +60,31 @@ def list_clients(*, json: JsonOption = False) -> None:
 @group.command()
 def add(
     url: Annotated[str, typer.Argument(help="As in the settings: udp:192.168.1.7:14550?name=…")],
+    *,
+    save: Annotated[
+        bool, typer.Option("--save", help="Into the settings file too, for the next start.")
+    ] = False,
+    config: ConfigOption = None,
 ) -> None:
-    """Add a client or a source until the gateway ends."""
+    """Add a client or a source until the gateway ends, or for good."""
     _show_endpoints(ask("clients.add", {"url": url}))
+    if save:
+        _save(config or USER_CONFIG.expanduser(), url)
     snapshot = ask("status")
     for added in (*snapshot["listeners"], *snapshot["clients"]):
         if added["endpoint"] == url and added["reason"]:
             print(f"{added['name']}: {added['reason']}; trying again until it works")
+
+
+def _save(file: Path, url: str) -> None:
+    # Not above: the settings import every stage.
+    from gateway.config import ConfigError, save_endpoint
+
+    try:
+        save_endpoint(file, url)
+    except (ConfigError, OSError) as error:
+        refuse(f"added, but not saved: {error}")
+    print(f"saved in {file}")
 
 
 @group.command()

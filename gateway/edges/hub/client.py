@@ -73,6 +73,8 @@ class Client:
         """Take over changed options of the same place."""
         if self.name == self.endpoint.name:
             self.name = endpoint.name
+        elif self.name == self.endpoint.name_of(self.remote):
+            self.name = endpoint.name_of(self.remote)
         self.endpoint = endpoint
         self.trusted = _is_trusted(endpoint, self.remote)
         self.context.reconfigure(self)
@@ -120,7 +122,6 @@ class Client:
             endpoint=self.endpoint.url,
             remote=self.remote,
             state=self.state,
-            reason=self.reason,
             trusted=self.trusted,
             systems=systems,
             sent=counters.sent,
@@ -133,6 +134,8 @@ class Client:
             since_us=self.since_us,
             heard_us=self.heard_us,
             round_trip_us=self.round_trip_us,
+            reason=self.reason,
+            unheard=counters.unheard,
         )
 
 
@@ -167,6 +170,9 @@ class HubContext(Protocol):
 
     def reconfigure(self, client: Client) -> None:
         """Let a client's changed lists and rates hold."""
+
+    def note_buffer(self, client: Client, free_percent: int) -> None:
+        """Take in how much of the buffer of the radio behind a client is free."""
 
     def vanish(self, client: Client) -> None:
         """Forget a client and close it."""

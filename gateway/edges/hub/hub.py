@@ -248,6 +248,10 @@ class Hub:
         self._fanout.reconfigure(client.client_id, client.endpoint)
         self._router.reconfigure(client)
 
+    def note_buffer(self, client: Client, free_percent: int) -> None:
+        """Let what goes to a radio follow the room in its buffer."""
+        self._fanout.note_buffer(client.client_id, free_percent)
+
     def vanish(self, client: Client) -> None:
         """Close a client and forget it."""
         self._fanout.remove(client.client_id)

@@ -14,9 +14,11 @@ import serial
 
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US
-from gateway.routing.outbox import BITS_PER_BYTE, Numbering, Outbox, Pacer
+from gateway.routing.endpoint import BITS_PER_BYTE
+from gateway.routing.limits.width import RADIO_STATUS
+from gateway.routing.outbox import Numbering, Outbox, Pacer
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavlinkSplitter
+from gateway.wire.mavlink_splitter import MavlinkSplitter, free_percent, message_id_of
 
 log = logging.getLogger(__name__)
 
@@ -146,6 +148,10 @@ class RadioClient(Client):
             self._broke(error)
             return
         if data:
-            self.receive(self._splitter.feed(data), len(data), self.context.now_us())
+            events = self._splitter.feed(data)
+            for frame in events:
+                if isinstance(frame, bytes) and message_id_of(frame) == RADIO_STATUS:
+                    self.context.note_buffer(self, free_percent(frame))
+            self.receive(events, len(data), self.context.now_us())
         else:
             self._broke(OSError("the device hung up"))

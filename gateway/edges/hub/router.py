@@ -13,9 +13,9 @@ from gateway.edges.hub.client import Client
 from gateway.edges.hub.express import Express, GuardedExpress
 from gateway.records import Incoming
 from gateway.routing.fanout import Fanout
+from gateway.routing.limits.request_queue import RequestQueue
 from gateway.routing.probe import RoundTrip, is_of_probe
 from gateway.routing.redundancy import RedundantLinks
-from gateway.routing.request_queue import RequestQueue
 from gateway.routing.routing_table import ROUTE_FRESH_US, LoopGuard, Origin, RoutingTable
 from gateway.routing.vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.units import US_PER_S
@@ -107,8 +107,11 @@ class Router:
             self._requests.charge(payer, size * copies)
 
     def tick(self, now_us: int) -> None:
-        """Part links of which no copies come; judge the short ways anew now and then."""
+        """Part links of which no copies come, thin what is too much for a narrow one."""
         self._links.expire(now_us)
+        self.settle_express()
+        if self._fanout.thin(now_us):
+            self.forget_express()
         if now_us - self._judged_us >= ROUTE_FRESH_US:
             self._judged_us = now_us
             self.forget_express()
@@ -183,8 +186,11 @@ class Router:
     def settle_express(self) -> None:
         """Bring all counters up to date."""
         for client in self._express_sources:
-            for express in client.express.values():
-                self._forwarded += express.settle()
+            for key, express in client.express.items():
+                frames, size = express.settle()
+                self._forwarded += frames
+                if frames:
+                    self._fanout.meter(key, int.from_bytes(key[2:5], "little"), frames, size)
 
     def _is_copy(self, client: Client, origin: Origin, frame: bytes) -> bool:
         """Note a frame of a system that is heard by several ways; return whether it was here."""

@@ -284,7 +284,8 @@ class TcpListener(StreamListener[TcpPeer]):
 
     def _admit(self, connection: socket.socket, peer: str) -> None:
         client_id = self._context.new_client_id()
-        client = TcpPeer(self._context, client_id, self.endpoint, peer, peer, leave=self.leave)
+        name = self.endpoint.name_of(peer)
+        client = TcpPeer(self._context, client_id, self.endpoint, peer, name, leave=self.leave)
         self._clients[client_id] = client
         self._context.appear(client)
         client.adopt(connection)

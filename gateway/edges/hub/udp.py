@@ -17,6 +17,7 @@ from gateway.routing.outbox import Packer
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_frame, split_datagram
 
+NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
 """Datagrams taken at one wake-up, so that one flooding peer cannot starve the others."""
@@ -154,10 +155,13 @@ class DatagramClient(Client):
             self._wait(data)
             self._count_sent(frames, len(data))
             return
-        if isinstance(error, ConnectionRefusedError) and self._sends_after_refusal(data):
-            self._count_sent(frames, len(data))
+        if isinstance(error, ConnectionRefusedError):
+            if self._sends_after_refusal(data):
+                self._count_sent(frames, len(data))
+            else:
+                self.counters.unheard += frames
             return
-        if self._socket is not None and not isinstance(error, ConnectionRefusedError):
+        if self._socket is not None:
             self.become("unreachable", error)
         self.counters.dropped += frames
 
@@ -172,6 +176,7 @@ class DatagramClient(Client):
 
     def _note_refusal(self) -> None:
         self.become("refused")
+        self.reason = NOBODY_LISTENS
         self.refused_us = self.context.now_us()
 
     def _wait(self, data: bytes) -> None:

@@ -52,7 +52,7 @@ class UdpPeer(DatagramClient):
             self.write = self._hold
 
     def _hold(self, data: bytes) -> None:
-        self.counters.dropped += 1
+        self.counters.unheard += 1
         self.counters.sent -= 1
         self.counters.bytes_sent -= len(data)
 
@@ -145,7 +145,9 @@ class UdpListener(Listener[UdpPeer]):
             return None
         presence.identity = origin_of(first)
         peer = host_and_port(host, port)
-        client = UdpPeer(self._context, presence.client_id, self.endpoint, peer, peer)
+        client = UdpPeer(
+            self._context, presence.client_id, self.endpoint, peer, self.endpoint.name_of(peer)
+        )
         self._clients[presence.client_id] = client
         client.adopt(sock, sock.send)
         self._context.appear(client)

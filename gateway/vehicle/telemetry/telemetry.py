@@ -16,6 +16,7 @@ from gateway.vehicle.home import Home, is_good_enough, place_of
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
+from gateway.vehicle.telemetry.high_latency import high_latency2
 from gateway.vehicle.telemetry.motion import IN_AIR, Motion
 from gateway.vehicle.telemetry.streams import Stream, interval_us
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -39,6 +40,7 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
     mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
     mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
+    mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
 )
 
 HEARTBEAT_HZ: Final = 1.0
@@ -85,6 +87,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
+            mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
         }
         self._timed = [*TIMED_MESSAGES]
@@ -246,13 +249,21 @@ class Telemetry:
             mavlink.MAV_VTOL_STATE_UNDEFINED, self.motion.landed_state
         )
 
+    @property
+    def _type(self) -> int:
+        kind: int = getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}")
+        return kind
+
+    def _high_latency(self, now_us: int) -> Any:
+        return high_latency2(self._type, self.state, self.fix, self.health, now_us)
+
     def _heartbeat(self, now_us: int) -> Any:
         # Somebody else flies the aircraft by hand; the gateway only watches.
         base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         return mavlink.MAVLink_heartbeat_message(
-            getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}"),
+            self._type,
             mavlink.MAV_AUTOPILOT_GENERIC,
             base_mode,
             custom_mode=0,

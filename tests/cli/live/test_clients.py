@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from gateway.cli.app import app
 from gateway.cli.live import clients
+from gateway.config import load
 from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams, socket_path
 from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
@@ -219,6 +220,17 @@ def test_mark_takes_places_of_the_south_and_west(gateway: Gateway) -> None:
 
 def test_reload(gateway: Gateway) -> None:
     assert "applied" in run("reload").output
+
+
+def test_an_added_client_is_kept_on_demand(gateway: Gateway, tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+    answer = run("clients", "add", "udp:127.0.0.1:9", "--save", "--config", str(file))
+    assert answer.exit_code == 0
+    assert f"saved in {file}" in answer.output
+    assert "udp:127.0.0.1:9" in load(file).hub.endpoints
+    again = run("clients", "add", "udp:127.0.0.1:9", "--save", "--config", str(file))
+    assert again.exit_code == 2
+    assert "added, but not saved" in again.output
 
 
 def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from gateway.routing.request_queue import STRANGERS_BURST
+from gateway.routing.limits.request_queue import STRANGERS_BURST
 
 pytestmark = pytest.mark.io
 

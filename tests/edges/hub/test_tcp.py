@@ -8,6 +8,7 @@ import termios
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import common as dialect
 
 from gateway.routing.client_table import SILENT_AFTER_US
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
@@ -91,6 +92,26 @@ class TestTcpListen:
 
 
 class TestTcpOut:
+    async def test_a_connection_to_itself_is_a_refusal(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The kernel may draw the wanted port, where nobody listens, as our own."""
+        loop = asyncio.get_running_loop()
+        connect = loop.sock_connect
+
+        async def from_there(sock: socket.socket, address: tuple[str, int]) -> None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            await connect(sock, address)
+
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        monkeypatch.setattr(loop, "sock_connect", from_there)
+        hub = rig.hub(f"tcp:127.0.0.1:{port}")
+        await rig.until(lambda: hub.clients()[0].state in ("refused", "open"))
+        assert hub.clients()[0].state == "refused"
+
     async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
         self, rig: Any
     ) -> None:
@@ -138,6 +159,19 @@ class TestSerial:
         await rig.until(lambda: bool(rig.incoming))
         assert rig.incoming[0].frame == said
         assert hub.clients()[0].bytes_garbage == 5
+
+    async def test_a_radio_that_tells_of_a_full_buffer_is_sent_less(
+        self, rig: Any, line: tuple[int, str]
+    ) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:57600")
+        width = hub._fanout._outlets[1].width
+        radio = rig.sender(51, 68)
+        for count, free in enumerate((100, 10), start=1):
+            report = dialect.MAVLink_radio_status_message(200, 200, free, 30, 30, 0, 0)
+            os.write(near, radio.pack(report))
+            await rig.until(lambda count=count: hub.clients()[0].received == count)
+            assert width.share == (1.0 if free == 100 else 0.7)
 
     async def test_the_attitude_overtakes_and_numbers_stay_in_order(
         self, rig: Any, line: tuple[int, str]

@@ -110,6 +110,16 @@ async def test_a_killed_client_goes_when_its_machine_says_so(rig: Any) -> None:
     await rig.until(lambda: not hub.clients())
 
 
+async def test_a_caller_is_called_by_its_port_too(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?name=tablets", "tcp-listen:127.0.0.1:0?name=bench")
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    with socket.create_connection(("127.0.0.1", hub.listening_ports()[1])):
+        await rig.until(lambda: len(hub.clients()) == 2)
+        names = sorted(client.name.partition(" ")[0] for client in hub.clients())
+    assert names == ["bench", "tablets"]
+
+
 async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
@@ -120,8 +130,10 @@ async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> 
     await rig.until(lambda: hub.clients()[0].state == "refused")
     for _ in range(100):
         hub.send(rig.out(rig.vehicle.attitude()))
-    assert hub.clients()[0].sent + hub.clients()[0].dropped == 101
-    assert hub.clients()[0].dropped >= 99
+    (caller,) = hub.clients()
+    assert (caller.sent + caller.unheard, caller.dropped) == (101, 0)
+    assert caller.unheard >= 99
+    assert caller.reason == "nobody listens there"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
         again.setblocking(False)
         again.bind(("127.0.0.1", station.port))
@@ -168,7 +180,8 @@ async def test_a_refused_port_is_counted_and_hurts_nobody(rig: Any) -> None:
         assert await station.receive() == frame
     refused, fine = hub.clients()
     assert refused.state == "refused"
-    assert refused.sent + refused.dropped == 10
+    assert (refused.sent + refused.unheard, refused.dropped) == (10, 0)
+    assert refused.reason == "nobody listens there"
     assert (fine.sent, fine.dropped) == (10, 0)
 
 

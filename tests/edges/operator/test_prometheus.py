@@ -1,15 +1,19 @@
 """The Prometheus text and the port that serves it."""
 
 import asyncio
+import dataclasses
 import socket
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.edges.operator import prometheus
-from gateway.edges.operator.prometheus import MetricsServer, prometheus_text
+from gateway.edges.operator.metric_families import prometheus_text
+from gateway.edges.operator.prometheus import MetricsServer
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.status import AircraftStatus, Snapshot
+from gateway.status import AircraftStatus, Snapshot, Way
+from tests.vehicle.samples import FIX, NOTHING, STATE
 
 NODE = NodeLink(
     node=NodeId(1, 2),
@@ -57,7 +61,7 @@ BOARD = NodeStatus(0, NodeId(1, 2), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 32
 SNAPSHOT = Snapshot(
     time_us=3_000_000,
     report=REPORT,
-    states=(),
+    states=((1, STATE),),
     clients=(CLIENT,),
     sent=(),
     hub=HubCounters(published=9),
@@ -66,34 +70,42 @@ SNAPSHOT = Snapshot(
     ),
     refused=5,
     forged=6,
-    aircraft=(AircraftStatus(1, None, None, None, (BOARD,)),),
+    aircraft=(AircraftStatus(1, FIX, Way(47.0, 8.0, 500.0, 120.0, 90.0), None, (BOARD,)),),
 )
-PORT = '{name="here",endpoint="tcp-listen:0.0.0.0:1?name=here"}'
+PORT = '{endpoint="tcp-listen:0.0.0.0:1?name=here",name="here"}'
 LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "mavgate_up_seconds 3",
-        "mavgate_receiver_connected 1",
-        'mavgate_receiver_faults_total{kind="crc"} 4',
-        'mavgate_node_lost_total{vehicle="1",node="2"} 3',
-        'mavgate_node_rate_hz{vehicle="1",node="2"} 60',
-        'mavgate_node_supply_volts{vehicle="1",node="2"} 3.29',
-        'mavgate_node_bus_errors_total{vehicle="1",node="2"} 12',
-        'mavgate_node_radio_failed_total{vehicle="1",node="2"} 3',
-        'mavgate_node_radio_retries_total{vehicle="1",node="2"} 450',
-        'mavgate_node_info{vehicle="1",node="2",firmware="1.4"} 1',
-        "mavgate_hub_published_total 9",
-        f"mavgate_client_sent_total{LABELS} 5000",
+        "mavgate_up_seconds 3.0",
+        "mavgate_receiver_connected 1.0",
+        'mavgate_receiver_faults_total{kind="crc"} 4.0',
+        'mavgate_node_lost_total{node="2",vehicle="1"} 3.0',
+        'mavgate_node_rate_hz{node="2",vehicle="1"} 60.0',
+        'mavgate_node_supply_volts{node="2",vehicle="1"} 3.29',
+        'mavgate_node_bus_errors_total{node="2",vehicle="1"} 12.0',
+        'mavgate_node_radio_failed_total{node="2",vehicle="1"} 3.0',
+        'mavgate_node_radio_retries_total{node="2",vehicle="1"} 450.0',
+        'mavgate_node_info{firmware="1.4",node="2",vehicle="1"} 1.0',
+        'mavgate_vehicle_satellites{vehicle="1"} 11.0',
+        'mavgate_vehicle_home_distance_metres{vehicle="1"} 120.0',
+        "mavgate_hub_published_total 9.0",
+        f"mavgate_client_sent_total{LABELS} 5000.0",
         f"mavgate_client_round_trip_seconds{LABELS} 0.0015",
-        f"mavgate_client_silent_seconds{LABELS} 2",
-        f"mavgate_client_open{LABELS} 1",
-        f"mavgate_listener_open{PORT} 0",
-        f"mavgate_listener_turned_away_total{PORT} 4",
-        "mavgate_requests_refused_total 5",
-        "mavgate_requests_forged_total 6",
+        f"mavgate_client_silent_seconds{LABELS} 2.0",
+        f"mavgate_client_open{LABELS} 1.0",
+        f"mavgate_listener_open{PORT} 0.0",
+        f"mavgate_listener_turned_away_total{PORT} 4.0",
+        "mavgate_requests_refused_total 5.0",
+        "mavgate_requests_forged_total 6.0",
+        'mavgate_node_silent_seconds{node="2",vehicle="1"} 3.0',
+        'mavgate_vehicle_latitude_degrees{vehicle="1"} 47.1234567',
+        'mavgate_vehicle_ground_speed_metres_per_second{vehicle="1"} 5.0',
+        'mavgate_vehicle_climb_metres_per_second{vehicle="1"} 1.25',
+        'mavgate_vehicle_valid{quantity="position",vehicle="1"} 1.0',
+        'mavgate_vehicle_trouble{kind="gps_rejected",vehicle="1"} 0.0',
     ],
 )
 def test_samples(line: str) -> None:
@@ -108,6 +120,22 @@ def test_every_family_is_declared_once_before_its_samples() -> None:
         elif not line.startswith("#"):
             assert line.split("{")[0].split()[0] == declared[-1]
     assert len(declared) == len(set(declared))
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    text = prometheus_text(dataclasses.replace(SNAPSHOT, states=((1, NOTHING),)))
+    assert "NaN" not in text
+    assert "mavgate_vehicle_latitude_degrees{" not in text
+    assert 'mavgate_vehicle_valid{quantity="position",vehicle="1"} 0.0' in text
+
+
+def test_another_program_reads_it() -> None:
+    """Every family of the text, as Prometheus' own reader understands it."""
+    read = list(text_string_to_metric_families(prometheus_text(SNAPSHOT)))
+    assert {family.type for family in read} == {"counter", "gauge"}
+    assert all(len(family.documentation) > 10 for family in read)
+    names = {s.labels["name"] for f in read if f.name == "mavgate_client_open" for s in f.samples}
+    assert names == {'the "tablet"'}
 
 
 @pytest.mark.io
@@ -139,6 +167,28 @@ class TestServer:
         server = MetricsServer(lambda: SNAPSHOT)
         server.listen(0)
         assert (server.port, server.listeners()) == (0, ())
+
+    async def test_idle_connections_are_no_more_than_a_few(self) -> None:
+        server = MetricsServer(lambda: SNAPSHOT)
+        server.listen(_free_port())
+        idle = [
+            await asyncio.open_connection("127.0.0.1", server.port)
+            for _ in range(prometheus.MAX_CONNECTIONS)
+        ]
+        while server.listeners()[0].clients < prometheus.MAX_CONNECTIONS:
+            await asyncio.sleep(0)
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        assert await asyncio.wait_for(reader.read(), 5) == b"", "closed without a word"
+        writer.close()
+        idle[0][1].close()
+        while server.listeners()[0].clients == prometheus.MAX_CONNECTIONS:
+            await asyncio.sleep(0)
+        assert (await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 200")
+        for _, other in idle[1:]:
+            other.close()
+        server.close()
+        while any(task.get_coro().__name__ == "_serve" for task in asyncio.all_tasks()):
+            await asyncio.sleep(0)
 
     async def test_a_taken_port_is_told_and_used_when_it_is_free(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch

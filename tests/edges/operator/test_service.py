@@ -51,6 +51,18 @@ async def test_the_watchdog_is_fed_at_twice_its_rate(
     assert notifier._timer is None
 
 
+async def test_signs_of_life_come_twice_in_the_time_that_systemd_waits(
+    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "60000000")
+    delays: list[float] = []
+    monkeypatch.setattr(
+        asyncio.get_running_loop(), "call_later", lambda delay_s, _: delays.append(delay_s)
+    )
+    ServiceNotifier().ready()
+    assert delays == [30.0]
+
+
 async def test_a_watchdog_of_another_process_is_not_ours(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:

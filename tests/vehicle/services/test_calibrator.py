@@ -225,6 +225,22 @@ def test_a_steady_turn_is_no_rest(station: GroundStation, turn_degps: float, res
     assert acks(run(station, 4.0, turning))[-1] == result
 
 
+@pytest.mark.parametrize(("shaking_mps2", "result"), [(0.4, ACCEPTED), (0.6, FAILED)])
+def test_shaking_is_no_rest(station: GroundStation, shaking_mps2: float, result: int) -> None:
+    noise = np.random.default_rng(3)
+
+    def shaken(_time_s: float) -> dict[str, Any]:
+        return {
+            "gyro_b_radps": (0.0, 0.0, 0.0),
+            "accel_b_mps2": tuple(
+                (np.array((0, 0, -G)) + noise.normal(0, shaking_mps2, 3)).tolist()
+            ),
+        }
+
+    station.command(CALIBRATE, *GYRO)
+    assert acks(run(station, 4.0, shaken))[-1] == result
+
+
 def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     assert acks([m for m in station.wait(61.0) if m.get_type() == "COMMAND_ACK"]) == [FAILED]

@@ -342,7 +342,7 @@ class WsListener(StreamListener[WsPeer]):
             client_id,
             self.endpoint,
             peer,
-            peer,
+            self.endpoint.name_of(peer),
             local_host=str(connection.getsockname()[0]),
             welcome=self._welcome,
             leave=self.leave,

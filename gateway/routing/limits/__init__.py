@@ -1,0 +1,1 @@
+"""How much anybody may cause, and how much a narrow link is sent."""

@@ -1,0 +1,154 @@
+"""Trouble for a hub, as `fault_hub.py` wants it: strangers that forge, ask too much, or crowd in.
+
+    python fault_traffic.py PORT KIND
+
+The hub trusts who calls at 127.0.0.1 and nobody who calls at 127.0.0.2, both on this port; system 1
+behind it answers, and system 42 is the healthy source.
+"""
+
+import itertools
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+from bench_hub import SOURCE_SYSTEM, source_frames
+from pymavlink.dialects.v20 import common as mavlink
+
+TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
+PORTS = 31
+OPEN_FILE_RO, BURST_READ_FILE = 4, 15
+TURN_S = 0.005
+"""Between two batches; the rates below are kept on average."""
+
+Batch = Iterator[Callable[[], object]]
+
+
+def packed(message: mavlink.MAVLink_message, system: int = 200, component: int = 190) -> bytes:
+    """Encode one message."""
+    return bytes(message.pack(mavlink.MAVLink(None, system, component)))
+
+
+def heartbeat(system: int, component: int = 190) -> bytes:
+    """Encode a ground station's heartbeat."""
+    return packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), system, component)
+
+
+def request_message(number: int, *, to_all: bool) -> bytes:
+    """Encode a request for a message of the vehicle."""
+    parameters = (number, 0, 0, 0, 0, 0, 2 if to_all else 0)
+    return packed(mavlink.MAVLink_command_long_message(1, 1, 512, 0, *parameters))
+
+
+def caller(host: str, port: int) -> socket.socket:
+    """Open a socket that speaks to the hub and listens to nothing."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.connect((host, port))
+    return sock
+
+
+def forge(port: int) -> Batch:
+    """Call the source a station, claim its components, and say what it will say in advance."""
+    stranger = caller(UNTRUSTED, port)
+    frames = itertools.cycle(source_frames())
+    names = itertools.cycle(range(1, 250))
+    while True:
+        yield lambda: stranger.send(heartbeat(SOURCE_SYSTEM, 1))
+        yield lambda: stranger.send(heartbeat(next(names), next(names)))
+        yield lambda: stranger.send(next(frames))
+
+
+def asking(port: int, host: str, frame: bytes, ports: int = PORTS) -> Batch:
+    """Ask the same from many ports in turns."""
+    callers = [caller(host, port) for _ in range(ports)]
+    for sock in callers:
+        sock.send(heartbeat(200))
+    for sock in itertools.cycle(callers):
+        yield lambda sock=sock: sock.send(frame)
+
+
+def bursts(port: int) -> Batch:
+    """Have a file sent byte by byte, again and again, from many ports."""
+    callers = [(sock, ftp_session(sock)) for sock in (caller(UNTRUSTED, port) for _ in range(16))]
+    for sock, session in itertools.cycle(callers):
+        yield lambda sock=sock, session=session: sock.send(ftp(BURST_READ_FILE, session, b"", 1))
+
+
+def ftp_session(sock: socket.socket) -> int:
+    """Open the vehicle's parameter metadata and return the session."""
+    parser = mavlink.MAVLink(None)
+    sock.settimeout(0.1)
+    while True:
+        sock.send(ftp(OPEN_FILE_RO, 0, b"/parameter.json"))
+        for _ in range(50):
+            try:
+                data = sock.recv(2048)
+            except TimeoutError:
+                break
+            for message in parser.parse_buffer(data) or ():
+                if message.get_type() == "FILE_TRANSFER_PROTOCOL":
+                    return int(message.payload[2])
+
+
+def ftp(opcode: int, session: int, data: bytes, size: int | None = None) -> bytes:
+    """Encode one FTP request."""
+    length = len(data) if size is None else size
+    payload = struct.pack("<HBBBBBxI", 1, session, opcode, length, 0, 0, 0) + data
+    message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload.ljust(251, b"\0"))
+    return packed(message)
+
+
+def crowd(port: int) -> Batch:
+    """Hold every place of the port from one machine, and knock for more."""
+    callers = [caller(UNTRUSTED, port) for _ in range(100)]
+    frames = [heartbeat(1 + number) for number in range(100)]
+    for sock, frame in itertools.cycle(zip(callers, frames, strict=True)):
+        yield lambda sock=sock, frame=frame: sock.send(frame)
+
+
+def twins(port: int) -> Batch:
+    """Be two stations with one id that ask the same at the same moments."""
+    callers = [caller(TRUSTED, port) for _ in range(2)]
+    link = mavlink.MAVLink(None, 254, 190)
+    while True:
+        message = mavlink.MAVLink_command_long_message(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)
+        frame = bytes(message.pack(link))
+        link.seq = (link.seq + 1) % 256
+        for sock in callers:
+            yield lambda sock=sock, frame=frame: sock.send(frame)
+
+
+LIST = packed(mavlink.MAVLink_param_request_list_message(1, 1))
+PING = packed(mavlink.MAVLink_ping_message(5, 1, 0, 0))
+KINDS: dict[str, tuple[Callable[[int], Batch], int]] = {
+    "forge": (forge, 1000),
+    "to-all": (lambda p: asking(p, UNTRUSTED, request_message(148, to_all=True), 1), 400),
+    "ports": (lambda p: asking(p, UNTRUSTED, request_message(148, to_all=False)), 4000),
+    "trusted-ports": (lambda p: asking(p, TRUSTED, PING), 4000),
+    "lists": (lambda p: asking(p, UNTRUSTED, LIST), 400),
+    "bursts": (bursts, 21),
+    "crowd": (crowd, 1000),
+    "twins": (twins, 200),
+}
+"""What there is, and how often a second."""
+
+
+def main() -> None:
+    """Make trouble until killed."""
+    port, kind = int(sys.argv[1]), sys.argv[2]
+    make, rate_hz = KINDS[kind]
+    batch, begin_s, done = make(port), time.monotonic(), 0
+    while True:
+        due = round((time.monotonic() - begin_s) * rate_hz)
+        for act in itertools.islice(batch, due - done):
+            try:
+                act()
+            except ConnectionRefusedError:
+                time.sleep(TURN_S)
+        done = due
+        time.sleep(TURN_S)
+
+
+if __name__ == "__main__":
+    main()
