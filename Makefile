@@ -2,9 +2,10 @@
 # make test   every test, the firmware's included
 # make lint   formatting, lint and types
 # make deb    a Debian package with the service, in dist/
+# make fuzz   odd input to all that reads any, with new values, for five minutes
 # make lock   write the lock files anew from pyproject.toml
 
-.PHONY: demo test lint deb lock firmware clean
+.PHONY: demo test lint deb fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck
@@ -23,6 +24,9 @@ lint: .venv/.dev
 
 deb: .venv/.run
 	tools/make_deb.sh dist
+
+fuzz: .venv/.dev
+	.venv/bin/python -m tools.fuzz
 
 lock: .venv/.dev
 	$(COMPILE) --extra panel --output-file requirements.lock pyproject.toml

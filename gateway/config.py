@@ -51,7 +51,8 @@ class GatewaySettings(Settings, frozen=True):
             "Folder of what differs between aircraft: one file each, named by its vehicle id "
             '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
             "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
-            'Missions, mark and home are kept beside it ("1.places.json").'
+            'Missions, mark and home are kept beside it ("1.places.json").',
+            path=True,
         ),
     ] = "~/.config/mavgate/aircraft"
 
@@ -236,7 +237,7 @@ def render(settings: GatewaySettings) -> str:
 
 def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -304,6 +305,18 @@ def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -
             msgspec.convert(value, field.type)
         except msgspec.ValidationError as error:
             yield _wrong_value(path, value, field, error)
+        else:
+            yield from _check_home(path, value, field)
+
+
+def _check_home(path: str, value: Any, field: Field) -> Iterator[str]:
+    """Check that `~` or `~user` at the begin of a path stands for a folder."""
+    if field.is_path:
+        try:
+            Path(value).expanduser()
+        except RuntimeError:
+            user = value.partition("/")[0]
+            yield f"{path} = {value!r}: no user has the home {user}; write the whole path"
 
 
 def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:

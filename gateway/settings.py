@@ -26,6 +26,7 @@ def setting(
     le: float | None = None,
     pattern: str | None = None,
     rotation: bool = False,
+    path: bool = False,
     choices: Collection[str] = (),
 ) -> msgspec.Meta:
     """Describe one setting: meaning, unit and what is allowed.
@@ -42,6 +43,8 @@ def setting(
         Regular expression that a text must match.
     rotation : bool
         Whether the value is the matrix of a rotation, for which people rather give angles.
+    path : bool
+        Whether the value names a file or folder, where `~` stands for a home.
     choices : collection of str, optional
         The allowed texts where they are not known to the type: a registry that may grow. The
         settings class checks them itself.
@@ -51,7 +54,7 @@ def setting(
     msgspec.Meta
         To be used as `Annotated[float, setting(...)]`.
     """
-    extra = {"unit": unit, "rotation": rotation, "choices": choices}
+    extra = {"unit": unit, "rotation": rotation, "path": path, "choices": choices}
     if pattern is not None:
         return msgspec.Meta(description=meaning, pattern=pattern, extra=extra)
     return msgspec.Meta(description=meaning, ge=_exact(ge), le=_exact(le), extra=extra)
@@ -78,6 +81,8 @@ class Field:
     unit: str
     is_rotation: bool
     """Whether the value is the matrix of a rotation."""
+    is_path: bool
+    """Whether the value names a file or folder."""
     bounds: tuple[float | None, float | None]
     """Least and greatest allowed number, of a vector of each of its components; None where there
     is no bound."""
@@ -109,6 +114,7 @@ def _field(name: str, kind: Any, default: Any) -> Field:
         meaning=meta.description or "",
         unit=extra.get("unit", ""),
         is_rotation=extra.get("rotation", False),
+        is_path=extra.get("path", False),
         bounds=(bounded.ge, bounded.le),
     )
 

@@ -63,6 +63,11 @@ def thin_out(points: Iterable[TrackPoint], interval_us: int = INTERVAL_US) -> It
             yield point
 
 
+FIRST_US: Final = 0
+LAST_US: Final = 253_402_300_799 * US_PER_S
+"""The ends of the calendar that other programs read: 1970 to 9999."""
+
+
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     """Write a flight as KML 2.2: a folder a vehicle, its track with times and attitude, its places.
 
@@ -179,6 +184,7 @@ def _gpx_attitude(point: TrackPoint) -> str:
 
 
 def _iso(unix_us: int) -> str:
-    seconds, fraction_us = divmod(unix_us, US_PER_S)
+    """Write a time as ISO 8601; one beyond the calendar as its nearest end."""
+    seconds, fraction_us = divmod(min(max(unix_us, FIRST_US), LAST_US), US_PER_S)
     moment = datetime.fromtimestamp(seconds, UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction_us // 1000:03d}Z"

@@ -7,6 +7,7 @@ from typing import Final
 
 from gateway.units import US_PER_S
 
+MAX_TEXT: Final = 40
 _CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
 
 
@@ -39,6 +40,8 @@ def parse_moment(text: str) -> Moment:
     ValueError
         If it is none of these.
     """
+    if len(text) > MAX_TEXT:
+        raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")
     if match := _CLOCK.fullmatch(text.strip()):
         sign, first, second, seconds = match.groups()
         hours, minutes = (first, second) if second is not None else ("0", first or "0")
@@ -53,6 +56,14 @@ def parse_moment(text: str) -> Moment:
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
     return Moment(time_us=round(moment.timestamp() * US_PER_S))
+
+
+def civil_time(unix_us: float) -> datetime | None:
+    """Return a time in µs since 1970 as a moment in UTC; None beyond the calendar's years."""
+    try:
+        return datetime.fromtimestamp(unix_us / US_PER_S, UTC)
+    except (ValueError, OverflowError, OSError):
+        return None
 
 
 def place_in(moment: Moment, first_us: int) -> int:

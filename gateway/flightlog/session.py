@@ -54,9 +54,9 @@ class RecordingSettings(Settings, frozen=True):
             "long as the gateway runs."
         ),
     ] = "in_flight"
-    folder: Annotated[str, setting("Folder of the recordings; made if it is not there.")] = (
-        "~/mavgate/recordings"
-    )
+    folder: Annotated[
+        str, setting("Folder of the recordings; made if it is not there.", path=True)
+    ] = "~/mavgate/recordings"
     tlog: Annotated[bool, setting("Record all MAVLink that is sent and received.")] = True
     table: Annotated[bool, setting("Record raw samples and fused states, one CSV an aircraft.")] = (
         True

@@ -1,5 +1,6 @@
 """Recordings as streams for the commands: rows to fuse, frames to send, points to draw."""
 
+import codecs
 import heapq
 import struct
 from collections.abc import Callable, Iterable, Iterator
@@ -27,7 +28,14 @@ from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
 from gateway.flightlog.table.row import RowBuilder, TableRow
-from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
+from gateway.flightlog.table.table import (
+    HEAD_LINES,
+    MAX_LINE,
+    TableFault,
+    TableHeader,
+    TableMark,
+    TableReader,
+)
 from gateway.flightlog.tlog.stamps import JUMP_US
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.pipeline import PipelineSettings
@@ -264,10 +272,17 @@ def foreign_rows(lines: Iterable[str], options: ReadOptions) -> Iterator[TableRo
 
 
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
-    rest = b""
+    rest, number = b"", 0
     for data in read_chunks(path, progress):
         *lines, rest = (rest + data).split(b"\n")
+        if not number:
+            lines = [line.removeprefix(codecs.BOM_UTF8) for line in lines]
         yield from (line.decode(errors="replace") for line in lines)
+        number += len(lines)
+        if len(rest) > MAX_LINE:
+            raise FlightError(
+                f"{path}: line {number + 1} is longer than {MAX_LINE >> 20} MB; it is no CSV"
+            )
     if rest:
         yield rest.decode(errors="replace")
 
@@ -275,12 +290,18 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
 def _open_table(path: Path, options: ReadOptions) -> RecordedTable:
     reader = TableReader()
     events = read_events(path, reader, options.progress)
-    lines = (event for event in events if isinstance(event, Line))
     head: list[Line] = []
-    for line in lines:
-        head.append(line)
-        if isinstance(line, TableRow):
-            return RecordedTable(reader.header or TableHeader(), chain(head, lines))
+    for event in events:
+        if isinstance(event, TableFault) and event.line <= HEAD_LINES:
+            raise FlightError(
+                f"{path}: line {event.line}: {event.reason}; `mavgate recover` writes the rows "
+                "that are sound"
+            )
+        if isinstance(event, Line):
+            head.append(event)
+        if isinstance(event, TableRow):
+            rest = (line for line in events if isinstance(line, Line))
+            return RecordedTable(reader.header or TableHeader(), chain(head, rest))
     raise FlightError(f"{path}: holds no row")
 
 

@@ -16,14 +16,13 @@ IPv6 addresses stand in brackets. Options follow as in any URL:
 `?name=tablet&deny=RAW_IMU&pack=1100`. What other programs write is understood too: `spelling.py`.
 """
 
-import ipaddress
 import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl
 
-from gateway.routing.page_origin import NULL_ORIGIN
+from gateway.routing.page_origin import NULL_ORIGIN, is_group, is_loopback, is_name, is_numeric
 from gateway.routing.spelling import respell
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -41,7 +40,6 @@ MAX_BAUD: Final = 12_000_000
 MAX_NAME: Final = 64
 MAX_MESSAGE_ID: Final = (1 << 24) - 1
 MIN_RATE_HZ: Final = 0.001
-_HOST: Final = re.compile(r"[\w.-]+")
 
 SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
@@ -82,6 +80,15 @@ OPEN_TO_ALL: Final = frozenset(
     }
 )
 """Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
+LISTENING: Final = frozenset(
+    {
+        EndpointKind.UDP_LISTEN,
+        EndpointKind.TCP_LISTEN,
+        EndpointKind.WS_LISTEN,
+        EndpointKind.WSS_LISTEN,
+    }
+)
+"""Kinds that bind to their port; to port 0 they bind to any that is free."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that speak within TLS."""
 COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "budget", "trusted"})
@@ -257,11 +264,19 @@ def _split_place(kind: str, place: str) -> tuple[str, int]:
         raise ValueError(f"write {kind}:HOST:PORT, an IPv6 host in [brackets]")
     number = _number(port, "port", 0, MAX_PORT)
     host = host[1:-1] if bracketed else host
+    if number == 0 and kind not in LISTENING:
+        raise ValueError(f"port 0 is nowhere; name one of 1 to {MAX_PORT}")
+    _check_host(kind, host)
+    return host, number
+
+
+def _check_host(kind: str, host: str) -> None:
     if kind in OPEN_TO_ALL and not is_numeric(host):
         raise ValueError(f"{host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
-    if not is_numeric(host) and not _is_name(host):
+    if kind is EndpointKind.UDP_MULTICAST and not is_group(host):
+        raise ValueError(f"{host!r} is no multicast group, such as 239.255.145.50")
+    if not is_numeric(host) and not is_name(host):
         raise ValueError(f"{host!r} is neither an address nor a name")
-    return host, number
 
 
 def _number(text: str, what: str, low: int, high: int) -> int:
@@ -271,36 +286,6 @@ def _number(text: str, what: str, low: int, high: int) -> int:
     if not low <= int(text) <= high:
         raise ValueError(f"{what} {text} is not {low} to {high}")
     return int(text)
-
-
-def _is_name(host: str) -> bool:
-    """Return whether the resolver would take it; one that does not raises each time it is asked."""
-    try:
-        host.encode("idna")
-    except UnicodeError:
-        return False
-    # Four numbers with a slip of the hand are no name either.
-    return _HOST.fullmatch(host) is not None and not host.replace(".", "").isdecimal()
-
-
-def is_numeric(host: str) -> bool:
-    """Return whether a host is an address and not a name."""
-    try:
-        ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return False
-    return True
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address is one of this machine alone; a name is none but `localhost`."""
-    if host == "localhost":
-        return True
-    if not is_numeric(host):
-        return False
-    address = ipaddress.ip_address(host.partition("%")[0])
-    mapped = getattr(address, "ipv4_mapped", None)
-    return (mapped or address).is_loopback
 
 
 def stays_here(endpoint: Endpoint) -> bool:

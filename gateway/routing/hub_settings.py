@@ -57,18 +57,22 @@ class HubSettings(Settings, frozen=True):
         str,
         setting(
             "PEM file with the certificate of this machine, and of those who vouch for it, that "
-            "wss-listen: shows. One that is replaced holds for the next who connect."
+            "wss-listen: shows. One that is replaced holds for the next who connect.",
+            path=True,
         ),
     ] = ""
     tls_key: Annotated[
         str,
-        setting("PEM file with the key of the certificate; empty if it is in the same file."),
+        setting(
+            "PEM file with the key of the certificate; empty if it is in the same file.", path=True
+        ),
     ] = ""
     tls_authority: Annotated[
         str,
         setting(
             "PEM file with the certificates that wss: accepts servers by, as of an authority of "
-            "one's own; empty for those that the machine knows."
+            "one's own; empty for those that the machine knows.",
+            path=True,
         ),
     ] = ""
     realtime_priority: Annotated[

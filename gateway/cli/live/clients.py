@@ -1,5 +1,6 @@
 """`mavgate status`, `clients …`, `mark`, `reload`: a gateway that runs, and its clients."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -103,6 +104,11 @@ def mark(
     ] = None,
 ) -> None:
     """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""
+    for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("--alt", alt)):
+        if value is not None and not math.isfinite(value):
+            refuse(
+                f"{name} {value}: write a number; without LAT_DEG and LON_DEG the mark is cleared"
+            )
     place = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
     print(ask("mark", place))
 

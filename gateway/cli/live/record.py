@@ -1,7 +1,6 @@
 """`mavgate record …`: orders to the recorder of a gateway that runs."""
 
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -24,7 +23,9 @@ from gateway.edges.disk.recordings import (
     list_recordings,
     rename_recording,
 )
+from gateway.flightlog.moment import civil_time
 from gateway.flights.glance import Glance, glance
+from gateway.units import US_PER_S
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
@@ -161,13 +162,13 @@ def _looked_at(recordings: list[Recording]) -> Iterator[tuple[Recording, Glance]
 def _list(recordings: list[Recording]) -> None:
     grid = table_of("recording", "length", "vehicles", "MB", "last written (UTC)", "path")
     for recording, look in _looked_at(recordings):
-        when = datetime.fromtimestamp(recording.modified_s, UTC)
+        when = civil_time(recording.modified_s * US_PER_S)
         grid.add_row(
             recording.name,
             UNKNOWN if look.duration_s is None else _clock(look.duration_s),
             " ".join(map(str, look.vehicles)) or UNKNOWN,
             f"{recording.size / 1e6:.2f}",
-            f"{when:%Y-%m-%d %H:%M:%S}",
+            UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
             _path(recording),
         )
     console_of().print(grid)

@@ -50,6 +50,7 @@ def check_config(
         load_aircraft,
         render,
     )
+    from gateway.routing.endpoint import LISTENING, parse_endpoint
 
     if file is None:
         print(render(GatewaySettings()), end="")
@@ -59,5 +60,11 @@ def check_config(
         aircraft = load_aircraft(settings)
     except ConfigError as error:
         refuse(str(error))
+    for endpoint in map(parse_endpoint, settings.hub.endpoints):
+        if endpoint.port == 0 and endpoint.kind in LISTENING:
+            refuse(
+                f"{file}: hub.endpoints: {endpoint.url!r} takes any free port, which no ground "
+                "station can know; name one of 1 to 65535"
+            )
     others = f", and of {len(aircraft)} aircraft in {aircraft_folder(settings)}" if aircraft else ""
     print(f"{file}: all settings are right{others}")

@@ -1,6 +1,5 @@
 """`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
 
-import gzip
 import itertools
 import math
 import re
@@ -29,10 +28,11 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
 from gateway.estimation.columns import NAV_COLUMNS
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import ESTIMATORS
 from gateway.flightlog.table.row import NAV_COLUMNS as NAV_NAMES
 from gateway.flightlog.table.table import FORMAT_LINE, TableHeader, encode_header
@@ -210,10 +210,13 @@ def _row(s: NavState) -> list[float]:
 def _facts_of(path: Path) -> dict[str, float]:
     """Read the `key=value` words of a foreign file's comments."""
     facts: dict[str, float] = {}
-    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
-        for line, _ in zip(file, range(HEAD_LINES), strict=False):
-            if line.startswith("#"):
-                facts |= {key: float(value) for key, value in _KEY_VALUE.findall(line)}
+    head = next(read_chunks(path), b"").decode("utf-8-sig", errors="replace")
+    for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
+        for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
+            try:
+                facts[key] = float(value)
+            except ValueError as error:
+                raise FlightError(f"{path}: line {number}: {key}={value} is no number") from error
     return facts
 
 
@@ -235,6 +238,10 @@ def _adjusted(
     estimation = msgspec.structs.replace(
         estimation, estimator=estimator or estimation.estimator, reference=reference
     )
+    try:
+        msgspec.convert(msgspec.to_builtins(reference), ReferenceSettings)
+    except msgspec.ValidationError as error:
+        raise FlightError(f"what the file's # line says cannot be: {error}") from error
     return msgspec.structs.replace(aircraft, estimation=estimation)
 
 

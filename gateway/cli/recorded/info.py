@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -29,6 +28,7 @@ from gateway.edges.disk.recording_streams import (
     read_batches,
     read_events,
 )
+from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
 from gateway.flightlog.table.table import (
     TableFault,
@@ -239,4 +239,9 @@ def _when(found: FileInfo) -> str:
         begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
     if begin_us is None:
         return ""
-    return f", from {datetime.fromtimestamp(begin_us / US_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    moment = civil_time(begin_us)
+    return (
+        ", from no day of the calendar"
+        if moment is None
+        else f", from {moment:%Y-%m-%d %H:%M:%S} UTC"
+    )

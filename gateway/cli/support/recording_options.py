@@ -49,9 +49,14 @@ def read_column_map(path: Path | None) -> ColumnMap | None:
     if path is None:
         return None
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=ColumnMap)
-    except (OSError, msgspec.DecodeError) as error:
-        raise FlightError(f"{path}: {error}") from error
+        return msgspec.toml.decode(path.read_text(encoding="utf-8-sig"), type=ColumnMap)
+    except UnicodeDecodeError as error:
+        line = 1 + error.object.count(b"\n", 0, error.start)
+        raise FlightError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise FlightError(f"{path}: is no column map: {error}") from error
 
 
 def read_moment(text: str | None) -> Moment | None:

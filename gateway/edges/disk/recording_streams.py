@@ -1,18 +1,24 @@
 """Recordings on the disk as streams: read in chunks."""
 
+import codecs
+import errno
 import gzip
+import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Final, cast
 
-from gateway.flightlog.table.table import TableEvent, TableReader
+from gateway.flightlog.table.table import MAX_LINE, TableEvent, TableReader
 from gateway.flightlog.tlog.tlog import Batch, TlogScanner
 
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512
 TAIL: Final = 1 << 14
 """Some twenty rows."""
+MAX_HEAD: Final = 4 * MAX_LINE
+"""Before the first row; a few kilobytes pack any number of zeros."""
 GZIP: Final = ".gz"
 
 Progress = Callable[[int], None]
@@ -36,8 +42,7 @@ OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {}
 
 def kind_of(path: Path) -> FileKind:
     """Look at a file's first bytes; raises OSError if it cannot be read."""
-    with _open(path) as file:
-        head = file.read(SNIFF)
+    head = _head(path)
     if any(knows(head) for knows in OTHER_FORMATS.values()):
         return FileKind.OTHER
     if head.startswith((b"# mavgate table", b"time_us,")):
@@ -48,18 +53,35 @@ def kind_of(path: Path) -> FileKind:
 
 def other_format(path: Path) -> str:
     """Return which of `OTHER_FORMATS` a file is; raises KeyError if it is none."""
-    with _open(path) as file:
-        head = file.read(SNIFF)
+    head = _head(path)
     for name, knows in OTHER_FORMATS.items():
         if knows(head):
             return name
     raise KeyError(path)
 
 
+def _head(path: Path) -> bytes:
+    with readable(path), _open(path) as file:
+        return file.read(SNIFF).removeprefix(codecs.BOM_UTF8)
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Say of a damaged gzip file what it is; raises OSError."""
+    try:
+        yield
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise OSError(
+            errno.EIO,
+            f"is no whole gzip file ({error}); `gzip -dc FILE > NEW` saves what is sound",
+            str(path),
+        ) from error
+
+
 def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:
     """Read a file, gzipped or not, piece by piece; progress counts bytes on the disk."""
     done = 0
-    with path.open("rb") as raw, _unpacked(path, raw) as file:
+    with readable(path), path.open("rb") as raw, _unpacked(path, raw) as file:
         while data := file.read(CHUNK):
             yield data
             if progress is not None:
@@ -78,10 +100,10 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
         The last lines, the first of them whole.
     """
     head = tail = b""
-    with _open(path) as file:
-        for line in file:
+    with readable(path), _open(path) as file:
+        while line := file.readline(MAX_LINE):
             head += line
-            if not line.startswith(b"#"):
+            if not line.startswith(b"#") or len(head) > MAX_HEAD:
                 break
         if path.suffix == GZIP:
             while data := file.read(CHUNK):

@@ -8,8 +8,9 @@ from typing import Protocol
 from gateway.edges.hub.express import ClientCounters, Express
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ClientStats
-from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint, is_loopback
+from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint
 from gateway.routing.hub_settings import HubSettings
+from gateway.routing.page_origin import is_loopback
 from gateway.routing.routing_table import Origin
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import SplitFault

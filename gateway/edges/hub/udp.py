@@ -12,8 +12,9 @@ from typing import Any, Final
 
 from gateway.edges.hub.client import Client, Write, not_open
 from gateway.edges.hub.listener import RETRY_US
-from gateway.routing.endpoint import Endpoint, host_and_port, is_numeric
+from gateway.routing.endpoint import Endpoint, host_and_port
 from gateway.routing.outbox import Packer
+from gateway.routing.page_origin import is_numeric
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_frame, split_datagram
 

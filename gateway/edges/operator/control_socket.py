@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 MAX_LINE: Final = 64 << 10
 """A request is some words; a status of many clients some thousand bytes."""
+MAX_PATH: Final = 107
+"""Bytes of `sun_path`, less the zero at its end."""
 MAX_CONNECTIONS: Final = 16
 FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
@@ -111,6 +113,7 @@ class ControlServer:
         ControlError
             If the socket cannot be made, or as many gateways as can be told apart run already.
         """
+        check_length(self.path)
         try:
             self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)
             self.path = _first_free(self.path)
@@ -207,6 +210,16 @@ def _first_free(path: Path) -> Path:
     raise ControlError(f"control socket {path}: {MOST_GATEWAYS} gateways listen there already")
 
 
+def check_length(path: Path) -> None:
+    """Check that the kernel takes a path for a socket; raises ControlError if not."""
+    size = len(os.fsencode(path))
+    if size > MAX_PATH:
+        raise ControlError(
+            f"control socket {path}: the path has {size} bytes, and a socket's at most {MAX_PATH}; "
+            "let XDG_RUNTIME_DIR name a shorter folder"
+        )
+
+
 def socket_path(name: str) -> Path:
     """Return where a kind of gateway makes its socket.
 
@@ -254,6 +267,7 @@ def request(
     ControlError
         If nobody listens, or the request is refused.
     """
+    check_length(path)
     line = msgspec.json.encode({"verb": verb, "params": params or {}}) + b"\n"
     try:
         with socket.socket(socket.AF_UNIX) as link:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final
 
-from gateway.flightlog.table.row import COLUMNS, TableRow
+from gateway.flightlog.table.row import COLUMNS, TableRow, check_times
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -26,6 +26,7 @@ NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 SEA_LEVEL_PA: Final = 101_325.0
 _EXPONENT: Final = 1.0 / 0.190263
 _SCALE_M: Final = 44_330.769
+"""Where the standard atmosphere's formula ends: no pressure belongs to a greater height."""
 
 
 class Column(Settings, frozen=True):
@@ -96,11 +97,16 @@ class ForeignReader:
             If the file lacks a column that it must have.
         """
         table = csv.DictReader(line for line in lines if not line.startswith("#"))
-        self._check(set(table.fieldnames or ()))
-        for cells in table:
+        try:
+            self._check(set(table.fieldnames or ()))
+        except csv.Error as error:
+            raise ValueError(f"no line of column names: {error}") from error
+        while True:
             try:
-                yield self._row(cells)
-            except (ValueError, TypeError):
+                yield self._row(next(table))
+            except StopIteration:
+                return
+            except (ValueError, TypeError, OverflowError, csv.Error):
                 self.faults += 1
 
     def _check(self, names: set[str]) -> None:
@@ -121,12 +127,14 @@ class ForeignReader:
         time_us = round(value["time_us"]) if "time_us" in value else None
         if time_us is None:
             raise ValueError("no time")
-        return TableRow(
+        row = TableRow(
             time_us=time_us,
             baro=self._baro(value, time_us),
             gps=self._gps(value, time_us),
             imu=self._imu(value, time_us),
         )
+        check_times(row)
+        return row
 
     def _imu(self, value: Mapping[str, float], time_us: int) -> ImuCalibrated | None:
         if "accel_x_b_mps2" not in value or "gyro_x_b_radps" not in value:
@@ -145,7 +153,7 @@ class ForeignReader:
     def _baro(self, value: Mapping[str, float], time_us: int) -> BaroRaw | None:
         if "baro_pressure_pa" in value:
             pressure_pa = value["baro_pressure_pa"]
-        elif "baro_alt_m" in value:
+        elif value.get("baro_alt_m", math.inf) < _SCALE_M:
             # The standard atmosphere backwards, so that the height comes out again.
             pressure_pa = SEA_LEVEL_PA * (1.0 - value["baro_alt_m"] / _SCALE_M) ** _EXPONENT
         else:

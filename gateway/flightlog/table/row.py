@@ -73,6 +73,10 @@ _NO_NAV: Final = (None,) * len(NAV_COLUMNS)
 _NO_VECTOR: Final = (None, None, None)
 
 
+MAX_TIME_US: Final = 1 << 53
+"""Three centuries; a clock that says more is broken, and other programs round such a number."""
+
+
 @dataclass(frozen=True, slots=True)
 class TableRow:
     """One row; what is not there is None."""
@@ -111,7 +115,7 @@ def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
     """
     time_us = int(cells[0])
     flags = ImuFlags(int(cells[3] or 0))
-    return TableRow(
+    row = TableRow(
         time_us=time_us,
         baro=_read_baro(cells[_BARO:_GPS], vehicle_id) if cells[_BARO] else None,
         gps=_read_gps(cells[_GPS:_NAV], vehicle_id) if cells[_GPS] else None,
@@ -119,6 +123,15 @@ def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
         imu=_read_si(cells, time_us, vehicle_id, flags) if cells[_SI] else None,
         state=_read_nav(cells[_NAV:]) if cells[_NAV] else None,
     )
+    check_times(row)
+    return row
+
+
+def check_times(row: TableRow) -> None:
+    """Check that all times of a row can be; raises ValueError if one cannot."""
+    for record in (row, row.baro, row.gps, row.state):
+        if record is not None and not -MAX_TIME_US <= record.time_us <= MAX_TIME_US:
+            raise ValueError(f"{record.time_us} us is no time of a flight")
 
 
 class RowBuilder:

@@ -17,19 +17,22 @@ new.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
 from gateway.flightlog.table.row import COLUMNS, TableRow, row_from_cells, row_to_line
 from gateway.records import FusionState, NodeStatus
 
-FORMAT_LINE: Final = "# mavgate table 1"
+FORMAT_PREFIX: Final = "# mavgate table "
+FORMAT_LINE: Final = f"{FORMAT_PREFIX}1"
 HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
 MARK_PREFIX: Final = "# mark: "
 NODE_PREFIX: Final = "# node: "
 
+HEAD_LINES: Final = 3
+"""Version, header, names."""
 MAX_LINE: Final = 1 << 20
 """Longer than any settings; a disk's zeros without a line's end must not fill the memory."""
 
@@ -38,7 +41,7 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """What stands at the head of a table."""
 
     mavgate_version: str = ""
-    vehicle_id: int = 1
+    vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
     session: str = ""
     """Recording that the file is a part of."""
     part: int = 1
@@ -164,7 +167,7 @@ class TableReader:
         if size > len(line) + 1:
             return TableFault(self.lines, size, "the line is too long")
         try:
-            text = line.decode().rstrip("\r")
+            text = line.decode("utf-8-sig" if self.lines == 1 else "utf-8").rstrip("\r")
             if text.startswith("#"):
                 return self._take_comment(text)
             if not text:
@@ -174,6 +177,9 @@ class TableReader:
             return TableFault(self.lines, size, str(error))
 
     def _take_comment(self, text: str) -> TableMark | TableHeader | FusionState | NodeStatus | None:
+        if text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
+            version = text.removeprefix(FORMAT_PREFIX)
+            raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
         if text.startswith(MARK_PREFIX):
             return msgspec.json.decode(text.removeprefix(MARK_PREFIX), type=TableMark)
         if text.startswith(NODE_PREFIX):

@@ -1,0 +1,214 @@
+"""Odd input to the commands: what is wrong is said with the file, the line and what to do."""
+
+import gzip
+import struct
+import tracemalloc
+from pathlib import Path
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.app import app
+from gateway.flightlog.table.row import COLUMNS
+from gateway.flightlog.table.table import FORMAT_LINE, encode_head
+from gateway.records import NavFlags
+from gateway.replay import header_for
+from tests.flightlog.frames import make_frames
+
+pytestmark = pytest.mark.io
+
+NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
+NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def run(*words: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert result.exit_code == code, result.output
+    return " ".join(result.output.split())
+
+
+def log(path: Path, **odd: str) -> Path:
+    """Write a tracker's log of a second, every tenth row of which has an odd cell."""
+    lines = [NAMES]
+    for number in range(100):
+        cells = dict(zip(NAMES.split(","), [f"{number / 100}", *NUMBERS], strict=True))
+        lines.append(",".join((cells | odd if number % 10 == 5 else cells).values()))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def table(path: Path, **head: object) -> Path:
+    """Write a table of one state."""
+    header = msgspec.structs.replace(header_for(AircraftSettings(), 1), **head)
+    cells = dict.fromkeys(COLUMNS, "") | {"time_us": "1000", "nav_time_us": "1000"}
+    cells |= dict.fromkeys((name for name in COLUMNS if name.startswith("nav_")), "1")
+    cells["nav_flags"] = str(int(NavFlags.POSITION_VALID))
+    path.write_text(encode_head(header) + ",".join(cells.values()) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"time_s": "inf"},
+        {"time_s": "1e300"},
+        {"gps_lat": "inf"},
+        {"ax": "1" * 140_000},
+        {"time_s": ""},
+    ],
+    ids=lambda odd: next(iter(odd)) + next(iter(odd.values()))[:5],
+)
+def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
+    out = tmp_path / "out.csv"
+    told = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
+    assert "samples fused" in told
+    assert 90 <= int(told.partition("out.csv: ")[2].split()[0]) <= 100
+
+
+@pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])
+def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
+    tmp_path: Path, height: str
+) -> None:
+    told = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
+    assert "100 samples fused" in told
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"# gps_latency_s=1.1.1\n", "line 1: gps_latency_s=1.1.1 is no number"),
+        (b"# gps_latency_s=99\n", "Expected `float` <= 2.0"),
+        (b"# \xe4\xf6\xfc gps_latency_s=0.2\n", "samples fused"),
+        (b"\xef\xbb\xbf", "samples fused"),
+    ],
+)
+def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
+    path = log(tmp_path / "log.csv")
+    path.write_bytes(text + path.read_bytes())
+    told = run("fuse", path, "-o", tmp_path / "out.csv", code=0 if "fused" in words else 2)
+    assert words in told
+
+
+@pytest.mark.parametrize("command", ["info", "fuse", "recover"])
+@pytest.mark.parametrize("how", ["cut", "false", "checksum"])
+def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> None:
+    whole = gzip.compress(log(tmp_path / "log.csv").read_bytes())
+    path = tmp_path / "log.csv.gz"
+    damaged = {"cut": whole[:-100], "false": b"time_s,ax\n", "checksum": whole[:-8] + bytes(8)}
+    path.write_bytes(damaged[how])
+    words = ["-o", tmp_path / "out.csv"] if command != "info" else []
+    told = run(command, path, *words, code=2)
+    assert "log.csv.gz: is no whole gzip file" in told
+    assert "gzip -dc" in told
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv.gz"
+    with gzip.open(path, "wb") as file:
+        file.write(NAMES.encode() + b"\n")
+        for _ in range(64):
+            file.write(b"1" * (1 << 20))
+    tracemalloc.start()
+    told = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "line 2 is longer than 1 MB" in told
+    assert peak < 32 << 20
+
+
+@pytest.mark.parametrize("end", [".kml", ".gpx"])
+@pytest.mark.parametrize("zero_us", [0, -(10**17), 10**18, 2**62])
+def test_times_beyond_the_calendar(tmp_path: Path, end: str, zero_us: int) -> None:
+    path = table(tmp_path / "table.csv", unix_us_at_zero=zero_us)
+    run("convert", path, "-o", tmp_path / f"out{end}")
+    told = run("info", path)
+    assert ("no day of the calendar" in told) == (zero_us != 0)
+
+
+def test_a_tlog_of_the_far_future(tmp_path: Path) -> None:
+    path = tmp_path / "future.tlog"
+    path.write_bytes(b"".join(struct.pack(">Q", 10**18) + frame for frame in make_frames(20)))
+    assert "is no recording" in run("info", path, code=2)
+
+
+def test_a_table_of_a_newer_version_is_not_read_as_if_it_were_known(tmp_path: Path) -> None:
+    path = table(tmp_path / "table.csv")
+    path.write_text(path.read_text().replace(FORMAT_LINE, "# mavgate table 2"))
+    told = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
+    assert "table.csv: line 1: table version '2'; this mavgate reads 1" in told
+
+
+@pytest.mark.parametrize("vehicle_id", [-5, 0, 300])
+def test_a_table_of_no_vehicle(tmp_path: Path, vehicle_id: int) -> None:
+    path = table(tmp_path / "table.csv", vehicle_id=vehicle_id)
+    told = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
+    assert "table.csv: line 2: Expected `int`" in told
+    assert "mavgate recover" in told
+
+
+def test_a_table_with_a_byte_order_mark_is_a_table(tmp_path: Path) -> None:
+    path = table(tmp_path / "table.csv")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert "vehicle 1" in run("info", path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (bytes(range(128, 200)), "map.toml: line 1: is not UTF-8 text; save it as UTF-8"),
+        (b'[columns]\ntime_us = "t"\n\xe4 = "x"\n', "map.toml: line 3: is not UTF-8"),
+        (b"[columns]\nfoo = 3\n", "map.toml: is no column map"),
+        (b"[columns", "map.toml: is no column map"),
+    ],
+)
+def test_a_column_map_that_is_none(tmp_path: Path, content: bytes, words: str) -> None:
+    columns = tmp_path / "map.toml"
+    columns.write_bytes(content)
+    path = log(tmp_path / "log.csv")
+    assert words in run("fuse", path, "--columns", columns, "-o", tmp_path / "o.csv", code=2)
+
+
+@pytest.mark.parametrize("moment", ["9" * 400, "inf", "nan", "1e400", "9999-99-99T00:00:00Z", ""])
+def test_a_moment_that_is_none(tmp_path: Path, moment: str) -> None:
+    path = table(tmp_path / "table.csv")
+    told = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
+    assert "write 80, 1:20" in told
+
+
+@pytest.mark.parametrize("words", [("nan", "nan"), ("inf", "0"), ("47", "8", "--alt", "nan")])
+def test_a_mark_that_is_nowhere_does_not_clear_the_one_there_is(words: tuple[str, ...]) -> None:
+    assert "write a number" in run("mark", *words, code=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[hub]\nendpoints = ["udp:127.0.0.1:0"]', "port 0 is nowhere"),
+        ('[hub]\nendpoints = ["udp-listen:127.0.0.1:0"]', "takes any free port"),
+        ('[hub]\nendpoints = ["serial::57600"]', "write serial:DEVICE:BAUD"),
+        ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is no multicast group"),
+        ('[recording]\nfolder = "~no-such-user/x"', "no user has the home ~no-such-user"),
+        ('aircraft_folder = "~no-such-user"', "write the whole path"),
+        ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, always"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(text + "\n")
+    assert words in run("check-config", file, code=2)
+
+
+def test_settings_with_a_byte_order_mark_are_settings(tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_bytes(b"\xef\xbb\xbf[recording]\nmode = 'always'\n")
+    assert "all settings are right" in run("check-config", file)

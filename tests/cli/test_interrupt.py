@@ -1,0 +1,45 @@
+"""Ctrl-C while the command line starts."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from gateway.cli.__main__ import INTERRUPTED
+
+pytestmark = pytest.mark.io
+
+PROGRAM = """
+    import os, signal, sys
+
+    class Interrupt:
+        '''Presses Ctrl-C when a module is looked for.'''
+
+        def __init__(self, wanted):
+            self.wanted = wanted
+
+        def find_spec(self, name, path=None, target=None):
+            if name == self.wanted:
+                os.kill(os.getpid(), signal.SIGINT)
+
+    from gateway.cli.__main__ import main
+    sys.meta_path.insert(0, Interrupt(sys.argv.pop()))
+    sys.argv.append("check-config")
+    main()
+"""
+
+
+@pytest.mark.parametrize("module", ["gateway.cli.app", "typer", "rich.console", "gateway.config"])
+def test_ctrl_c_at_any_import_ends_it_without_a_traceback(module: str) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(PROGRAM), module],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        check=False,
+    )
+    assert found.returncode == INTERRUPTED, found
+    assert "Traceback" not in found.stderr

@@ -1,0 +1,397 @@
+"""Throw odd bytes, frames, orders, settings and files at whatever reads them; nothing may raise.
+
+    python -m tools.fuzz                     # five minutes, all targets in turn
+    python -m tools.fuzz --minutes 30 table  # one of them for longer
+
+Each target is a property: a function that Hypothesis calls with values of its own making. The tests
+run the same for a moment, always with the same values; here they are new each time. What fails is
+shrunk, shown and kept in `.hypothesis`, so that the next run begins with it.
+"""
+
+import argparse
+import gzip
+import itertools
+import math
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import tomlkit
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+from typer.testing import CliRunner
+
+from gateway.aircraft import AircraftSettings
+from gateway.config import ConfigError, GatewaySettings, load
+from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams
+from gateway.edges.operator.control_verbs import AircraftVerbs, Named, Text, To
+from gateway.flightlog.moment import parse_moment
+from gateway.flightlog.table.row import COLUMNS, TableRow
+from gateway.flightlog.table.table import TableHeader, TableReader, encode_head, encode_line
+from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.records import BaroRaw, Incoming, NodeId
+from gateway.settings import Field, Settings, fields_of
+from gateway.vehicle.home import Place
+from gateway.wire import payloads
+from gateway.wire.framing import encode_frame
+from gateway.wire.link import Link
+from gateway.wire.mavlink_splitter import MavlinkSplitter
+
+NUMBERS: Final = (
+    *("0", "-1", "1", "47.0", "99999", "-99999", "inf", "-inf", "nan", "1e308", "5e-324", "1e999"),
+    *("9223372036854775808", "99999999999999999999", "0x10", "1_0", "٣", "", " ", "x", '"', "\0"),
+)
+MESSAGES: Final = tuple(mavlink.mavlink_map.values())
+HEAD: Final = encode_head(TableHeader(vehicle_id=1, unix_us_at_zero=1_780_000_000_000_000))
+FOREIGN: Final = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
+
+Property = Callable[[], None]
+
+
+def chunks_of(data: bytes, cuts: list[int]) -> list[bytes]:
+    """Cut bytes at some places."""
+    places = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
+    return [data[a:b] for a, b in itertools.pairwise(places)]
+
+
+CUTS: Final = st.lists(st.integers(0, 1 << 16), max_size=8)
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> bytes:
+    """Make a well-formed frame of any message, with any bytes for its fields, signed or not."""
+    kind = draw(st.sampled_from(MESSAGES))
+    size = struct.calcsize(kind.unpacker.format)
+    body = draw(st.binary(min_size=size, max_size=size) | st.just(bytes(size)))
+    mav = mavlink.MAVLink(None, draw(st.integers(1, 255)), draw(st.integers(0, 255)))
+    if draw(st.booleans()):
+        mav.signing.secret_key, mav.signing.sign_outgoing = bytes(32), True
+    message = mavlink.MAVLink_message(kind.id, kind.msgname)
+    force_version_1 = kind.id < 256 and draw(st.booleans())
+    frame = message._pack(mav, kind.crc_extra, body, force_version_1)  # noqa: SLF001
+    return bytes(frame)
+
+
+@st.composite
+def damaged(draw: st.DrawFn, whole: st.SearchStrategy[bytes]) -> bytes:
+    """Whole pieces, with some bytes changed, left out, doubled or put between."""
+    data = bytearray(b"".join(draw(st.lists(whole | st.binary(max_size=40), max_size=12))))
+    for _ in range(draw(st.integers(0, 4))):
+        place = draw(st.integers(0, len(data)))
+        data[place : place + draw(st.integers(0, 3))] = draw(st.binary(max_size=3))
+    return bytes(data)
+
+
+@st.composite
+def radio_frames(draw: st.DrawFn) -> bytes:
+    """Make a frame of the receiver with a payload, whole or with a byte changed."""
+    node = NodeId(draw(st.integers(1, 31)), draw(st.integers(0, 1)))
+    header = payloads.Header(node, draw(st.integers(0, 65535)), draw(st.integers(0, 2**32 - 1)))
+    baro = payloads.BaroPayload(draw(st.integers(0, 2**32 - 1)), draw(st.integers(-999, 999)))
+    packet = bytearray(payloads.encode_payload(header, baro))
+    if draw(st.booleans()):
+        packet[draw(st.integers(0, len(packet) - 1))] ^= draw(st.integers(1, 255))
+    content = payloads.encode_radio(
+        draw(st.integers(0, 255)), draw(st.integers(0, 5)), header.node_time_us, bytes(packet)
+    )
+    return encode_frame(content)
+
+
+@given(damaged(messages()), CUTS)
+def splitter(data: bytes, cuts: list[int]) -> None:
+    """Any bytes in any chunks: the same frames, each whole, and nothing raised."""
+    whole = [event for event in MavlinkSplitter().feed(data) if isinstance(event, bytes)]
+    split = MavlinkSplitter()
+    events = [event for chunk in chunks_of(data, cuts) for event in split.feed(chunk)]
+    assert [event for event in events if isinstance(event, bytes)] == whole
+    assert all(frame in data for frame in whole)
+
+
+@given(st.lists(messages(), min_size=1, max_size=8), CUTS)
+def whole_frames(frames: list[bytes], cuts: list[int]) -> None:
+    """Every good frame comes out, whatever the chunks."""
+    split = MavlinkSplitter()
+    data = b"".join(frames)
+    assert [f for chunk in chunks_of(data, cuts) for f in split.feed(chunk)] == frames
+
+
+@given(damaged(radio_frames()), CUTS, st.integers(-1, 10_000_000))
+def receiver(data: bytes, cuts: list[int], step_us: int) -> None:
+    """Any bytes of the serial line: records whose times never come from the future."""
+    link, now_us = Link(), 0
+    for chunk in chunks_of(data, cuts):
+        now_us += max(step_us, 0)
+        for record in link.feed(chunk, now_us):
+            assert isinstance(record.time_us, int)
+    link.report(now_us, connected=True, port="")
+
+
+@cache
+def _vehicles() -> Pipeline:
+    pipeline = Pipeline(PipelineSettings(AircraftSettings()))
+    pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 100_000.0, 20.0), 0)
+    return pipeline
+
+
+@given(messages(), st.booleans(), st.integers(0, 1 << 50))
+def vehicle(frame: bytes, trusted: bool, now_us: int) -> None:
+    """Any message to a vehicle: answers or none."""
+    _vehicles().handle(Incoming(7, frame, trusted), now_us)
+    _vehicles().poll(now_us)
+    _vehicles().forget_client(7)
+
+
+JSON: Final = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner),
+    max_leaves=8,
+)
+VERBS: Final = ("mark", "verbs", "name", "text", "to", "none", "record.list", "")
+KEYS: Final = ("lat_deg", "lon_deg", "alt_amsl_m", "vehicle_id", "name", "text", "to", "url")
+
+
+def _control() -> ControlServer:
+    server = ControlServer(Path("unused.sock"))
+
+    def mark(place: Place | None, vehicle_id: int | None) -> None:
+        _vehicles().mark(place, vehicle_id, 0)
+
+    def moment(params: To) -> str:
+        try:
+            return str(parse_moment(params.to))
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+
+    AircraftVerbs(mark).register(server)
+    server.register("name", Named, lambda params: params.name)
+    server.register("text", Text, lambda params: params.text)
+    server.register("to", To, moment)
+    server.register("none", NoParams, lambda _: None)
+    return server
+
+
+def _run(awaitable: Any) -> Any:
+    """Run a coroutine that waits for nothing."""
+    try:
+        awaitable.send(None)
+    except StopIteration as stop:
+        return stop.value
+    raise AssertionError("it waits")
+
+
+@given(
+    st.binary(max_size=60)
+    | st.builds(
+        lambda verb, params: msgspec.json.encode({"verb": verb, "params": params}),
+        st.sampled_from(VERBS) | st.text(max_size=8),
+        st.dictionaries(st.sampled_from(KEYS) | st.text(max_size=8), JSON, max_size=4),
+    )
+)
+def control(line: bytes) -> None:
+    """Any line to the control socket: one line of JSON that says whether it went well."""
+    answer = _run(_control().answer(line))
+    assert answer.endswith(b"\n")
+    assert answer.count(b"\n") == 1
+    assert isinstance(msgspec.json.decode(answer)["ok"], bool)
+
+
+def values_of(field: Field) -> st.SearchStrategy[Any]:
+    """Values that a person could write for a setting, right and wrong."""
+    if field.section is not None:
+        return trees_of(field.section)
+    odd = st.sampled_from(["", "x", "~nobody-here/x", -1, 0, 1, 2**62, 1e308, 5e-324, True, []])
+    odd |= st.floats() | st.sampled_from([msgspec.to_builtins(field.default)])
+    low, high = field.bounds
+    if low is not None and high is not None:
+        odd |= st.sampled_from([low, high, math.nextafter(low, high), math.nextafter(high, low)])
+    return odd | st.sampled_from(field.choices or ("x",))
+
+
+def trees_of(kind: type[Settings]) -> st.SearchStrategy[dict[str, Any]]:
+    """Sections with some of their keys, and now and then one that there is not."""
+    known = {field.name: values_of(field) for field in fields_of(kind)}
+    return st.fixed_dictionaries({}, optional={**known, "no_such_key": st.just(1)})
+
+
+@cache
+def _folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="mavgate-fuzz-"))
+
+
+@given(trees_of(GatewaySettings) | st.binary(max_size=60))
+def settings_file(tree: dict[str, Any] | bytes) -> None:
+    """Any settings file: settings, or an error that names it."""
+    file = _folder() / "gateway.toml"
+    text = tree if isinstance(tree, bytes) else tomlkit.dumps(_writable(tree)).encode()
+    file.write_bytes(text)
+    try:
+        load(file)
+    except ConfigError as error:
+        assert all(str(file) in line for line in str(error).splitlines()[:1])  # noqa: PT017
+
+
+def _writable(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _writable(value) for key, value in tree.items() if value is not None}
+    if isinstance(tree, list | tuple):
+        return [_writable(value) for value in tree if value is not None]
+    return tree
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> bytes:
+    """Make a table whose lines have odd cells, lines of comments, and damage."""
+    lines = [HEAD] if draw(st.booleans()) else [",".join(COLUMNS) + "\n"]
+    for number in range(draw(st.integers(0, 6))):
+        cells = [""] * len(COLUMNS)
+        cells[0], cells[1], cells[2] = str(number * 10_000), "0", str(number)
+        for place in draw(st.lists(st.integers(0, len(COLUMNS) - 1), max_size=12)):
+            cells[place] = draw(st.sampled_from(NUMBERS))
+        lines.append(",".join(cells) + "\n")
+    lines += draw(st.lists(st.sampled_from(["# mark: {", "# node: 3\n", "# header: {}\n", "\n"])))
+    data = "".join(lines).encode(errors="replace")
+    return draw(st.sampled_from([b"", b"\xef\xbb\xbf"])) + data + draw(st.binary(max_size=5))
+
+
+@given(tables() | st.binary(max_size=200), CUTS)
+def table(data: bytes, cuts: list[int]) -> None:
+    """Any table: the same events in any chunks, and rows that can be written and read again."""
+    whole = TableReader().feed(data, final=True)
+    reader = TableReader()
+    found = [event for chunk in chunks_of(data, cuts) for event in reader.feed(chunk)]
+    found += reader.feed(b"", final=True)
+    assert repr(found) == repr(whole)
+    rows = [event for event in whole if isinstance(event, TableRow)]
+    again = TableReader().feed((HEAD + "".join(map(encode_line, rows))).encode())
+    assert len([event for event in again if isinstance(event, TableRow)]) == len(rows)
+
+
+@given(
+    damaged(st.builds(encode_record, st.integers(0, 2**64 - 1), messages())), CUTS, st.booleans()
+)
+def tlog(data: bytes, cuts: list[int], strict: bool) -> None:
+    """Any tlog: no record is made up, and of a sound one all come out in any chunks."""
+    whole = TlogScanner(strict=strict).feed(data, final=True)
+    scanner = TlogScanner(strict=strict)
+    found = [r for chunk in chunks_of(data, cuts) for r in scanner.feed(chunk).records()]
+    found += scanner.feed(b"", final=True).records()
+    # Which times a damage has torn is judged by the records beside it in the same chunk.
+    assert whole.damage or found == list(whole.records())
+    assert all(encode_record(record.time_us, record.frame) in data for record in found)
+
+
+@st.composite
+def files(draw: st.DrawFn) -> tuple[str, bytes]:
+    """Make a file such as people hand over, and the ending of its name."""
+    rows = [FOREIGN]
+    for number in range(draw(st.integers(0, 30))):
+        cells = [f"{number / 100}", "0", "0", "-9.8", "0", "0", "0", "20", "0", "40", "100"]
+        cells += [f"{number / 100}", "47", "8", "500"]
+        if draw(st.integers(0, 3)) == 0:
+            cells[draw(st.integers(0, len(cells) - 1))] = draw(st.sampled_from(NUMBERS))
+        rows.append(",".join(cells))
+    text = "\n".join(rows).encode(errors="replace")
+    ending, data = draw(
+        st.sampled_from([(".csv", text), (".csv", b"# gps_latency_s=9.9.9\n" + text)])
+        | st.tuples(st.just(".csv"), tables())
+        | st.tuples(st.just(".tlog"), damaged(st.builds(encode_record, st.just(7), messages())))
+        | st.tuples(st.sampled_from([".csv", ".tlog"]), st.binary(max_size=200))
+    )
+    packed = draw(st.sampled_from(["", "gzip", "cut", "false"]))
+    if not packed:
+        return ending, data
+    whole = gzip.compress(data)
+    return f"{ending}.gz", {"gzip": whole, "cut": whole[: len(whole) // 2], "false": data}[packed]
+
+
+COMMANDS: Final = (
+    ("info",),
+    ("info", "--json"),
+    ("recover", "--force", "-o", "OUT.csv"),
+    *(("convert", "--force", "-o", f"OUT{end}") for end in (".csv", ".tlog", ".kml", ".gpx")),
+    ("convert", "--force", "--fuse", "--from", "1", "-o", "OUT.csv"),
+    ("fuse", "--force", "--estimator", "complementary", "-o", "OUT.csv"),
+    ("check-config",),
+)
+
+
+@given(files(), st.sampled_from(COMMANDS))
+def command(file: tuple[str, bytes], words: tuple[str, ...]) -> None:
+    """Any file to any command: it does its work, or says in words why it cannot."""
+    from gateway.cli.app import app
+
+    ending, data = file
+    path = _folder() / f"odd{ending}"
+    path.write_bytes(data)
+    out = [word.replace("OUT", str(_folder() / "out")) for word in words[1:]]
+    empty = _folder() / "empty.toml"
+    empty.touch()
+    result = CliRunner().invoke(app, [words[0], str(path), *out])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code in (0, 2), result.output
+    assert result.exit_code == 0 or result.output.strip()
+
+
+TARGETS: Final[dict[str, Any]] = {
+    target.__name__: target
+    for target in (
+        *(splitter, whole_frames, receiver, vehicle, control),
+        *(settings_file, table, tlog, command),
+    )
+}
+"""By name."""
+
+
+def bounded(name: str, examples: int, *, always_the_same: bool) -> Property:
+    """Make a property ready to be called with so many values."""
+    checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
+    chosen = settings(
+        max_examples=examples,
+        deadline=None,
+        derandomize=always_the_same,
+        suppress_health_check=checks,
+        **({"database": None} if always_the_same else {}),
+    )
+    ready: Property = chosen(TARGETS[name])
+    return ready
+
+
+def main() -> int:
+    """Run the targets in turn until the time is up; what failed is told at the end."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)}")
+    parser.add_argument("--minutes", type=float, default=5.0, help="in all (5)")
+    parser.add_argument("--examples", type=int, default=300, help="in a row of one target (300)")
+    options = parser.parse_args()
+    wanted = options.targets or list(TARGETS)
+    if unknown := set(wanted) - set(TARGETS):
+        parser.error(f"no such target: {', '.join(sorted(unknown))}")
+    end_s, failed, runs = time.monotonic() + 60.0 * options.minutes, set(), dict.fromkeys(wanted, 0)
+    for name in itertools.cycle(wanted):
+        if time.monotonic() > end_s or failed >= set(wanted):
+            break
+        if name in failed:
+            continue
+        try:
+            bounded(name, options.examples, always_the_same=False)()
+        except Exception as error:  # noqa: BLE001
+            failed.add(name)
+            print(f"{name}: {type(error).__name__}: {error}")
+            print(*getattr(error, "__notes__", ()), sep="\n")
+        runs[name] += options.examples
+    for name, count in runs.items():
+        print(f"{name:13} {'FAILED' if name in failed else 'held'} after {count} values or fewer")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
