@@ -22,14 +22,21 @@ from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl
 
+from gateway.routing.option_values import (
+    intervals_from,
+    messages_from,
+    name_from,
+    number_from,
+    yes_or_no,
+)
 from gateway.routing.page_origin import NULL_ORIGIN, is_group, is_loopback, is_name, is_numeric
 from gateway.routing.spelling import respell
-from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 BITS_PER_BYTE: Final = 10
 """On a serial line: start bit, eight data bits, stop bit."""
 MAX_BUDGET: Final = 1_000_000_000
+MS_PER_S: Final = 1000
+MAX_WAIT_MS: Final = 1000
 MAX_PACK_BYTES: Final = 1100
 """Routers on the way cut or drop datagrams beyond 1120 bytes."""
 MAX_PORT: Final = 65535
@@ -37,9 +44,6 @@ DEFAULT_BAUD: Final = 57600
 MIN_BAUD: Final = 300
 MAX_BAUD: Final = 12_000_000
 """The fastest USB adapters."""
-MAX_NAME: Final = 64
-MAX_MESSAGE_ID: Final = (1 << 24) - 1
-MIN_RATE_HZ: Final = 0.001
 
 SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
@@ -47,9 +51,6 @@ LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
 RAW_KEYS: Final = "mavlink_raw"
 SITE_NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 """What may stand between two slashes of a Zenoh key and means only itself there."""
-
-NO_MESSAGES: Final = -1
-"""An interval that stops a message."""
 
 
 class EndpointKind(StrEnum):
@@ -91,7 +92,9 @@ LISTENING: Final = frozenset(
 """Kinds that bind to their port; to port 0 they bind to any that is free."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that speak within TLS."""
-COMMON_OPTIONS: Final = frozenset({"name", "allow", "deny", "rate", "pack", "budget", "trusted"})
+COMMON_OPTIONS: Final = frozenset(
+    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted"}
+)
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
     EndpointKind.WSS: frozenset({"path"}),
@@ -133,6 +136,8 @@ class Endpoint:
     """Least time between two frames of a message, by message id."""
     pack_bytes: int = 0
     """Gather frames into datagrams or messages of up to this size; 0 sends each on its own."""
+    pack_wait_s: float = 0.0
+    """How long the first frame waits for others; 0 sends what has come at once."""
     budget: int = 0
     """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
     trusted: bool | None = None
@@ -171,8 +176,8 @@ def parse_endpoint(url: str) -> Endpoint:
     url : str
         As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
         separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
-        `budget` (bytes a second), `trusted` (yes or no), and of some kinds `origins` (separated by
-        commas) or `path`.
+        `wait` (milliseconds), `budget` (bytes a second), `trusted` (yes or no), and of some kinds
+        `origins` (separated by commas) or `path`.
 
     Returns
     -------
@@ -195,13 +200,14 @@ def parse_endpoint(url: str) -> Endpoint:
             host=host,
             port=port,
             place=f"{kind}:{place}",
-            name=_name(options.get("name", f"{kind}:{place}")),
-            allow=_messages(options.get("allow", "")),
-            deny=_messages(options.get("deny", "")),
-            interval_us=_intervals(options.get("rate", "")),
-            pack_bytes=_pack_bytes(options.get("pack", "0")),
+            name=name_from(options.get("name", f"{kind}:{place}")),
+            allow=messages_from(options.get("allow", "")),
+            deny=messages_from(options.get("deny", "")),
+            interval_us=intervals_from(options.get("rate", "")),
+            pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
+            pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,
             budget=_budget(kind, port, options.get("budget")),
-            trusted=_yes_or_no(options.get("trusted")),
+            trusted=yes_or_no(options.get("trusted")),
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
             config=options.get("config", ""),
@@ -214,22 +220,6 @@ def parse_endpoint(url: str) -> Endpoint:
 def host_and_port(host: object, port: object) -> str:
     """Write a place as in a URL, an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
-
-
-def message_id_from(text: str) -> int:
-    """Return a message id from its name or number.
-
-    Raises
-    ------
-    ValueError
-        If no message has that name.
-    """
-    if text.isdecimal():
-        return _number(text, "message id", 0, MAX_MESSAGE_ID)
-    try:
-        return MESSAGE_IDS[text.upper()]
-    except KeyError:
-        raise ValueError(f"no MAVLink message is called {text!r}") from None
 
 
 def _kind_and_place(address: str) -> tuple[str, str]:
@@ -253,7 +243,7 @@ def _split_place(kind: str, place: str) -> tuple[str, int]:
             device, baud = place, str(DEFAULT_BAUD)
         if not device:
             raise ValueError(f"write {kind}:DEVICE:BAUD, as in {kind}:/dev/ttyUSB0:57600")
-        return device, _number(baud, "baud rate", MIN_BAUD, MAX_BAUD)
+        return device, number_from(baud, "baud rate", MIN_BAUD, MAX_BAUD)
     if kind is EndpointKind.ZENOH:
         if not LOCATOR.fullmatch(place):
             raise ValueError(f"{place!r} is no place of a router; write {kind}:tcp/HOST:7447")
@@ -262,7 +252,7 @@ def _split_place(kind: str, place: str) -> tuple[str, int]:
     bracketed = host.startswith("[") and host.endswith("]")
     if not host or (":" in host and not bracketed):
         raise ValueError(f"write {kind}:HOST:PORT, an IPv6 host in [brackets]")
-    number = _number(port, "port", 0, MAX_PORT)
+    number = number_from(port, "port", 0, MAX_PORT)
     host = host[1:-1] if bracketed else host
     if number == 0 and kind not in LISTENING:
         raise ValueError(f"port 0 is nowhere; name one of 1 to {MAX_PORT}")
@@ -277,15 +267,6 @@ def _check_host(kind: str, host: str) -> None:
         raise ValueError(f"{host!r} is no multicast group, such as 239.255.145.50")
     if not is_numeric(host) and not is_name(host):
         raise ValueError(f"{host!r} is neither an address nor a name")
-
-
-def _number(text: str, what: str, low: int, high: int) -> int:
-    # A number of thousands of digits is refused by Python itself, in words about Python.
-    if not text.isascii() or not text.isdecimal() or len(text) > len(str(high)):
-        raise ValueError(f"{what} {text!r} is not {low} to {high}")
-    if not low <= int(text) <= high:
-        raise ValueError(f"{what} {text} is not {low} to {high}")
-    return int(text)
 
 
 def stays_here(endpoint: Endpoint) -> bool:
@@ -308,48 +289,11 @@ def _options(kind: str, query: str) -> dict[str, str]:
     return options
 
 
-def _name(text: str) -> str:
-    if not text.strip() or not text.isprintable():
-        raise ValueError(f"name {text!r} cannot be shown")
-    return text[:MAX_NAME]
-
-
-def _messages(text: str) -> frozenset[int]:
-    return frozenset(message_id_from(part) for part in text.split(",") if part)
-
-
-def _intervals(text: str) -> dict[int, int]:
-    intervals = {}
-    for part in filter(None, text.split(",")):
-        message, _, rate = part.partition(":")
-        try:
-            rate_hz = float(rate)
-        except ValueError:
-            raise ValueError(f"rate {part!r} is not NAME:hertz") from None
-        if not (rate_hz == 0 or MIN_RATE_HZ <= rate_hz <= US_PER_S):
-            raise ValueError(f"rate {part!r} is not 0, or {MIN_RATE_HZ} to {US_PER_S} Hz")
-        interval = round(US_PER_S / rate_hz) if rate_hz else NO_MESSAGES
-        intervals[message_id_from(message)] = interval
-    return intervals
-
-
 def _budget(kind: str, baud: int, text: str | None) -> int:
     """Read the width of a link; a serial line carries no more than its baud rate."""
     if text is not None:
-        return _number(text, "budget", 0, MAX_BUDGET)
+        return number_from(text, "budget", 0, MAX_BUDGET)
     return baud // BITS_PER_BYTE if kind == EndpointKind.SERIAL else 0
-
-
-def _pack_bytes(text: str) -> int:
-    return _number(text, "pack", 0, MAX_PACK_BYTES)
-
-
-def _yes_or_no(text: str | None) -> bool | None:
-    if text is None:
-        return None
-    if text not in {"yes", "no"}:
-        raise ValueError(f"trusted {text!r} is not yes or no")
-    return text == "yes"
 
 
 def _origins(text: str) -> frozenset[str]:

@@ -20,8 +20,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.records import ClientInterval
-from gateway.routing.endpoint import NO_MESSAGES, Endpoint
+from gateway.routing.endpoint import Endpoint
 from gateway.routing.limits.width import HIGH_LATENCY2, HIGH_LATENCY2_BYTES, NARROW, Width
+from gateway.routing.option_values import NO_MESSAGES
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import (

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.routing.endpoint import MAX_PORT, NO_MESSAGES, EndpointKind, parse_endpoint
+from gateway.routing.endpoint import MAX_PORT, EndpointKind, parse_endpoint
 from gateway.routing.hub_settings import HubSettings
+from gateway.routing.option_values import NO_MESSAGES
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,9 @@ class HubContext(Protocol):
     def reconfigure(self, client: Client) -> None:
         """Let a client's changed lists and rates hold."""
 
+    def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
+        """Call back when all that has come at once is dealt with, or after a wait."""
+
     def note_buffer(self, client: Client, free_percent: int) -> None:
         """Take in how much of the buffer of the radio behind a client is free."""
 

@@ -91,6 +91,8 @@ class Hub:
         self._ping_us = self._trouble_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._published = 0
+        self._gathering: dict[float, list[Callable[[], None]]] = {}
+        """What is to be flushed, by how long it waits."""
 
     def start(self) -> None:
         """Open the endpoints; needs a running event loop. What fails is tried again."""
@@ -247,6 +249,25 @@ class Hub:
         """Let a client's changed lists and rates hold from the next frame on."""
         self._fanout.reconfigure(client.client_id, client.endpoint)
         self._router.reconfigure(client)
+
+    def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
+        """Call back when all that has come at once is dealt with, or after a wait.
+
+        One handle of the loop serves all clients: a timer for each cost more than it saved.
+        """
+        if gathering := self._gathering.get(wait_s):
+            gathering.append(flush)
+            return
+        self._gathering[wait_s] = [flush]
+        loop = asyncio.get_running_loop()
+        if wait_s:
+            loop.call_later(wait_s, self._flush, wait_s)
+        else:
+            loop.call_soon(self._flush, wait_s)
+
+    def _flush(self, wait_s: float) -> None:
+        for flush in self._gathering.pop(wait_s, ()):
+            flush()
 
     def note_buffer(self, client: Client, free_percent: int) -> None:
         """Let what goes to a radio follow the room in its buffer."""

@@ -28,8 +28,6 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """The default holds only about 256 small datagrams; a parameter upload bursts more."""
 BACKLOG_DATAGRAMS: Final = 256
 """Waiting behind a full socket buffer; what is older is of no use to a ground station."""
-PACK_DELAY_S: Final = 0.02
-"""How long a packed frame waits for company: one frame of the fastest stream."""
 
 
 class DatagramClient(Client):
@@ -38,7 +36,7 @@ class DatagramClient(Client):
     refused_us: int | None = None
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
-    _flush_timer: asyncio.TimerHandle | None = None
+    _is_gathering = False
 
     def __post_init__(self) -> None:
         """Begin without a socket."""
@@ -75,9 +73,6 @@ class DatagramClient(Client):
         self.write = not_open
         self.counters.dropped += len(self._backlog)
         self._backlog.clear()
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
         if self._socket is not None:
             self.loop.remove_reader(self._socket)
             self.loop.remove_writer(self._socket)
@@ -125,11 +120,12 @@ class DatagramClient(Client):
     def _pack(self, frame: bytes) -> None:
         assert self._packer is not None
         self._send_packed(self._packer.add(frame))
-        if self._flush_timer is None:
-            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+        if not self._is_gathering:
+            self._is_gathering = True
+            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def _flush(self) -> None:
-        self._flush_timer = None
+        self._is_gathering = False
         if self._packer is not None:
             self._send_packed(self._packer.flush())
 

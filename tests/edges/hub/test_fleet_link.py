@@ -167,7 +167,7 @@ class TestSite:
         hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
         far = visit("mavlink/field/*/out")
         await until_heard(rig, hub, far)
-        await until(rig, hub, lambda: not hub._clients[1]._flush_timer)
+        await until(rig, hub, lambda: not hub._clients[1]._is_gathering)
         for _ in range(5):
             hub.send(rig.out(rig.vehicle.raw_imu()))
             hub.send(rig.out(rig.vehicle.attitude()))

@@ -297,6 +297,48 @@ async def test_packed_frames_share_a_datagram(rig: Any) -> None:
     assert hub.clients()[0].sent == 5
 
 
+async def test_packing_waits_for_nothing_but_what_comes_at_once(rig: Any) -> None:
+    """Two datagrams that are read at one wake-up go on as one, without a timer."""
+    station = rig.station()
+    hub = rig.hub("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}?pack=1100")
+    await rig.until_open(hub)
+    source = rig.station(hub.listening_ports()[0])
+    source.sender = rig.sender(42, 1)
+    source.say(source.sender.heartbeat())
+    assert (await station.receive())[5] == 42
+    frames = [source.sender.attitude() for _ in range(3)]
+    for frame in frames:
+        source.say(frame)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert station.socket.recv(2000) == b"".join(frames)
+    assert hub._gathering == {}
+
+
+async def test_packing_may_wait(rig: Any) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=1100&wait=20")
+    await rig.until_open(hub)
+    frames = [rig.vehicle.attitude() for _ in range(3)]
+    for frame in frames:
+        hub.send(rig.out(frame))
+        await asyncio.sleep(0)
+        assert station.is_silent()
+    assert await station.receive() == b"".join(frames)
+
+
+async def test_a_packing_client_that_goes_before_the_flush(rig: Any) -> None:
+    errors: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=1100")
+    await rig.until_open(hub)
+    hub.send(rig.out(rig.vehicle.attitude()))
+    hub.remove(f"udp:127.0.0.1:{station.port}")
+    await rig.quiet()
+    assert errors == []
+
+
 async def test_a_full_socket_buffer_drops_the_oldest(rig: Any) -> None:
     station = rig.station()
     hub = rig.hub(f"udp:127.0.0.1:{station.port}")

@@ -19,7 +19,6 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     session_config,
 )
 from gateway.edges.hub.listener import RETRY_US
-from gateway.edges.hub.udp import PACK_DELAY_S
 from gateway.routing.endpoint import RAW_KEYS, Endpoint
 from gateway.routing.outbox import Packer
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
@@ -40,7 +39,7 @@ class ZenohClient(Client):
     _task: asyncio.Task[None] | None = None
     _outlets: Outlets | None = None
     _retry_us = 0
-    _flush_timer: asyncio.TimerHandle | None = None
+    _is_gathering = False
 
     def __post_init__(self) -> None:
         """Begin without a session; the first tick opens it."""
@@ -88,9 +87,6 @@ class ZenohClient(Client):
         """End the session; it says good-bye by itself, which may take a moment."""
         if self._task is not None:
             self._task.cancel()
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
         for inlet in self._inlets:
             inlet.close()
         if self._outlets is not None:
@@ -178,11 +174,12 @@ class ZenohClient(Client):
     def _pack(self, key: str, frame: bytes) -> None:
         packer = self._packers.setdefault(key, Packer(self.endpoint.pack_bytes))
         self._publish(key, packer.add(frame), patient=False)
-        if self._flush_timer is None:
-            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+        if not self._is_gathering:
+            self._is_gathering = True
+            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def _flush(self) -> None:
-        self._flush_timer = None
+        self._is_gathering = False
         for key, packer in self._packers.items():
             self._publish(key, packer.flush(), patient=False)
 

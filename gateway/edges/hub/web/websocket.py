@@ -5,7 +5,6 @@ one that has answered before and does so no more is gone; one that never answers
 programs do, is left to the kernel, which ends a connection that acknowledges nothing.
 """
 
-import asyncio
 import contextlib
 import logging
 import socket
@@ -18,7 +17,6 @@ from wsproto.frame_protocol import CloseReason
 
 from gateway.edges.hub.client import HubContext
 from gateway.edges.hub.tcp import CHUNK_BYTES, StreamClient, StreamListener, TcpClient
-from gateway.edges.hub.udp import PACK_DELAY_S
 from gateway.edges.hub.web.tls_layer import TlsLayer, caller_context, server_context
 from gateway.edges.hub.web.ws_protocol import WsCaller, WsInput, WsProtocol, WsServer
 from gateway.edges.reasons import reason_of
@@ -47,7 +45,7 @@ class WebStream(StreamClient):
     """A chunk holds hundreds of the smallest messages, and each costs as much as a large one."""
     _web: WsProtocol
     _tls: TlsLayer | None = None
-    _flush_timer: asyncio.TimerHandle | None = None
+    _is_gathering = False
     _begun_us = _spoke_us = _pinged_us = 0
     _answers = False
 
@@ -101,8 +99,9 @@ class WebStream(StreamClient):
         self._drop(self._outbox.push(frame, message_id, self._numbering.enter(frame)))
         if self._outbox.size >= self.endpoint.pack_bytes:
             self._flush()
-        elif self._flush_timer is None:
-            self._flush_timer = self.loop.call_later(PACK_DELAY_S, self._flush)
+        elif not self._is_gathering:
+            self._is_gathering = True
+            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Take some bytes of the connection."""
@@ -151,9 +150,6 @@ class WebStream(StreamClient):
 
     def close(self) -> None:
         """Say good-bye if there is room for it, and close the connection; what waits is lost."""
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
         if self._socket is not None and self.state == "open" and not self._partial:
             with contextlib.suppress(OSError):
                 self._socket.send(self._seal(self._web.close(CloseReason.GOING_AWAY)))
@@ -196,9 +192,7 @@ class WebStream(StreamClient):
 
     def _flush(self) -> None:
         """Send what has gathered."""
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
+        self._is_gathering = False
         if self._socket is not None and not self._partial:
             self._on_writable(self._socket)
 
