@@ -292,7 +292,7 @@ class TestExpress:
         by_remote = {client.remote: client for client in hub.clients()}
         gone = by_remote[f"127.0.0.1:{world.second.port}"]
         assert gone.state == "refused"
-        assert gone.sent + gone.dropped == 22
+        assert gone.sent + gone.dropped + gone.unheard == 22
         assert by_remote[f"127.0.0.1:{world.first.port}"].dropped == 0
 
     async def test_changes_hold_from_the_next_frame_on(self, world: Any) -> None:
