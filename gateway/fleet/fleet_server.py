@@ -15,6 +15,7 @@ from gateway.edges.hub.fleet_link.site_keys import out_key, presence_key, site_o
 from gateway.edges.hub.fleet_link.zenoh_session import (
     Inlet,
     Outlets,
+    end_session,
     open_session,
     session_config,
 )
@@ -128,11 +129,11 @@ class FleetServer:
         for inlet in self._inlets:
             inlet.close()
         if self._outlets is not None:
-            self._outlets.close()
+            self._declared += self._outlets.close()
             self._outlets = None
         if self._session is not None:
-            await asyncio.to_thread(self._session.close)
-            self._session = None
+            session, self._session = self._session, None
+            await asyncio.to_thread(end_session, session, self._declared)
         self._write_ids()
         self._hub.close()
         self._control.close()

@@ -3,7 +3,11 @@
 import asyncio
 import json
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -219,3 +223,24 @@ def test_a_file_of_ids_that_is_none(settings: FleetSettings, text: str, words: s
 def test_patterns_that_are_none(settings: FleetSettings, site: str) -> None:
     with pytest.raises(ValueError, match="site"):
         FleetServer(FleetSettings(sites=(site,), ids_file=settings.ids_file), HubSettings())
+
+
+def test_the_command_ends_at_once(tmp_path: Path, settings: FleetSettings) -> None:
+    config = tmp_path / "fleet.toml"
+    config.write_text(f'[fleet]\nids_file = "{tmp_path}/ids.json"\n')
+    words = ("fleet", "--listen", settings.listen, "--config", str(config))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gateway.cli", *words, "--endpoint", "udp:127.0.0.1:9"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        host, port = settings.listen.removeprefix("tcp/").split(":")
+        for _ in range(600):
+            with suppress(ConnectionRefusedError), socket.create_connection((host, int(port))):
+                break
+            time.sleep(0.1)
+        process.terminate()
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        process.wait()

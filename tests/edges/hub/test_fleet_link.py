@@ -283,3 +283,28 @@ class TestInlet:
         inlet.put(0)
         await asyncio.sleep(0)
         assert len(taken) == MAX_WAITING
+
+
+SITE = """
+import asyncio, sys
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub.hub import Hub
+from gateway.routing.hub_settings import HubSettings
+
+async def main():
+    hub = Hub(HubSettings(endpoints=(f"zenoh:{sys.argv[1]}?site=field",)), print, GatewayClock())
+    hub.start()
+    while hub.clients()[0].state != "open":
+        await asyncio.sleep(0.01)
+    hub.close()
+
+asyncio.run(main())
+"""
+
+
+async def test_a_process_ends_when_its_session_is_closed(router: Router) -> None:
+    """What is still declared at the end of Python waits for threads that have ended."""
+    done = await asyncio.to_thread(
+        subprocess.run, [sys.executable, "-c", SITE, router.place], timeout=60, check=False
+    )
+    assert done.returncode == 0

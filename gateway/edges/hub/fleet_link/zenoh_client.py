@@ -15,6 +15,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     PATIENT_IDS,
     Inlet,
     Outlets,
+    end_session,
     open_session,
     session_config,
 )
@@ -90,11 +91,11 @@ class ZenohClient(Client):
         for inlet in self._inlets:
             inlet.close()
         if self._outlets is not None:
-            self._outlets.close()
+            self._declared += self._outlets.close()
             self._outlets = None
         if self._session is not None:
-            self.loop.run_in_executor(None, self._session.close)
-            self._session = None
+            self.loop.run_in_executor(None, end_session, self._session, self._declared)
+            self._session, self._declared = None, []
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Take over changed options; another site or file needs the endpoint to be added anew."""

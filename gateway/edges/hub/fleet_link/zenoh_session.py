@@ -11,8 +11,9 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from gateway.routing.outbox import BULK_IDS
 
@@ -87,6 +88,19 @@ def open_session(config: "zenoh.Config") -> "zenoh.Session":
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise OSError(_words(error)) from None
+
+
+def end_session(session: "zenoh.Session", declared: list[Any]) -> None:
+    """Undeclare what was declared, and close; waits, so not on the loop.
+
+    What is still declared when Python ends would wait for ever for threads that have ended.
+    """
+    import zenoh
+
+    with suppress(zenoh.ZError):
+        while declared:
+            declared.pop().undeclare()
+        session.close()  # type: ignore[no-untyped-call]
 
 
 class Inlet(Generic[Item]):
@@ -183,8 +197,14 @@ class Outlets:
         """How many wait for a congested link."""
         return self._waiting.qsize()
 
-    def close(self) -> None:
-        """Publish nothing more; what waits is lost."""
+    def close(self) -> list["zenoh.Publisher"]:
+        """Publish nothing more, what waits is lost; return what is to be undeclared."""
+        self._end_thread()
+        publishers = [*self._publishers.values()]
+        self._publishers.clear()
+        return publishers
+
+    def _end_thread(self) -> None:
         while True:
             try:
                 self._waiting.put_nowait(None)
