@@ -22,7 +22,7 @@ from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
-from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.simulator.flight import fly
@@ -162,23 +162,21 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
 
 
 def run_paper(flight: Flight) -> np.ndarray:
-    """Run the paper's estimator, which takes records one at a time, over a flight."""
+    """Run the paper's estimator over a flight."""
     estimator = PaperEstimator(PaperSettings(), flight.reference, RestSettings())
     chain = SensorChain(SensingSettings(), NodeCalibration())
-    log, fix = flight.log, 0
+    log = flight.log
+    accel, gyro = chain.filter_log(log.imu_time_us, log.imu[:, :3], log.imu[:, 3:6])
+    samples = np.column_stack([accel, gyro, log.imu[:, 6:9]])
+    samples[~np.isfinite(log.imu[:, :6]).all(axis=1), :6] = np.nan
+    fixes = [
+        _fix_of(time_us, row)
+        for time_us, row in zip(log.gps_time_us.tolist(), log.gps.tolist(), strict=True)
+    ]
+    found = estimator.run(log.imu_time_us, samples, fixes)
     out = np.full((len(log.imu_time_us), NAV_COLUMNS), np.nan)
-    for i, (time_us, row) in enumerate(
-        zip(log.imu_time_us.tolist(), log.imu.tolist(), strict=True)
-    ):
-        while fix < len(log.gps_time_us) and log.gps_time_us[fix] <= time_us:
-            estimator.update_gps(_fix_of(int(log.gps_time_us[fix]), log.gps[fix].tolist()))
-            fix += 1
-        mag = tuple(row[6:9]) if math.isfinite(row[6]) else None
-        sample = chain.imu_si(time_us, tuple(row[:3]), tuple(row[3:6]), mag, math.nan, ImuFlags(0))
-        state = estimator.update_imu(sample)
-        out[i, :4] = state.q_nb
-        out[i, NAV_LAT : NAV_LAT + 3] = state.lat_deg, state.lon_deg, state.alt_amsl_m
-        out[i, NAV_VEL : NAV_VEL + 3] = state.vel_n_mps
+    out[:, :4], out[:, NAV_LAT : NAV_LAT + 3] = found[:, :4], found[:, 4:7]
+    out[:, NAV_VEL : NAV_VEL + 3] = found[:, 7:10]
     return out
 
 

@@ -4,6 +4,8 @@ import math
 from typing import Annotated, Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from gateway.records import BaroRaw, BaroSample, ImuFlags, ImuRaw, ImuSample, Vec3
 from gateway.sensing.calibration import (
@@ -18,6 +20,7 @@ from gateway.sensing.calibration import (
 from gateway.sensing.filters import (
     Coefficients,
     FilterState,
+    FloatArray,
     Kind,
     VectorFilter,
     design_highpass,
@@ -25,6 +28,8 @@ from gateway.sensing.filters import (
 )
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
+
+IntArray = NDArray[np.int64]
 
 GAP_US: Final = 500_000
 """Longer silence: the past says nothing about now, and the filters start afresh."""
@@ -204,6 +209,37 @@ class SensorChain:
             flags=flags,
         )
 
+    def filter_log(
+        self, time_us: IntArray, accel_b_mps2: FloatArray, gyro_b_radps: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Filter a whole log; bit for bit what `imu_si` gives for samples that are not filtered.
+
+        Parameters
+        ----------
+        time_us : ndarray of int, shape (n,)
+            Gateway clock.
+        accel_b_mps2, gyro_b_radps : ndarray, shape (n, 3)
+            Specific force and angular rate in body FRD.
+
+        Returns
+        -------
+        accel, gyro : ndarray, shape (n, 3)
+            Behind the low-pass and the high-pass.
+        """
+        accel, gyro = np.empty_like(accel_b_mps2), np.empty_like(gyro_b_radps)
+        begin = 0
+        for k, now_us in enumerate([*time_us.tolist(), None]):
+            rate_hz = None if now_us is None else self._measured(now_us)
+            if now_us is not None and rate_hz is None:
+                continue
+            part = slice(begin, k)
+            accel[part] = _filtered_array(self._lowpass, accel_b_mps2[part])
+            gyro[part] = _filtered_array(self._highpass, gyro_b_radps[part])
+            begin = k
+            if rate_hz is not None:
+                self._begin_anew(rate_hz)
+        return accel, gyro
+
     def baro(self, raw: BaroRaw) -> BaroSample:
         """Add the pressure altitude to a barometer payload.
 
@@ -233,25 +269,37 @@ class SensorChain:
 
     def _track_rate(self, time_us: int) -> None:
         """Measure the sample rate; start afresh after a gap, design anew when it has changed."""
+        rate_hz = self._measured(time_us)
+        if rate_hz is not None:
+            self._begin_anew(rate_hz)
+
+    def _begin_anew(self, rate_hz: float) -> None:
+        """Design the filters for another rate, or forget their past where it is the same."""
+        if rate_hz == self._rate_hz:
+            self._lowpass.reset()
+            self._highpass.reset()
+            return
+        self._rate_hz = rate_hz
+        self._lowpass.retune(rate_hz)
+        self._highpass.retune(rate_hz)
+
+    def _measured(self, time_us: int) -> float | None:
+        """Tell the rate to begin anew with: another one, or after a gap the same; else None."""
         last, self._last_us = self._last_us, time_us
         if last is None:
-            return
+            return None
         dt_us = time_us - last
         if not 0 < dt_us <= GAP_US:
             self._window = (0, 0)
-            if dt_us > GAP_US or dt_us < -GAP_US:
-                self._lowpass.reset()
-                self._highpass.reset()
-            return
+            return self._rate_hz if abs(dt_us) > GAP_US else None
         count, total_us = self._window[0] + 1, self._window[1] + dt_us
         if count == RATE_WINDOW:
             measured_hz = count * US_PER_S / total_us
-            if abs(measured_hz - self._rate_hz) > RETUNE_RATIO * self._rate_hz:
-                self._rate_hz = measured_hz
-                self._lowpass.retune(measured_hz)
-                self._highpass.retune(measured_hz)
-            count = total_us = 0
+            self._window = (0, 0)
+            changed = abs(measured_hz - self._rate_hz) > RETUNE_RATIO * self._rate_hz
+            return measured_hz if changed else None
         self._window = (count, total_us)
+        return None
 
 
 def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:
@@ -259,3 +307,11 @@ def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:
     if math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2]):
         return vector_filter.step(v)
     return v if vector_filter.state is None else vector_filter.state[1]
+
+
+def _filtered_array(vector_filter: VectorFilter, values: FloatArray) -> FloatArray:
+    """Do the same for an array."""
+    finite = np.isfinite(values).all(axis=1)
+    if finite.all():
+        return vector_filter.run(values)
+    return np.array([_filtered(vector_filter, (v[0], v[1], v[2])) for v in values.tolist()])

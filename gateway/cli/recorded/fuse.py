@@ -112,6 +112,7 @@ def fuse_log(
             columns=read_column_map(columns),
             progress=advance,
         )
+        _remark_latency(files[0], facts, gps_latency_s, options)
         table = joined_rows([open_rows(part, options) for part in files])
         aircraft = _adjusted(
             aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
@@ -133,6 +134,19 @@ def fuse_log(
         write_new(out, _lines(header, time_us, states), overwrite=force, inputs=inputs)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
+
+
+def _remark_latency(
+    file: Path, facts: dict[str, float], told_s: float | None, options: ReadOptions
+) -> None:
+    """Say which latency is assumed where neither the file nor the user tells one."""
+    foreign = kind_of(file) is FileKind.FOREIGN
+    if foreign and told_s is None and "gps_latency_s" not in facts:
+        assumed_s = options.current.default.estimation.reference.gps_latency_s
+        console_of(stderr=True).print(
+            f"{file}: tells no GPS latency; {assumed_s:.2f} s is assumed, --gps-latency sets it",
+            markup=False,
+        )
 
 
 def _records(table: RecordedTable) -> Iterator[Record]:
