@@ -113,5 +113,11 @@ def test_a_fix_without_height_leaves_the_rest_of_it(flight: Flight, name: str) -
     assert np.isfinite(out[settled][:, NAV_LAT : NAV_LAT + 2]).all()
 
 
+def test_turns_without_gps_are_not_taken_for_level(flight: Flight) -> None:
+    """What pulls for long is flown: the compass hangs on the level, so the heading tells."""
+    alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
+    assert attitude_scores(alone, run_eskf(alone)[:, :4])["heading"] < 6.0
+
+
 def test_every_way_of_spoiling_applies_to_a_whole_flight(flight: Flight) -> None:
     assert all(applies(how, flight) for how in SPOILS)

@@ -36,6 +36,7 @@ GRAVITY_NOISE_MPS2: Final = 1.0
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 """What the gyroscope's bias may be off."""
 PULL_TAU_S: Final = 3.0
+TURNING_TAU_S: Final = 20.0
 PULL_KEPT: Final = 0.7
 """Of an acceleration that is over, from one pair to the next."""
 USUAL_PULL: Final = 1.03
@@ -69,6 +70,8 @@ class AlignmentState:
     """Over which time, what has faded left out."""
     force_mean_i: Annotated[FloatArray, (3,)]
     """Low-pass of the specific force in the gyroscope's frame."""
+    turning_mps2: float
+    """Mean of what gives itself away: of a hand little, of a flight in turns much."""
     pull_mps2: float
     """Level acceleration of late: as GPS tells it, or what gives itself away without."""
     square: Annotated[FloatArray, (2, 4, 4)]
@@ -201,6 +204,7 @@ def align_by_gravity(s: AlignmentState, now_s: float, force_i: Vec3, period_s: f
     for k in range(3):
         s.force_mean_i[k] += share * (force[k] - s.force_mean_i[k])
     s.pull_mps2 = unseen_acceleration(s)
+    s.turning_mps2 += min(1.0, dt / TURNING_TAU_S) * (s.pull_mps2 - s.turning_mps2)
     weight = 1.0 / (GRAVITY_NOISE_MPS2 * GRAVITY_NOISE_MPS2)
     take_pair(s, force, (0.0, 0.0, -STANDARD_GRAVITY_MPS2), weight, dt)
     begin_pair(s, now_s, (0.0, 0.0, 0.0), force_i)

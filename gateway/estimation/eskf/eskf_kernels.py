@@ -61,6 +61,9 @@ COMPASS_S: Final = 0.045
 """Between compass measurements; its slow error makes more of them useless."""
 ROUGH_LIMIT: Final = 1e4
 """A larger change is a fault, and NaN compares false."""
+HAND_MPS2: Final = 0.5
+TURN_S: Final = 4.0
+"""What pulls more than a hand does for long is flown; its velocity turns in about this time."""
 UNAIDED_PULL_MPS2: Final = 0.5
 """A lasting acceleration of this much halves the belief in standing still."""
 ZERO: Final = (0.0, 0.0, 0.0)
@@ -239,7 +242,9 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
         update_by_rest(s, p)
     elif s.aided == 0 and s.lost == 0:
         pull = s.pull_mps2 / UNAIDED_PULL_MPS2
-        variance = p.unaided_var * UNAIDED_CORRELATION_S / dt * (1.0 + pull * pull)
+        flown = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
+        variance = p.unaided_var * (1.0 + pull * pull) + flown * flown
+        variance *= UNAIDED_CORRELATION_S / dt
         update_by_velocity(s, p, variance)
 
 
