@@ -28,6 +28,7 @@ from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.field_history import FloatArray
 from gateway.panel.state.sample_memory import TimedFrames
+from gateway.records import NavState
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.services.parameters.parameters import ParameterTable
@@ -124,7 +125,8 @@ async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) ->
 
 def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:
     reader = AutopilotReader()
-    records = [record for time_us, frame in frames for record in reader.feed(frame, time_us)]
+    found = (record for time_us, frame in frames for record in reader.feed(frame, time_us))
+    records = [record for record in found if not isinstance(record, NavState)]
     try:
         flight = flight_of_records(
             records, NodeCalibration(), name="the last minutes", story="", fusion=settings

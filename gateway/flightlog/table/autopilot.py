@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.geometry.quaternion import from_euler
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -21,10 +22,12 @@ from gateway.records import (
     GpsFixType,
     ImuCalibrated,
     ImuFlags,
+    NavFlags,
+    NavState,
     NodeId,
     Vec3,
 )
-from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 UT_PER_GAUSS: Final = 100.0
@@ -38,7 +41,7 @@ UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
 VELOCITY_AGE_US: Final = US_PER_S // 2
 """A velocity down that is older is another one by now."""
 
-Imported = ImuCalibrated | BaroRaw | GpsFix
+Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
 
 _FIX_TYPES: Final = {2: GpsFixType.FIX_2D, 3: GpsFixType.FIX_3D}
 _IMU_RANK: Final = {
@@ -66,13 +69,15 @@ class AutopilotReader:
         self._zero_us: int | None = None
         self._rank = 0
         self._newest_us = 0
-        self._down_mps = NAN
-        self._down_us = 0
+        self._place: Any = None
+        """The newest GLOBAL_POSITION_INT, and when it was recorded."""
+        self._place_us = 0
         self._handlers: dict[int, Callable[[Any, int], list[Imported]]] = {
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._milli_imu,
             mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._milli_imu,
             mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._pressure,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._position,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps,
         }
@@ -167,8 +172,36 @@ class AutopilotReader:
         return [BaroRaw(time_us, node, time_us, m.press_abs * PA_PER_HPA, m.temperature * CENTI)]
 
     def _position(self, m: Any, recorded_us: int) -> list[Imported]:
-        self._down_mps, self._down_us = m.vz * CENTI, recorded_us
+        self._place, self._place_us = m, recorded_us
         return []
+
+    def _newest_place(self, recorded_us: int) -> Any:
+        """Return the newest GLOBAL_POSITION_INT, unless it is of long ago."""
+        return self._place if abs(recorded_us - self._place_us) <= VELOCITY_AGE_US else None
+
+    def _attitude(self, m: Any, recorded_us: int) -> list[Imported]:
+        """Take what the autopilot itself believes, to be compared with."""
+        place = self._newest_place(recorded_us)
+        flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+        if place is not None:
+            flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
+        vel = (NAN,) * 3 if place is None else (place.vx, place.vy, place.vz)
+        unknown: Vec3 = (NAN, NAN, NAN)
+        return [
+            NavState(
+                time_us=self._time(m, recorded_us),
+                q_nb=from_euler(m.roll, m.pitch, m.yaw),
+                rate_b_radps=(m.rollspeed, m.pitchspeed, m.yawspeed),
+                lat_deg=NAN if place is None else place.lat * DEG_PER_DEGE7,
+                lon_deg=NAN if place is None else place.lon * DEG_PER_DEGE7,
+                alt_amsl_m=NAN if place is None else place.alt * MILLI,
+                vel_n_mps=(vel[0] * CENTI, vel[1] * CENTI, vel[2] * CENTI),
+                attitude_std_rad=unknown,
+                vel_std_mps=unknown,
+                pos_std_m=unknown,
+                flags=flags,
+            )
+        ]
 
     def _gps(self, m: Any, recorded_us: int) -> list[Imported]:
         time_us = self._time(m, recorded_us)
@@ -201,8 +234,9 @@ class AutopilotReader:
         if fix_type is GpsFixType.NONE:
             return (NAN, NAN, NAN)
         speed, course_rad = _known(m.vel, CENTI), math.radians(_known(m.cog, CENTI))
-        fresh = abs(recorded_us - self._down_us) <= VELOCITY_AGE_US
-        down = self._down_mps if fresh and fix_type is GpsFixType.FIX_3D else NAN
+        place = self._newest_place(recorded_us)
+        climbs = place is not None and fix_type is GpsFixType.FIX_3D
+        down = place.vz * CENTI if climbs else NAN
         return (speed * math.cos(course_rad), speed * math.sin(course_rad), down)
 
 

@@ -140,9 +140,15 @@ class RowBuilder:
     def __init__(self) -> None:
         self._baro: BaroRaw | None = None
         self._gps: GpsFix | None = None
+        self._state: NavState | None = None
 
-    def add(self, record: BaroRaw | GpsFix | FusedSample | ImuCalibrated) -> list[TableRow]:
-        """Take the next record and return the rows that it completes."""
+    def add(
+        self, record: BaroRaw | GpsFix | FusedSample | ImuCalibrated | NavState
+    ) -> list[TableRow]:
+        """Take the next record and return the rows that it completes.
+
+        A state that comes by itself, as an autopilot's does, goes with the next sample.
+        """
         match record:
             case BaroRaw():
                 rows = self.flush() if self._baro or self._gps else []
@@ -153,7 +159,10 @@ class RowBuilder:
             case FusedSample():
                 rows = [self._row(record.imu, _calibrated(record), record.state)]
             case ImuCalibrated():
-                rows = [self._row(None, record, None)]
+                rows = [self._row(None, record, self._state)]
+                self._state = None
+            case NavState():
+                rows, self._state = [], record
         return rows
 
     def _row(self, raw: ImuRaw | None, imu: ImuCalibrated, state: NavState | None) -> TableRow:

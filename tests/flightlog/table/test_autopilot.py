@@ -7,7 +7,17 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.flightlog.table.autopilot import AutopilotReader, Imported
-from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags
+from gateway.flightlog.table.row import RowBuilder
+from gateway.geometry.quaternion import to_euler
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NavFlags,
+    NavState,
+)
 from tests.flightlog.frames import START_US
 
 G = 9.80665
@@ -161,3 +171,26 @@ def test_a_lost_fix_makes_no_climb() -> None:
 def test_a_flat_fix_has_no_climb() -> None:
     (fix,) = fixes_of([(0, position(0, -150)), (0, gps(1, fix=2))])
     assert math.isnan(fix.vel_n_mps[2])
+
+
+def attitude(time_ms: int) -> Message:
+    return mavlink.MAVLink_attitude_message(time_ms, 0.1, -0.2, 1.5, 0.01, 0.02, 0.03)
+
+
+def test_what_the_autopilot_believes_goes_along() -> None:
+    later = [(600_000, attitude(600)), (600_000, raw(600_000))]
+    records = read([(0, raw(0)), (0, position(0, -150)), (10_000, attitude(10)), *later])
+    fresh, stale = (record for record in records if isinstance(record, NavState))
+    assert to_euler(fresh.q_nb) == pytest.approx((0.1, -0.2, 1.5))
+    assert fresh.rate_b_radps == pytest.approx((0.01, 0.02, 0.03))
+    assert (fresh.lat_deg, fresh.alt_amsl_m) == pytest.approx((47.1, 430.0))
+    assert fresh.vel_n_mps == pytest.approx((0.0, 15.0, -1.5))
+    assert NavFlags.POSITION_VALID in fresh.flags
+    assert math.isnan(stale.lat_deg)
+    assert NavFlags.POSITION_VALID not in stale.flags
+    rows, builder = [], RowBuilder()
+    for record in records:
+        rows += builder.add(record)
+    assert [row.state for row in rows if row.imu is not None] == [None, stale], (
+        "with the next sample; of two the newer"
+    )
