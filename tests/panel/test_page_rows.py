@@ -40,7 +40,11 @@ def test_row_3d_from_two_viewpoints(page: Page) -> None:
     assert [choices.nth(i).input_value() for i in range(2)] == ["chase", "ground"]
     page.wait_for_function("document.querySelector('.scene').dataset.frames > 5")
     # Over each half's own region the world is drawn: sky, ground and aircraft, not one colour.
-    picture = Image.open(io.BytesIO(scene.screenshot())).convert("RGB")
+    # Not the element's own photograph, which waits until nothing moves.
+    box = scene.bounding_box()
+    assert box is not None
+    clip = {"x": box["x"], "y": box["y"], "width": box["width"], "height": box["height"]}
+    picture = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
     upper = picture.crop((0, 60, picture.width, picture.height // 2))
     lower = picture.crop((0, picture.height // 2 + 60, picture.width, picture.height))
     assert all(len(half.getcolors(1 << 24)) > 20 for half in (upper, lower))
