@@ -47,6 +47,7 @@ def test_page_finds_a_gateway_that_was_killed_and_started_again(
     browser: Browser, tmp_path: Path, processes: list[Process]
 ) -> None:
     processes.append(Process(tmp_path, "demo", "--plain", "--no-panel"))
+    processes[0].until("receiver on")
     processes.append(Process(tmp_path, "panel"))
     page = open_page(browser, processes[1].link())
     chips = page.locator(".chips")
