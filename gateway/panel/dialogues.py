@@ -11,7 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.clock import GatewayClock
-from gateway.panel.state.dialogue.calibration_run import CalibrationRun, CalibrationStep
+from gateway.panel.state.dialogue.calibration_run import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.dialogue.file_client import FileClient
 from gateway.panel.state.dialogue.parameter_client import AUTOPILOT, ListState, ParameterClient
 from gateway.panel.state.dialogue.parameter_meta import (
@@ -45,9 +45,16 @@ class Dialogue:
         found = self.parameters.load(now_us)
         return found if self.metas else found + self.files.read(GENERAL_PATHS[0], now_us)
 
+    @property
+    def unanswered(self) -> CalibrationStep | None:
+        """The step that was calibrated and neither stored nor undone yet."""
+        run = self.calibration
+        return run.step if run is not None and run.state is RunState.DONE else None
+
     def calibrate(self, step: CalibrationStep, now_us: int) -> list[Any]:
         """Begin a calibration; returns what is to be sent."""
-        self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
+        if self.unanswered is None:
+            self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
         self.calibration = CalibrationRun(self.parameters.system_id, step, now_us)
         return [*self.ask_for_samples(), self.calibration.start_message()]
 

@@ -244,6 +244,11 @@ class _CalibrationView:
         context.check_may_change()
         if system_id is None:
             return
+        other = context.parts.dialogues.of(system_id).unanswered
+        if other not in (None, self._step):
+            # Storing this one would store that one too.
+            ui.notify(f"{TITLES[other][0]}: store it or undo it first", type="warning")
+            return
         context.parts.dialogues.calibrate(system_id, self._step)
         self._refresh()
 

@@ -1,0 +1,45 @@
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.estimator_trial import ComparisonError, compare, settings_of
+from gateway.panel.state.sample_memory import SPAN_US, SampleMemory
+from gateway.units import US_PER_S
+
+
+def imu(time_us: int) -> mavlink.MAVLink_message:
+    """A message as it comes off the line: with its frame."""
+    mav = mavlink.MAVLink(None, 1, 1)
+    message = mavlink.MAVLink_highres_imu_message(
+        time_us, 0, 0, -9.8, 0, 0, 0, 0.2, 0, 0.4, 0, 0, 0, 20, 0xFFFF
+    )
+    return mav.decode(bytearray(message.pack(mav)))
+
+
+def test_parameters_become_the_settings_that_they_are_of() -> None:
+    found = settings_of({"PAPER_ALPHA_GYRO": 0.75, "EST_ESTIMATOR": 1.0, "CAL_ACC_BIAS_X": 3.0})
+    assert found.estimation.paper.alpha_gyro == 0.75
+
+
+@pytest.mark.parametrize("value", [7.0, float("nan")])
+def test_a_value_that_is_not_allowed_leaves_the_default(value: float) -> None:
+    assert settings_of({"PAPER_ALPHA_GYRO": value}) == settings_of({})
+
+
+def test_too_little_to_fuse_is_said() -> None:
+    with pytest.raises(ComparisonError, match="no sensor samples"):
+        compare([], {})
+    memory = SampleMemory()
+    for n in range(100):
+        memory.take(1, imu(n * 20_000), n * 20_000)
+    with pytest.raises(ComparisonError, match="2 s of samples at 50 Hz"):
+        compare(memory.frames(1), {})
+
+
+def test_only_the_last_minutes_of_sensors_are_remembered() -> None:
+    memory = SampleMemory()
+    memory.take(1, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3), 0)
+    assert memory.frames(1) == []
+    for second in range(400):
+        memory.take(1, imu(second), second * US_PER_S)
+    times = [time_us for time_us, _ in memory.frames(1)]
+    assert times[-1] - times[0] == SPAN_US
