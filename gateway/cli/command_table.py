@@ -78,7 +78,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "info": CommandEntry(
         "recorded.info",
-        "Tell what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
         RECORDINGS,
     ),
     "recover": CommandEntry(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 import typer
@@ -24,8 +24,10 @@ from gateway.edges.disk.recordings import (
     rename_recording,
 )
 from gateway.flightlog.moment import civil_time
-from gateway.flights.glance import Glance, glance
 from gateway.units import US_PER_S
+
+if TYPE_CHECKING:
+    from gateway.flights.glance import Glance
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
@@ -155,7 +157,10 @@ def _show(status: dict[str, Any]) -> None:
     console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free", markup=False)
 
 
-def _looked_at(recordings: list[Recording]) -> Iterator[tuple[Recording, Glance]]:
+def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":
+    # Not above: it brings the compiler along, which an order to the recorder must not wait for.
+    from gateway.flights.glance import glance
+
     return ((recording, glance(recording.files)) for recording in recordings)
 
 
