@@ -30,8 +30,6 @@ EXTRAS: Final = {
     "plot": ("jinja2", "matplotlib"),
     "panel": ("nicegui", "pmtiles"),
     "fleet": ("zenoh",),
-    "formats": ("mcap", "pyarrow", "pyulog"),
-    "batch": ("dask", "duckdb", "fsspec"),
 }
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0
