@@ -39,8 +39,12 @@ def numbers(kind: type[Settings], path: tuple[str, ...] = ()) -> Iterator[tuple[
         inner = (*path, field.name)
         if field.section is not None:
             yield from numbers(field.section, inner)
-        elif not field.choices and not isinstance(first_of(field.default), bool | str):
+        elif not field.choices and is_number(first_of(field.default)):
             yield ".".join(inner), field
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def first_of(value: Any) -> Any:

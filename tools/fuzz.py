@@ -43,7 +43,8 @@ from gateway.vehicle.home import Place
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import Link
-from gateway.wire.mavlink_splitter import MavlinkSplitter
+from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 
 NUMBERS: Final = (
     *("0", "-1", "1", "47.0", "99999", "-99999", "inf", "-inf", "nan", "1e308", "5e-324", "1e999"),
@@ -107,12 +108,18 @@ def radio_frames(draw: st.DrawFn) -> bytes:
 
 @given(damaged(messages()), CUTS)
 def splitter(data: bytes, cuts: list[int]) -> None:
-    """Any bytes in any chunks: the same frames, each whole, and nothing raised."""
+    """Any bytes in any chunks: the same frames, each whole, and nothing raised.
+
+    Where a message is unknown its checksum proves nothing: it passes if it ends where another frame
+    or the chunk does, so chunks may differ about that.
+    """
     whole = [event for event in MavlinkSplitter().feed(data) if isinstance(event, bytes)]
     split = MavlinkSplitter()
     events = [event for chunk in chunks_of(data, cuts) for event in split.feed(chunk)]
-    assert [event for event in events if isinstance(event, bytes)] == whole
-    assert all(frame in data for frame in whole)
+    frames = [event for event in events if isinstance(event, bytes)]
+    if all(message_id_of(frame) in CRC_EXTRA for frame in whole + frames):
+        assert frames == whole
+    assert all(frame in data for frame in whole + frames)
 
 
 @given(st.lists(messages(), min_size=1, max_size=8), CUTS)

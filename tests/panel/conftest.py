@@ -9,7 +9,7 @@ from tests.panel.browsing import Process, launch
 from tests.panel.test_map_tiles import picture, write_mbtiles
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         opened = launch(playwright)
@@ -17,7 +17,7 @@ def browser() -> Iterator[Browser]:
         opened.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     folder = tmp_path_factory.mktemp("demo")
     for name, shade in (("field", 40), ("other", 200)):

@@ -61,7 +61,7 @@ def test_a_folder_that_cannot_be_written_is_told(
     monkeypatch.setattr("gateway.analysis.reporting.page.write_report", full)
     empty = Report("", "", [], [])
     monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda *_: empty)
-    monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_: None)
+    monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_, **__: None)
     monkeypatch.setattr(report, "load_flight", lambda *_: None)
     result = CliRunner().invoke(app, ["report", "-o", str(tmp_path / "page")])
     assert result.exit_code == 2
