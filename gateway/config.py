@@ -310,7 +310,7 @@ def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -
 
 
 def _check_home(path: str, value: Any, field: Field) -> Iterator[str]:
-    """Check that `~` or `~user` at the begin of a path stands for a folder."""
+    """Check that `~` or `~user` at the start of a path stands for a folder."""
     if field.is_path:
         try:
             Path(value).expanduser()
@@ -333,7 +333,7 @@ def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationE
 
 
 def _choice_hint(value: Any, field: Field) -> str:
-    """Tell what may be chosen, and what was probably meant."""
+    """Return what may be chosen, and what was probably meant."""
     if not field.choices:
         return ""
     near = difflib.get_close_matches(str(value), field.choices, n=1)

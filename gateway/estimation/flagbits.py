@@ -26,7 +26,7 @@ FRESH_GPS_S: Final = 1.5
 
 @compiled
 def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
-    """Tell the flags that follow from the age of the last accepted and rejected fix.
+    """Return the flags that follow from the age of the last accepted and rejected fix.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class FieldGains:
 
 
 def field_gains(settings: CompassSettings) -> dict[str, float]:
-    """Tell the fields of `FieldGains`."""
+    """Return the fields of `FieldGains`."""
     return {
         "mag_norm_tolerance": settings.norm_tolerance,
         "mag_dip_tolerance_rad": math.radians(settings.dip_tolerance_deg),

@@ -40,7 +40,7 @@ class ReferenceSettings(Settings, frozen=True):
 
 
 def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
-    """Tell whether a fix may be fused.
+    """Return whether a fix may be fused.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class EarthField:
         return math.nan if self.state is None else self.state[2].declination_rad
 
     def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
-        """Tell the place.
+        """Return the place.
 
         Parameters
         ----------

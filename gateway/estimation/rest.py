@@ -55,7 +55,7 @@ class RestGains:
 
 
 def rest_gains(settings: RestSettings) -> dict[str, float]:
-    """Tell the fields of `RestGains`."""
+    """Return the fields of `RestGains`."""
     return {
         "bias_limit_radps": math.radians(settings.bias_limit_degps),
         "rest_gyro_radps": math.radians(settings.gyro_degps),
@@ -124,7 +124,7 @@ def watch_rest(
 
 @compiled
 def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: float) -> float:
-    """Tell how firmly a bias that was learned at rest may be believed in flight.
+    """Return how firmly a bias that was learned at rest may be believed in flight.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
     Returns
     -------
     float
-        Standard deviation in rad/s at the begin of a motion: what the bias has changed by from
+        Standard deviation in rad/s at the start of a motion: what the bias has changed by from
         motion to rest before, or may change by where that is not known; 0 at other times.
     """
     if s.at_rest == 1:

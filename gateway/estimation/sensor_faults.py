@@ -33,13 +33,13 @@ class HealthState:
 
 @compiled
 def is_sound(v: Vec3, limit: float) -> bool:
-    """Tell whether a vector is finite and within what a sensor can read."""
+    """Return whether a vector is finite and within what a sensor can read."""
     return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
 
 
 @compiled
 def is_start(s: HealthState, gyro: Vec3, accel: Vec3) -> bool:
-    """Tell whether an estimator may begin with a sample, and set the fault if not.
+    """Return whether an estimator may begin with a sample, and set the fault if not.
 
     A sensor that has just been woken may send zeros; what is far from gravity tells no level.
     """
@@ -51,13 +51,13 @@ def is_start(s: HealthState, gyro: Vec3, accel: Vec3) -> bool:
 
 @compiled
 def is_same(v: Vec3, last: FloatArray) -> bool:
-    """Tell whether a vector repeats the last one exactly."""
+    """Return whether a vector repeats the last one exactly."""
     return bool(v[0] == last[0] and v[1] == last[1] and v[2] == last[2])
 
 
 @compiled
 def check_sensors(s: HealthState, gyro: Vec3, accel: Vec3, dt: float) -> tuple[bool, bool]:
-    """Tell whether gyroscope and accelerometer may be believed.
+    """Return whether gyroscope and accelerometer may be believed.
 
     Parameters
     ----------

@@ -136,7 +136,7 @@ class LogAnswers:
                 self._kept += 1
 
     def tells(self, system: int, message_id: int) -> bool:
-        """Tell whether a vehicle sent a message at all."""
+        """Return whether a vehicle sent a message at all."""
         return (system, message_id) in self._told
 
     def frames_at(self, system: int, message_id: int, time_us: int) -> Iterator[bytes]:
@@ -215,7 +215,7 @@ class VehicleAnswers:
         self._position_us = position_us
 
     def tells(self, message_id: int) -> bool:
-        """Tell whether the vehicle sent a message at all."""
+        """Return whether the vehicle sent a message at all."""
         return self._log.tells(self._system_id, message_id)
 
     def frames(self, message_id: int) -> list[bytes]:

@@ -53,7 +53,7 @@ class RecordingBudget:
         self._trusted.pop(client_id, None)
 
     def takes(self, client_id: int, size: int, now_us: int) -> bool:
-        """Tell whether a frame from a client, or to it alone, is recorded.
+        """Return whether a frame from a client, or to it alone, is recorded.
 
         Parameters
         ----------

@@ -100,7 +100,7 @@ class Track:
         return self._source.prepare(time_us - self._shift_us)
 
     def peek_us(self) -> int | None:
-        """Tell the time of the next record, None at the end."""
+        """Return the time of the next record, None at the end."""
         return None if self._next is None else self._next.time_us + self._shift_us
 
     def take(self) -> bytes:
@@ -176,7 +176,7 @@ class Track:
 
 
 def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:
-    """Tell which frames replace one another; each parameter stands for itself."""
+    """Return which frames replace one another; each parameter stands for itself."""
     message_id = message_id_of(frame)
     name = frame[PARAM_NAME] if message_id == PARAM_VALUE_ID else b""
     return (*origin_of(frame), message_id, name)

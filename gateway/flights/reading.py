@@ -220,7 +220,7 @@ def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int:
-    """Tell how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    """Return how far two clocks are apart; the parts of a recording have one, by whatever name."""
     if None in (header.unix_us_at_zero, first.unix_us_at_zero):
         return 0
     shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)

@@ -43,7 +43,7 @@ from gateway.records import (
 )
 from gateway.replay import InterpolatedPosition, Replay, header_for, records_of
 
-SETTLES: Final = "what was remembered at the begin is left aside: {}; the estimator settles anew"
+SETTLES: Final = "what was remembered at the start is left aside: {}; the estimator settles anew"
 
 Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
@@ -137,7 +137,7 @@ class Refusion:
 
 
 def end_of(file: Path, options: ReadOptions) -> int | None:
-    """Tell the civil time of a table's last row without reading all of it; None if unknown."""
+    """Return the civil time of a table's last row without reading all of it; None if unknown."""
     kind = kind_of(file)
     if kind is FileKind.OTHER:
         return None

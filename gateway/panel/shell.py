@@ -189,7 +189,7 @@ class _Page:
 
 
 def _mode_of(context: ViewContext) -> str:
-    """Tell where what is shown comes from."""
+    """Return where what is shown comes from."""
     vehicle, status = context.vehicle, context.parts.watch.status
     if vehicle is not None and vehicle.origin != "live":
         return "recording"

@@ -85,7 +85,7 @@ class RoutingTable:
         return len(self._to[origin]) > 1
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
-        """Return whether a system has been heard of late by more than one way."""
+        """Return whether a system has been heard recently by more than one way."""
         ways = self._to.get(origin)
         if ways is None or len(ways) == 1:
             return False

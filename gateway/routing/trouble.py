@@ -1,7 +1,7 @@
 """Trouble with clients and ports, told in words: once when it comes, once when it has passed.
 
 Every configured client has its own words. Those who call at a listening port may be anybody, and
-any number: of them only a few are named in a minute, lest an attack drown what else is told.
+any number: of them only a few are named in a minute, so that an attack drowns nothing else.
 """
 
 from typing import Final

@@ -284,7 +284,7 @@ class SensorChain:
         self._highpass.retune(rate_hz)
 
     def _measured(self, time_us: int) -> float | None:
-        """Tell the rate to begin anew with: another one, or after a gap the same; else None."""
+        """Return the rate to begin anew with: another one, or after a gap the same; else None."""
         last, self._last_us = self._last_us, time_us
         if last is None:
             return None

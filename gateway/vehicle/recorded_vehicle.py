@@ -61,7 +61,7 @@ class Answers(Protocol):
     """What a log tells of one vehicle, as of the moment that is played."""
 
     def tells(self, message_id: int) -> bool:
-        """Tell whether the vehicle sent a message at all."""
+        """Return whether the vehicle sent a message at all."""
         ...
 
     def frames(self, message_id: int) -> list[bytes]:
@@ -144,7 +144,7 @@ class RecordedVehicle:
         return self._finish([*found, *self._ftp.poll(now_us)])
 
     def next_due_us(self) -> int | None:
-        """Tell when `poll` has something to send."""
+        """Return when `poll` has something to send."""
         due = (self._due_us, self._ftp.next_due_us())
         return min((time_us for time_us in due if time_us is not None), default=None)
 

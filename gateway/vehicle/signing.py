@@ -77,7 +77,7 @@ class Verifier:
         self._book = StampBook() if book is None else book
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
-        """Tell whether a whole frame is signed by a holder of the key, and not a replay.
+        """Return whether a whole frame is signed by a holder of the key, and not a replay.
 
         Parameters
         ----------

@@ -50,7 +50,7 @@ class StampBook:
         return self._newest.get(mark, {}).get(stream)
 
     def has_room(self, mark: str) -> bool:
-        """Tell whether one more stream can be followed under a key."""
+        """Return whether one more stream can be followed under a key."""
         return len(self._newest.get(mark, {})) < MAX_STREAMS
 
     def note(self, mark: str, stream: Stream, stamp: int) -> None:

@@ -196,7 +196,7 @@ class Link:
     def _take_radio(
         self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
     ) -> list[RawRecord]:
-        """Tell what a payload says; a node is believed from the second one that agrees."""
+        """Return what a payload says; a node is believed from the second one that agrees."""
         header = frame.header
         node = self._nodes.get(header.node)
         if node is not None:

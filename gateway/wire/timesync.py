@@ -90,7 +90,7 @@ class ClockTracker:
         return min(self._to_local(remote_us), arrival_us)
 
     def _is_doubtful(self, point: _Point, arrival_us: int) -> bool:
-        """Tell whether a packet is far too early, and no other says so too."""
+        """Return whether a packet is far too early, and no other says so too."""
         before, self._suspect = self._suspect, None
         if not self._buckets or self._to_local(point.remote_us) - arrival_us <= AHEAD_US:
             return False

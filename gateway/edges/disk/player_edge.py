@@ -100,7 +100,7 @@ class PlayerEdge:
         self._player.loop = loop
 
     def seek(self, offset_s: float, *, relative: bool = False) -> None:
-        """Move to an offset from the begin of the range, or from here."""
+        """Move to an offset from the start of the range, or from here."""
         player = self._player
         here_us = player.position_us if self._wanted_us is None else self._wanted_us
         base_us = here_us if relative else player.begin_us

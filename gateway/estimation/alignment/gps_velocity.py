@@ -26,13 +26,13 @@ class WayState:
 
 @compiled
 def is_velocity_told(vel: Vec3) -> bool:
-    """Tell whether a fix has a level velocity of its own."""
+    """Return whether a fix has a level velocity of its own."""
     return is_sound((vel[0], vel[1], 0.0), FASTEST_MPS)
 
 
 @compiled
 def velocity_noise(vel: Vec3) -> float:
-    """Tell the noise of the velocity that `velocity_of_fix` makes of what a fix tells, m/s."""
+    """Return the noise of the velocity that `velocity_of_fix` makes of what a fix tells, m/s."""
     return TOLD_NOISE_MPS if is_velocity_told(vel) else WAY_NOISE_MPS
 
 

@@ -98,7 +98,7 @@ def find(s: ReviewState, q_nb: Quat) -> Quat:
 
 @compiled
 def tells_heading(s: ReviewState) -> bool:
-    """Tell whether a heading that is not known yet can be had from the alignment."""
+    """Return whether a heading that is not known yet can be had from the alignment."""
     found = s.by_gps == 1 and s.level_std < FOUND_LEVEL_RAD and s.heading_std < FOUND_HEADING_RAD
     return bool(s.lost == 0 and s.heading_known == 0 and found)
 
@@ -140,7 +140,7 @@ def is_to_be_taken(
 
 @compiled
 def is_contradicted(s: ReviewState, q_nb: Quat, level_told: float, heading_told: float) -> bool:
-    """Tell whether the alignment and the attitude cannot both be right."""
+    """Return whether the alignment and the attitude cannot both be right."""
     found = as_quat(s.found_q_nb)
     allowed = DOUBT_SIGMA * math.hypot(s.level_std, level_told)
     off = level_difference(found, q_nb)

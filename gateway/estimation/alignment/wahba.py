@@ -73,7 +73,7 @@ class AlignmentState:
     turning_mps2: float
     """Mean of what gives itself away: of a hand little, of a flight in turns much."""
     pull_mps2: float
-    """Level acceleration of late: as GPS tells it, or what gives itself away without."""
+    """Level acceleration recently: as GPS tells it, or what gives itself away without."""
     square: Annotated[FloatArray, (2, 4, 4)]
     """Scratch."""
 
@@ -120,7 +120,7 @@ def begin_pair(s: AlignmentState, time_s: float, vel: Vec3, force_i: Vec3) -> No
 
 @compiled
 def mean_force(s: AlignmentState, force_i: Vec3, dt: float) -> Vec3:
-    """Tell the mean force since the last pair."""
+    """Return the mean force since the last pair."""
     f = s.pair_force
     return ((force_i[0] - f[0]) / dt, (force_i[1] - f[1]) / dt, (force_i[2] - f[2]) / dt)
 
@@ -213,7 +213,7 @@ def align_by_gravity(s: AlignmentState, now_s: float, force_i: Vec3, period_s: f
 
 @compiled
 def unseen_acceleration(s: AlignmentState) -> float:
-    """Tell the level acceleration that a mean force beyond gravity gives away, m/s2.
+    """Return the level acceleration that a mean force beyond gravity gives away, m/s2.
 
     Gravity stands still in the gyroscope's frame, what pulls in a turn adds to it squarely; the
     norm of the sum knows of no attitude.
@@ -266,7 +266,7 @@ def solve_alignment(s: AlignmentState) -> Quat:
 
 @compiled
 def misfit(s: AlignmentState, q_ni: Quat) -> float:
-    """Tell the mean squared misfit of a solution against what the noise explains, 1 or more."""
+    """Return the mean squared misfit of a solution against what the noise explains, 1 or more."""
     set_davenport(s)
     K, fit = s.square[0], 0.0
     for i in range(4):
@@ -278,7 +278,7 @@ def misfit(s: AlignmentState, q_ni: Quat) -> float:
 
 @compiled
 def alignment_std(s: AlignmentState, excess: float) -> tuple[float, float]:
-    """Tell how well the pairs say the level and the heading.
+    """Return how well the pairs say the level and the heading.
 
     Parameters
     ----------
@@ -312,14 +312,14 @@ def alignment_std(s: AlignmentState, excess: float) -> tuple[float, float]:
 
 @compiled
 def level_difference(q_a: Quat, q_b: Quat) -> float:
-    """Tell the angle between the verticals of two attitudes, rad."""
+    """Return the angle between the verticals of two attitudes, rad."""
     x, y = rotate_inverse(q_a, (0.0, 0.0, 1.0)), rotate_inverse(q_b, (0.0, 0.0, 1.0))
     return math.acos(max(-1.0, min(1.0, x[0] * y[0] + x[1] * y[1] + x[2] * y[2])))
 
 
 @compiled
 def heading_difference(q_a: Quat, q_b: Quat) -> float:
-    """Tell the turn about down from the second attitude to the first, rad."""
+    """Return the turn about down from the second attitude to the first, rad."""
     conjugate = (q_b[0], -q_b[1], -q_b[2], -q_b[3])
     turn = multiply(q_a, conjugate)
     angle = 2.0 * math.atan2(turn[3], turn[0])

@@ -34,7 +34,7 @@ GOOD_VAR: Final = 0.3
 
 @compiled
 def is_heading_good(s: ComplementaryState) -> bool:
-    """Tell whether horizontal vectors may be turned by the heading."""
+    """Return whether horizontal vectors may be turned by the heading."""
     return s.heading_known == 1 and s.heading_var < GOOD_VAR
 
 
@@ -114,7 +114,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
 
 @compiled
 def information_of(accel_n: Vec3, dt: float, noise_mps: float) -> float:
-    """Tell how much the mean acceleration of one interval says of the heading, 1/rad2."""
+    """Return how much the mean acceleration of one interval says of the heading, 1/rad2."""
     power = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
     return power * dt * MATCH_WINDOW_S / (2.0 * noise_mps * noise_mps)
 

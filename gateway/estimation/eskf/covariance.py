@@ -146,7 +146,7 @@ def innovation_variance(s: EskfState, variance: float) -> float:
 
 @compiled
 def normalised_innovation_sq(s: EskfState, innovation: float, variance: float) -> float:
-    """Tell the normalised innovation squared of the row in `h`."""
+    """Return the normalised innovation squared of the row in `h`."""
     rest = residual(s, innovation)
     return rest * rest / innovation_variance(s, variance)
 

@@ -169,7 +169,7 @@ def substitute_force(s: EskfState) -> Vec3:
 
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
-    """Tell whether the GPS says that the aircraft moves."""
+    """Return whether the GPS says that the aircraft moves."""
     vel = s.vel_n if s.aided == 1 else s.fix_vel
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     return bool(fresh and math.hypot(vel[0], vel[1]) > p.rest_speed_mps)

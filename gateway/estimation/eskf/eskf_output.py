@@ -101,7 +101,7 @@ def flags_of(s: EskfState) -> int:
 
 @compiled
 def sensor_flags(s: EskfState) -> int:
-    """Tell which sensors are used, and whether one is at fault."""
+    """Return which sensors are used, and whether one is at fault."""
     flags = AT_REST if s.at_rest == 1 else 0
     if s.time_s - s.mag_s < STALE_MAG_S:
         flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG

@@ -154,7 +154,7 @@ def delay_variances(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple
 def place_distance_sq(
     s: EskfState, p: EskfGains, row: FloatArray, off_pos: Vec3, once: Vec3, twice: Vec3, lag: float
 ) -> float:
-    """Tell how unlikely the horizontal place of a fix is, before any of its numbers is used.
+    """Return how unlikely the horizontal place of a fix is, before any of its numbers is used.
 
     Returns
     -------

@@ -297,7 +297,7 @@ class PaperEstimator:
         )
 
     def _read(self, fix: GpsFix) -> tuple[kernels.Place, Vec3]:
-        """Tell the place and velocity of a fix, and keep it for the next one's bearing."""
+        """Return the place and velocity of a fix, and keep it for the next one's bearing."""
         s = self._s
         # Without a height of its own a fix lies as high as the one before.
         last_m = s.last_fix[2] if math.isfinite(s.last_fix[2]) else 0.0

@@ -58,7 +58,7 @@ OUT_COLUMNS: Final = 11
 
 
 class Memory(RestState):
-    """What the inertial sensors showed of late."""
+    """What the inertial sensors showed recently."""
 
     bias_b: Annotated[FloatArray, (3,)]
     """Of the gyroscope, as it last showed at rest."""
@@ -76,13 +76,13 @@ REST_LAYOUT: Final = layout(RestGains)
 
 @compiled
 def is_finite(v: Vec3) -> bool:
-    """Tell whether all three are finite."""
+    """Return whether all three are finite."""
     return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
 
 
 @compiled
 def is_sound(accel: Vec3, gyro: Vec3) -> bool:
-    """Tell whether a sample is finite and within what sensors can tell."""
+    """Return whether a sample is finite and within what sensors can tell."""
     force = max(abs(accel[0]), abs(accel[1]), abs(accel[2]))
     rate = max(abs(gyro[0]), abs(gyro[1]), abs(gyro[2]))
     finite = is_finite(accel) and is_finite(gyro)
@@ -290,7 +290,7 @@ def flags_of(
     fix_time_us: int,
     sound: bool,
 ) -> int:
-    """Tell what holds at a time."""
+    """Return what holds at a time."""
     flags = flagbits.ATTITUDE_VALID if began else 0
     if mag_time_us != NEVER and time_us - mag_time_us < STALE_MAG_US:
         flags |= flagbits.USING_MAG

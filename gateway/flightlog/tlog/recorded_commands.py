@@ -48,7 +48,7 @@ _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
 
 def is_station(origin: int, stations: Set[int]) -> bool:
-    """Tell whether a sender (system << 8 | component) is a ground station.
+    """Return whether a sender (system << 8 | component) is a ground station.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def is_station(origin: int, stations: Set[int]) -> bool:
 
 
 def is_command(frame: bytes, stations: Set[int]) -> bool:
-    """Tell whether a frame asks something of a vehicle, or feeds its navigation."""
+    """Return whether a frame asks something of a vehicle, or feeds its navigation."""
     message_id = message_id_of(frame)
     if message_id in _FEEDING:
         return origin_of(frame)[1] != AUTOPILOT

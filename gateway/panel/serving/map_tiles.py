@@ -43,7 +43,7 @@ SIGNATURES: Final = (
 
 
 def kind_of_image(data: bytes) -> str | None:
-    """Tell the media type of a picture by its first bytes; None for anything else."""
+    """Return the media type of a picture by its first bytes; None for anything else."""
     return next((kind for head, kind in SIGNATURES if data.startswith(head)), None)
 
 

@@ -30,7 +30,7 @@ def hash_password(password: str) -> str:
 
 
 def matches(password: str, hashed: str) -> bool:
-    """Tell whether a password is the one that was hashed; a broken hash matches none."""
+    """Return whether a password is the one that was hashed; a broken hash matches none."""
     try:
         kind, cost, salt, digest = hashed.split("$")
         derived = _derive(password, base64.b64decode(salt), int(cost))
@@ -60,20 +60,20 @@ class PageLock:
         return not self.operator_hash
 
     def role_of(self, token: str) -> Role | None:
-        """Tell what the holder of a session may do; None if there is no such session."""
+        """Return what the holder of a session may do; None if there is no such session."""
         if self.is_open:
             return Role.OPERATOR
         role, until_s = self._sessions.get(token, (None, 0.0))
         return role if time.monotonic() < until_s else None
 
     def may_try(self, peer: str) -> bool:
-        """Tell whether an address has not guessed wrong too often."""
+        """Return whether an address has not guessed wrong too often."""
         now_s = time.monotonic()
         failures = self._failures.get(peer, ())
         return sum(now_s - then_s < FAILURE_WINDOW_S for then_s in failures) < MAX_FAILURES
 
     def check(self, password: str) -> Role | None:
-        """Tell what a password opens. It takes its time: not on the event loop."""
+        """Return what a password opens. It takes its time: not on the event loop."""
         if matches(password, self.operator_hash):
             return Role.OPERATOR
         return Role.VIEWER if matches(password, self.viewer_hash) else None

@@ -104,7 +104,7 @@ async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
 
 
 def _kind(path: Path) -> FileKind | None:
-    """Tell what an upload is by what its begin holds; None if it is no recording."""
+    """Return what an upload is by what its begin holds; None if it is no recording."""
     kind = kind_of(path)
     with path.open("rb") as file:
         head = file.read(LOOKED_AT)

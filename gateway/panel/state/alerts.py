@@ -56,7 +56,7 @@ class Alert:
 
 
 def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
-    """Tell what is wrong with one aircraft now, the gravest first.
+    """Return what is wrong with one aircraft now, the gravest first.
 
     Parameters
     ----------

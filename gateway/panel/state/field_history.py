@@ -52,7 +52,7 @@ class FieldHistory:
         columns.add(message, now_us)
 
     def fields(self, system_id: int) -> dict[str, tuple[str, ...]]:
-        """Tell which fields each message of an aircraft has, both in the order of the alphabet."""
+        """Return which fields each message of an aircraft has, in alphabetical order."""
         kinds = self._vehicles.get(system_id, {})
         return {kind: kinds[kind].names for kind in sorted(kinds) if kinds[kind].names}
 
@@ -150,7 +150,7 @@ _Reader = tuple[str, str, Callable[[Any], float]]
 
 
 def _readers_of(message: Any) -> list[_Reader]:
-    """Tell the numbers in a message: their names, the field they are of, how to read them."""
+    """Return the numbers in a message: their names, the field they are of, how to read them."""
     found: list[_Reader] = []
     for field in message.fieldnames:
         value = getattr(message, field)

@@ -108,7 +108,7 @@ class VehiclePicture:
         self.generation += 1
 
     def silent_s(self, now_us: int) -> float:
-        """Tell how long no heartbeat came; infinite if none ever did."""
+        """Return how long no heartbeat came; infinite if none ever did."""
         heard_us = self.heard_us.get("HEARTBEAT")
         return math.inf if heard_us is None else (now_us - heard_us) / US_PER_S
 
@@ -188,14 +188,14 @@ class VehiclePicture:
         return euler, from_euler(*euler), _rates(angles)
 
     def _pos_std_m(self) -> float:
-        """Tell the position's standard deviation: the estimator's, or what the GPS claims."""
+        """Return the position's standard deviation: the estimator's, or what the GPS claims."""
         estimator, fix = self.newest.get("ESTIMATOR_STATUS"), self.newest.get("GPS_RAW_INT")
         if estimator and math.isfinite(estimator.pos_horiz_accuracy):
             return float(estimator.pos_horiz_accuracy)
         return fix.h_acc / MM if fix and fix.h_acc else NAN
 
     def _mark(self) -> tuple[Spot | None, float, float]:
-        """Tell the mark, and the way to it as the aircraft itself measures it."""
+        """Return the mark, and the way to it as the aircraft itself measures it."""
         way, place = (
             self.newest.get("NAV_CONTROLLER_OUTPUT"),
             self.newest.get("GLOBAL_POSITION_INT"),

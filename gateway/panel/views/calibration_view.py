@@ -198,7 +198,7 @@ class _CalibrationView:
         ui.html(f'<table class="residuals">{head}{rows}</table>', sanitize=False)
 
     def _changes(self) -> dict[str, tuple[float, float]]:
-        """Tell the parameters that the calibration changed."""
+        """Return the parameters that the calibration changed."""
         dialogue = self._dialogue
         if dialogue is None:
             return {}

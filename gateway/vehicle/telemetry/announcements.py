@@ -78,7 +78,7 @@ class Announcements:
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_boards(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
-        """Tell how the boards fare, where that changed."""
+        """Return how the boards fare, where that changed."""
         found = []
         for one in findings:
             found += self._announcer.track(one.topic, one.is_bad, one.text, now_us, initially=False)

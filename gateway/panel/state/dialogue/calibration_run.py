@@ -134,11 +134,11 @@ class CalibrationRun:
         self._done_us = 0
 
     def start_message(self) -> Any:
-        """Tell the command that begins it."""
+        """Return the command that begins it."""
         return _command(self.system_id, PARAMS[self.step])
 
     def cancel_message(self) -> Any:
-        """Tell the command that breaks it off: all zero."""
+        """Return the command that breaks it off: all zero."""
         return _command(self.system_id, ())
 
     def take(self, message: Any, now_us: int) -> None:
@@ -183,14 +183,14 @@ class CalibrationRun:
         return middle, float(np.linalg.norm(points - middle, axis=1).max())
 
     def cover(self) -> list[bool]:
-        """Tell which cells of `CELLS` the magnetic field was seen in."""
+        """Return which cells of `CELLS` the magnetic field was seen in."""
         if not self._before.mag:
             return [False] * len(CELLS)
         centre, _ = self.sphere()
         return seen_cells(self.field_points - centre)
 
     def residuals(self) -> list[Residual]:
-        """Tell what was wrong before and what is left, as far as it is known."""
+        """Return what was wrong before and what is left, as far as it is known."""
         match self.step:
             case CalibrationStep.GYRO:
                 return [Residual("Rate at rest", "deg/s", *self._each(_rate_degps))]

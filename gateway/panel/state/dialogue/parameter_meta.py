@@ -39,7 +39,7 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parameter_path(general: bytes) -> str | None:
-    """Tell the path of the parameters' file, as a general metadata file has it.
+    """Return the path of the parameters' file, as a general metadata file has it.
 
     Parameters
     ----------

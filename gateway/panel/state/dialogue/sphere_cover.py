@@ -47,7 +47,7 @@ _MIDDLES: Final = np.array([_unit(cell.sum(axis=0)) for cell in CELLS])
 
 
 def seen_cells(vectors: FloatArray) -> list[bool]:
-    """Tell which cells the vectors point into, taken from the origin.
+    """Return which cells the vectors point into, taken from the origin.
 
     Parameters
     ----------
