@@ -81,7 +81,7 @@ def play(
     begin: FromOption = None,
     end: ToOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Start anew at the end.")] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Wait at the begin.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Wait at the start.")] = False,
     skip_gaps: Annotated[
         float | None, typer.Option("--skip-gaps", min=0, help="Shorten silences to so many s.")
     ] = None,
@@ -150,7 +150,7 @@ group = AskingTyper(help="Steer the player that runs.", no_args_is_help=True)
 
 def seek(
     to: Annotated[
-        str, typer.Argument(help="80 or 1:20 from the begin, +10 or -0:30 from here, or a date.")
+        str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")
     ],
 ) -> None:
     """Move the player to a moment."""
