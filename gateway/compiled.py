@@ -3,7 +3,7 @@
 import ctypes
 import hashlib
 from collections.abc import Callable, Iterator
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -77,6 +77,29 @@ def compiled(function: Function) -> Function:
         made_of = (files._source_stamp, *_borrowed(function.__globals__))  # noqa: SLF001
         files._source_stamp = hashlib.sha256(repr(made_of).encode()).hexdigest()  # noqa: SLF001
     return cast(Function, dispatcher)
+
+
+def compiled_with(template: Function, names: dict[str, object], mark: str) -> Function:
+    """Compile a copy of a function in which names stand for something else.
+
+    Parameters
+    ----------
+    template : callable
+        A function in numba's nopython subset, not yet compiled.
+    names : dict
+        What they stand for: constants and compiled functions.
+    mark : str
+        Tells this copy's machine code from that of others; no two copies share one.
+
+    Returns
+    -------
+    callable
+        As from `compiled`.
+    """
+    source = cast(FunctionType, template)
+    copy = FunctionType(source.__code__, {**source.__globals__, **names}, source.__name__)
+    copy.__qualname__, copy.__doc__ = f"{source.__qualname__}_{mark}", source.__doc__
+    return cast(Function, compiled(copy))
 
 
 def _make_pointer(_: Any, _address: Any) -> Any:

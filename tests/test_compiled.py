@@ -112,3 +112,40 @@ def test_what_it_calls_has_changed(
         calling = importlib.import_module("calling")
         assert calling.outer() == expected
     assert bool(calling.outer.stats.cache_hits) == (result == 100)
+
+
+TEMPLATE = """
+from gateway.compiled import compiled, compiled_with
+
+def answer():
+    return 0
+
+def outer():
+    return 10 + answer()
+
+@compiled
+def one():
+    return 1
+
+@compiled
+def two():
+    return {two}
+
+COPIES = [compiled_with(outer, {{"answer": f}}, f.__name__) for f in (one, two)]
+"""
+
+
+@pytest.mark.io
+def test_the_copies_of_a_template_keep_code_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In another process, too; and none runs on when what stands in it has changed."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    for two, hits in ((2, [0, 0]), (2, [1, 1]), (34, [0, 0])):
+        (tmp_path / "template.py").write_text(TEMPLATE.format(two=two))
+        monkeypatch.delitem(sys.modules, "template", raising=False)
+        importlib.invalidate_caches()
+        copies = importlib.import_module("template").COPIES
+        assert [copy() for copy in copies] == [11, 10 + two]
+        assert [sum(copy.stats.cache_hits.values()) for copy in copies] == hits

@@ -6,6 +6,7 @@ A live sample is one row, a log many of the same: this is why both give the same
 import math
 from typing import Final
 
+from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.records import (
@@ -16,6 +17,7 @@ from gateway.records import (
     ImuSample,
     NavFlags,
     NavState,
+    Vec3,
 )
 from gateway.units import DEG_PER_DEGE7
 
@@ -67,6 +69,16 @@ def imu_row(sample: ImuSample) -> ImuRow:
     clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
     mag = sample.mag_b_ut or UNKNOWN_VEC3
     return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped)
+
+
+@compiled
+def imu_vectors(row: FloatArray) -> tuple[Vec3, Vec3, Vec3]:
+    """Read angular rate, specific force and field of an IMU sample's row."""
+    return (
+        (row[GYRO], row[GYRO + 1], row[GYRO + 2]),
+        (row[ACCEL], row[ACCEL + 1], row[ACCEL + 2]),
+        (row[MAG], row[MAG + 1], row[MAG + 2]),
+    )
 
 
 def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:

@@ -60,6 +60,8 @@ class Kernels(Generic[State, Gains]):
     """`(state, gains, alt_m)`."""
     gps: Callable[[int, int, int, FloatArray], None]
     """`(state, gains, arrival_us, gps_row)`."""
+    earlier: Callable[..., None]
+    """`(state, gains, time_us, taken, *arrays of the barometer and the GPS)`."""
     run: Callable[..., None]
     """`(state, gains, *arrays of a SampleLog, output)`."""
 

@@ -59,8 +59,11 @@ def field_gains(settings: CompassSettings) -> dict[str, float]:
 class FieldState:
     """The usual field and a candidate for it."""
 
+    time_s: float
     rate_b: Annotated[FloatArray, (3,)]
     """Angular rate, bias removed, rad/s."""
+    mag_s: float
+    """Time of the last sample that told a field."""
     mag_norm_ref: float
     mag_dip_ref: float
     mag_ok_s: float
@@ -69,6 +72,31 @@ class FieldState:
     mag_new_dip: float
     mag_new_s: float
     mag_disturbed: int
+
+
+@compiled
+def take_field(s: FieldState, p: FieldGains, norm: float, down: float) -> float:
+    """Judge the newest field.
+
+    Parameters
+    ----------
+    s : FieldState
+        Changed in place.
+    p : FieldGains
+        Constants.
+    norm, down : float
+        Its strength and its part downwards, uT.
+
+    Returns
+    -------
+    float
+        Weight of the sample, 0 to 1; 0 also where there is no field, or no new one.
+    """
+    dt = s.time_s - s.mag_s
+    if norm < MIN_FIELD_UT or dt <= 0.0:
+        return 0.0
+    s.mag_s = s.time_s
+    return compare_field(s, p, norm, math.asin(down / norm), min(dt, STALE_MAG_S))
 
 
 @compiled

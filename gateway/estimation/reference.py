@@ -30,6 +30,16 @@ class ReferenceSettings(Settings, frozen=True):
             "Fixes whose own horizontal accuracy is worse are not used.", "m", ge=1.0, le=1000.0
         ),
     ] = 30.0
+    gps_relock_s: Annotated[
+        float,
+        setting(
+            "After this time of agreeing fixes that were all rejected, they are believed; for "
+            "complementary and eskf.",
+            "s",
+            ge=0.5,
+            le=120.0,
+        ),
+    ] = 8.0
     declination: Annotated[
         Literal["model", "fixed"],
         setting("Magnetic declination: model (World Magnetic Model at the fix) or fixed."),

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from typing import Annotated, Final
 
-from gateway.estimation.complementary.complementary_live import KERNELS as COMPLEMENTARY
+from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.complementary.complementary_state import ComplementarySettings
 from gateway.estimation.complementary.complementary_state import make_gains as complementary_gains
-from gateway.estimation.eskf.eskf_live import KERNELS as ESKF
+from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.eskf.eskf_settings import EskfSettings
 from gateway.estimation.eskf.eskf_settings import make_gains as eskf_gains
 from gateway.estimation.interface import Estimator

@@ -13,8 +13,8 @@ from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores, run_copies
 from gateway.cli.support.terminal import console_of
 from gateway.compiled import is_kept
-from gateway.estimation.complementary import complementary_live
-from gateway.estimation.eskf import eskf_live
+from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
+from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper import paper_kernels
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 REHEARSAL_US: Final = 100_000
 SAMPLE_US: Final = 10_000
-STEPS: Final = (paper_kernels.step_live, complementary_live.imu_step, eskf_live.imu_step)
+STEPS: Final = (paper_kernels.step_live, COMPLEMENTARY.imu, ESKF.imu)
 
 
 def make_ready(estimator: str) -> None:

@@ -1,10 +1,11 @@
-"""The compiled entry points: one sample in, a log through, the state told."""
+"""The compiled entry points: one sample in."""
 
 import math
 from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
+from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.complementary.bias import raise_bias_variance, update_bias
 from gateway.estimation.complementary.complementary_output import (
     write_output,
@@ -25,19 +26,19 @@ from gateway.estimation.complementary.reorientation import (
     watch_gravity,
 )
 from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
+from gateway.estimation.filtering.sample_clock import begin_clock, step_clock
+from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
+from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import (
     FloatArray,
-    IntArray,
     as_quat,
     as_vec,
     write_quat,
     write_vec,
 )
-from gateway.estimation.local_position import (
-    NEVER_S,
-)
+from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors, is_start
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -80,19 +81,14 @@ def begin(s: ComplementaryState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first sound sample, level by its specific force."""
     if not is_start(s, gyro, accel):
         return
-    s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
-    write_vec(s.gyro_lp, gyro)
-    write_vec(s.gyro_rest, gyro)
-    write_vec(s.accel_lp, accel)
+    begin_clock(s, time_us, gyro, accel)
     write_vec(s.force_lp_i, accel)
-    write_vec(s.force_mean_i, accel)
     # One sample may be anything: the alignment finds the level within the first second.
     lose_attitude(s)
     take_gravity(s, accel, 1.0, 1e-3)
     # Two turns: the first leaves a remainder where the start is upside down.
     take_gravity(s, accel, 1.0, 1e-3)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
-    write_vec(s.rate_b, gyro)
     refresh(s)
 
 
@@ -101,41 +97,29 @@ def take_imu(
     s: ComplementaryState,
     p: ComplementaryGains,
     time_us: int,
-    ax: float,
-    ay: float,
-    az: float,
-    gx: float,
-    gy: float,
-    gz: float,
-    mx: float,
-    my: float,
-    mz: float,
-    clipped: float,
+    row: FloatArray,
 ) -> None:
-    """Advance by one IMU sample; see `columns` for the numbers.
+    """Advance by one IMU sample; see `columns` for its row.
 
     A sample that is late is left out; a clock that went far back is a new clock.
     """
-    gyro, accel = (gx, gy, gz), (ax, ay, az)
+    gyro, accel, mag = imu_vectors(row)
     if s.started == 0:
         begin(s, time_us, gyro, accel)
         return
-    dt = (time_us - s.time_us) * 1e-6
+    dt = step_clock(s, time_us)
     if dt <= 0.0:
-        s.fault = 1
         if dt < -GAP_S:
-            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
             forget_times(s)
         return
-    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
     if dt > GAP_S:
         bridge_gap(s, dt)
         return
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
-    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    s.fault = 0 if sound_gyro and sound_accel and row[CLIPPED] == 0.0 else 1
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
-    if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
-        take_mag(s, p, (mx, my, mz))
+    if math.isfinite(mag[0]) and math.isfinite(mag[1]) and math.isfinite(mag[2]):
+        take_mag(s, p, mag)
     refresh(s)
 
 
@@ -198,28 +182,6 @@ def speed(s: ComplementaryState) -> float:
     return math.hypot(s.vel_n[0], s.vel_n[1])
 
 
-@compiled
-def run(
-    s: ComplementaryState,
-    p: ComplementaryGains,
-    imu_time_us: IntArray,
-    imu: FloatArray,
-    baro_time_us: IntArray,
-    baro_alt_m: FloatArray,
-    gps_time_us: IntArray,
-    gps: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Advance over a log: at each IMU sample, what came before it first."""
-    i_baro, i_gps = 0, 0
-    for i in range(imu_time_us.shape[0]):
-        now = imu_time_us[i]
-        while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
-            take_baro(s, p, baro_alt_m[i_baro])
-            i_baro += 1
-        while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
-            take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
-            i_gps += 1
-        r = imu[i]
-        take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
-        write_output(s, out[i])
+KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = kernels_of(
+    ComplementaryState, ComplementaryGains, start, take_imu, take_baro, take_gps, write_output
+)

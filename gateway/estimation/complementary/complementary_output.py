@@ -15,21 +15,15 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.complementary.complementary_state import ComplementaryState
 from gateway.estimation.complementary.heading import is_heading_good
+from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
-    AT_REST,
     ATTITUDE_VALID,
-    DEGRADED,
     HEADING_VALID,
-    MAG_DISTURBED,
-    SENSOR_FAULT,
-    USING_BARO,
-    USING_MAG,
     gps_flags,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
-from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
-from gateway.estimation.magfield import STALE_MAG_S
+from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
@@ -65,19 +59,13 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
 @compiled
 def flags_of(s: ComplementaryState) -> int:
     """Put the flags together."""
-    flags = ATTITUDE_VALID if s.started == 1 and s.lost == 0 else 0
+    flags = sensor_flags(s)
+    if s.started == 1 and s.lost == 0:
+        flags |= ATTITUDE_VALID
     if s.heading_known == 1 and s.heading_true == 1 and is_heading_good(s):
         flags |= HEADING_VALID
-    if s.at_rest == 1:
-        flags |= AT_REST
-    if s.time_s - s.mag_s < STALE_MAG_S:
-        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
-    if s.time_s - s.baro_s < BARO_STALE_S:
-        flags |= USING_BARO
     if s.has_height == 1:
         flags |= ALTITUDE_VALID
-    if s.fault == 1:
-        flags |= SENSOR_FAULT | DEGRADED
     if s.fix_s == NEVER_S:
         return flags
     since_reject = s.time_s - s.reject_last[0]

@@ -2,14 +2,11 @@
 
 from typing import Annotated
 
-from gateway.estimation.alignment.gps_velocity import WayState
-from gateway.estimation.alignment.review import ReviewState
+from gateway.estimation.filtering.filter_state import FilterGains, FilterState, filter_gains
 from gateway.estimation.kernel_record import FloatArray, filled_record
-from gateway.estimation.local_position import PlaceState
-from gateway.estimation.magfield import CompassSettings, FieldGains, FieldState, field_gains
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
-from gateway.estimation.sensor_faults import HealthState
+from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
@@ -124,19 +121,10 @@ class ComplementarySettings(Settings, frozen=True):
     gps_gate_mps: Annotated[
         float, setting("The same for the velocity.", "m/s", ge=0.5, le=100.0)
     ] = 6.0
-    gps_relock_s: Annotated[
-        float,
-        setting(
-            "After this time of agreeing fixes that were all rejected, they are believed.",
-            "s",
-            ge=0.5,
-            le=120.0,
-        ),
-    ] = 8.0
 
 
-class ComplementaryGains(RestGains, FieldGains):
-    """The settings in SI units, and the latency."""
+class ComplementaryGains(FilterGains):
+    """The settings in SI units."""
 
     tau_accel_s: float
     tau_accel_gps_s: float
@@ -153,16 +141,11 @@ class ComplementaryGains(RestGains, FieldGains):
     tau_baro_offset_s: float
     gps_gate_m: float
     gps_gate_mps: float
-    gps_relock_s: float
-    gps_latency_s: float
 
 
-class ComplementaryState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
+class ComplementaryState(FilterState):
     """All that the complementary estimator remembers."""
 
-    started: int
-    base_us: int
-    time_us: int
     bias_b: Annotated[FloatArray, (3,)]
     bias_cov: Annotated[FloatArray, (3, 3)]
     q_ei: Annotated[FloatArray, (4,)]
@@ -189,20 +172,11 @@ class ComplementaryState(HealthState, RestState, FieldState, PlaceState, ReviewS
     """With the gyroscope's bias."""
     down_turn: Annotated[FloatArray, (3,)]
     """Integral of the down row of `R_nb` since `heading_cov` was carried on."""
-    heading_true: int
-    """1 if the declination was known or the GPS gave the heading."""
-    declination_rad: float
-    mag_s: float
     accel_bias_b: Annotated[FloatArray, (3,)]
     """Error of the specific force as the fixes' velocities tell it, m/s2."""
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float
-    baro_known: int
-    baro_s: float
-    has_height: int
-    fix_s: float
-    """Arrival of the last accepted fix."""
     fix_valid_s: float
     """When the last accepted fix was valid."""
     fix_vel: Annotated[FloatArray, (3,)]
@@ -242,5 +216,5 @@ def make_gains(
     noise_rad = settings.heading_noise_deg * RAD_PER_DEG
     values["heading_process_rad2ps"] = noise_rad**2 / settings.tau_heading_s
     values["heading_noise_rad2s"] = noise_rad**2 * settings.tau_heading_s
-    values["gps_latency_s"] = reference.gps_latency_s
-    return filled_record(ComplementaryGains, values | rest_gains(rest) | field_gains(compass))
+    values |= filter_gains(reference, rest, compass)
+    return filled_record(ComplementaryGains, values)

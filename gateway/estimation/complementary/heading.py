@@ -16,7 +16,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, compare_field
+from gateway.estimation.magfield import STALE_MAG_S, take_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 
@@ -91,16 +91,12 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     mag_b : tuple of 3 floats
         Calibrated field in body FRD, uT.
     """
-    dt = s.time_s - s.mag_s
-    if dt <= 0.0 or s.lost == 1:
+    if s.lost == 1:
         return
-    s.mag_s = s.time_s
+    dt = min(s.time_s - s.mag_s, STALE_MAG_S)
     north, east, down = rotate(as_quat(s.q_eb), mag_b)
     norm = math.sqrt(north * north + east * east + down * down)
-    if norm < MIN_FIELD_UT:
-        return
-    dt = min(dt, STALE_MAG_S)
-    weight = compare_field(s, p, norm, math.asin(down / norm), dt)
+    weight = take_field(s, p, norm, down)
     if weight <= 0.0:
         return
     declination = s.declination_rad

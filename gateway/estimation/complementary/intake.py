@@ -10,9 +10,8 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_noise,
     velocity_of_fix,
 )
-from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S, GAP_TILT_RATE, MOVING_MPS
-from gateway.estimation.alignment.wahba import align_by_velocity
-from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.columns import GPS_DECLINATION
 from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
@@ -34,21 +33,24 @@ from gateway.estimation.complementary.reorientation import (
     review_attitude,
 )
 from gateway.estimation.complementary.tilt import refresh
-from gateway.estimation.history import recall
+from gateway.estimation.filtering.fix_intake import (
+    accept_fix,
+    is_fix_told,
+    is_flown_unaided,
+    learn_declination,
+    look_back,
+    pair_with,
+    place_fix,
+    wanted_time_s,
+)
+from gateway.estimation.filtering.sample_clock import silence_before, silent_rate
 from gateway.estimation.kernel_record import (
     FloatArray,
     as_quat,
     as_vec,
     write_vec,
 )
-from gateway.estimation.local_position import (
-    NEVER_S,
-    fix_position,
-    fix_velocity,
-    is_relocked,
-    move_origin,
-    past_state,
-)
+from gateway.estimation.local_position import NEVER_S, is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
@@ -58,13 +60,9 @@ from gateway.records import Vec3
 def bridge_gap(s: ComplementaryState, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
     s.fault = 1
-    rate = (
-        s.gyro_lp[0] - s.bias_b[0],
-        s.gyro_lp[1] - s.bias_b[1],
-        s.gyro_lp[2] - s.bias_b[2],
-    )
     still = s.at_rest == 1
-    turning = 0.0 if still else math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    rate = silent_rate(s, as_vec(s.bias_b))
+    turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     for k in range(3):
         s.pos_n[k] += s.vel_n[k] * dt
     begin_level(s)
@@ -97,29 +95,28 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     row : ndarray, shape (GPS_COLUMNS,)
         See `columns`.
     """
-    if s.started == 0 or row[GPS_USABLE] == 0.0:
+    if not is_fix_told(s, row):
         return
-    if not (math.isfinite(row[GPS_LAT]) and math.isfinite(row[GPS_LON])):
-        return
-    learn_declination(s, row[GPS_DECLINATION])
-    wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
-    catch_up(s, wanted_s)
-    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
+    s.heading_rad += learn_declination(s, row[GPS_DECLINATION])
+    wanted_s = wanted_time_s(s, p, time_us)
+    silent_s = silence_before(s, wanted_s)
+    if silent_s > 0.0:
+        bridge_gap(s, silent_s)
+    valid_s = look_back(s, wanted_s)
     lag = s.time_s - valid_s
-    move_origin(s, row[GPS_LAT], row[GPS_LON])
-    pos, told = fix_position(s, row), fix_velocity(row)
+    pos, told = place_fix(s, row)
     vel, at_s = velocity_of_fix(s, valid_s, pos, told)
     align(s, at_s, vel, velocity_noise(told))
-    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
+    look_back(s, wanted_s)
     past = past_state(s, s.then, lag)
     noise_mps = p.gps_velocity_noise_mps if is_velocity_told(told) else WAY_NOISE_MPS
     if not is_sound(told, FASTEST_MPS):
         told = velocity_from_position(s, pos, past)
-    if not accept_fix(s, p, row, pos, told, past, lag):
+    if not blend_or_restart(s, p, row, pos, told, past, lag):
         return
-    s.fix_s = s.time_s
+    accept_fix(s)
     if is_sound(vel, FASTEST_MPS) and s.lost == 0:
-        at_s = recall(s.ring, s.ring_count, at_s, s.time_s, s.integrals, s.then)
+        at_s = look_back(s, at_s)
         interval = take_fix_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
         if interval > 0.0:
             update_bias(s, p, p.tau_accel_gps_s, interval)
@@ -127,26 +124,13 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
 
 
 @compiled
-def catch_up(s: ComplementaryState, valid_s: float) -> None:
-    """Go on to a fix that was valid long after the newest sample: the IMU is silent."""
-    ahead = valid_s - s.time_s
-    if ahead > GAP_S:
-        s.time_us += int(ahead * 1e6)
-        s.time_s = (s.time_us - s.base_us) * 1e-6
-        bridge_gap(s, ahead)
-
-
-@compiled
 def align(s: ComplementaryState, at_s: float, vel: Vec3, noise_mps: float) -> None:
     """Give the velocity of a fix to the alignment, and heed what that says."""
     if not is_sound(vel, FASTEST_MPS):
         return
-    fast = math.hypot(vel[0], vel[1]) > MOVING_MPS
-    if s.by_gps == 0 and fast and s.time_s - s.fix_s > DEAD_RECKONING_MAX_S:
-        # What was found without GPS took the pull of every turn for gravity.
+    if s.time_s - s.fix_s > DEAD_RECKONING_MAX_S and is_flown_unaided(s, vel):
         lose_attitude(s)
-    at_s = recall(s.ring, s.ring_count, at_s, s.time_s, s.integrals, s.then)
-    dt = align_by_velocity(s, at_s, vel, as_vec(s.then), noise_mps)
+    dt = pair_with(s, at_s, vel, noise_mps)
     if dt > 0.0:
         review_attitude(s, dt)
 
@@ -164,7 +148,7 @@ def velocity_from_position(s: ComplementaryState, pos: Vec3, past: tuple[Vec3, V
 
 
 @compiled
-def accept_fix(
+def blend_or_restart(
     s: ComplementaryState,
     p: ComplementaryGains,
     row: FloatArray,
@@ -180,23 +164,10 @@ def accept_fix(
     off_m = math.hypot(pos[0] - past[0][0], pos[1] - past[0][1])
     off_mps = math.hypot(vel[0] - past[1][0], vel[1] - past[1][1])
     if is_plausible(s, p, row, off_m, off_mps):
-        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
         blend_fix(s, p, pos, vel, past, lag)
         return True
     if is_relocked(s, p.gps_relock_s, pos, vel):
-        s.reject_s, s.reject_last[0] = 0.0, NEVER_S
         s.fix_valid_s = NEVER_S
         restart_at(s, pos, vel, lag)
         return True
     return False
-
-
-@compiled
-def learn_declination(s: ComplementaryState, declination_rad: float) -> None:
-    """Turn a magnetic heading to true north when the declination becomes known."""
-    if not math.isfinite(declination_rad):
-        return
-    if s.heading_known == 1 and s.heading_true == 0:
-        s.heading_rad += declination_rad
-        s.heading_true = 1
-    s.declination_rad = declination_rad

@@ -1,4 +1,4 @@
-"""The compiled entry points: one sample in, a log through."""
+"""The compiled entry points: one sample in."""
 
 import math
 from typing import Final
@@ -6,6 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.alignment.wahba import carry_frame
+from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -25,13 +26,16 @@ from gateway.estimation.eskf.start import (
     end_dead_reckoning,
     forget_times,
     restart_baro,
+    start,
     start_heading_by_compass,
 )
+from gateway.estimation.filtering.sample_clock import step_clock
+from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
+from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import (
     FloatArray,
-    IntArray,
     as_quat,
     as_vec,
     write_quat,
@@ -40,7 +44,7 @@ from gateway.estimation.kernel_record import (
 from gateway.estimation.local_position import (
     BARO_STALE_S,
 )
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, compare_field, field_similarity
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_similarity, take_field
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
 from gateway.geometry.quaternion import (
@@ -74,39 +78,27 @@ def take_imu(
     s: EskfState,
     p: EskfGains,
     time_us: int,
-    ax: float,
-    ay: float,
-    az: float,
-    gx: float,
-    gy: float,
-    gz: float,
-    mx: float,
-    my: float,
-    mz: float,
-    clipped: float,
+    row: FloatArray,
 ) -> None:
-    """Advance by one IMU sample; see `columns` for the numbers.
+    """Advance by one IMU sample; see `columns` for its row.
 
     A sample that is late is left out; a clock that went far back is a new clock.
     """
-    gyro, accel = (gx, gy, gz), (ax, ay, az)
+    gyro, accel, mag = imu_vectors(row)
     if s.started == 0:
         s.hold_s = p.dead_reckoning_s
         begin(s, p, time_us, gyro, accel)
         return
-    dt = (time_us - s.time_us) * 1e-6
+    dt = step_clock(s, time_us)
     if dt <= 0.0:
-        s.fault = 1
         if dt < -GAP_S:
-            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
             bridge_gap(s, p, 1.0)
             forget_times(s)
         return
-    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
     if dt > GAP_S:
         bridge_gap(s, p, dt)
         return
-    sound = move(s, gyro, accel, clipped, dt)
+    sound = move(s, gyro, accel, row[CLIPPED], dt)
     if sound:
         moving = is_moving(s, p)
         rested = s.at_rest == 1
@@ -116,8 +108,8 @@ def take_imu(
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
     take_substitutes(s, p)
-    if math.isfinite(mx) and math.isfinite(my) and math.isfinite(mz):
-        take_mag(s, p, (mx, my, mz))
+    if math.isfinite(mag[0]) and math.isfinite(mag[1]) and math.isfinite(mag[2]):
+        take_mag(s, p, mag)
 
 
 @compiled
@@ -263,17 +255,15 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     """
     if s.lost == 1:
         return
-    dt = s.time_s - s.mag_s
     b = s.mag_bias_b
     mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
     field = rotate(as_quat(s.q_nb), mag_b)
     level = math.hypot(field[0], field[1])
     norm = math.hypot(level, field[2])
-    if norm < MIN_FIELD_UT or level < 0.05 * norm or dt <= 0.0:
+    if norm < MIN_FIELD_UT or level < 0.05 * norm or s.time_s <= s.mag_s:
         return
-    s.mag_s = s.time_s
-    dip = math.asin(field[2] / norm)
-    weight = compare_field(s, p, norm, dip, min(dt, STALE_MAG_S)) * field_similarity(s, norm, dip)
+    weight = take_field(s, p, norm, field[2])
+    weight *= field_similarity(s, norm, math.asin(field[2] / norm))
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:
@@ -311,28 +301,6 @@ def take_baro(s: EskfState, p: EskfGains, alt_m: float) -> None:
     s.baro_known, s.baro_s = 1, s.time_s
 
 
-@compiled
-def run(
-    s: EskfState,
-    p: EskfGains,
-    imu_time_us: IntArray,
-    imu: FloatArray,
-    baro_time_us: IntArray,
-    baro_alt_m: FloatArray,
-    gps_time_us: IntArray,
-    gps: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Advance over a log: at each IMU sample, what came before it first."""
-    i_baro, i_gps = 0, 0
-    for i in range(imu_time_us.shape[0]):
-        now = imu_time_us[i]
-        while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
-            take_baro(s, p, baro_alt_m[i_baro])
-            i_baro += 1
-        while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
-            take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
-            i_gps += 1
-        r = imu[i]
-        take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
-        write_output(s, out[i])
+KERNELS: Final[Kernels[EskfState, EskfGains]] = kernels_of(
+    EskfState, EskfGains, start, take_imu, take_baro, take_gps, write_output
+)

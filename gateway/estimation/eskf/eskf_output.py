@@ -16,22 +16,16 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
+from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
-    AT_REST,
     ATTITUDE_VALID,
-    DEGRADED,
     FRESH_GPS_S,
     HEADING_VALID,
-    MAG_DISTURBED,
-    SENSOR_FAULT,
-    USING_BARO,
-    USING_MAG,
     gps_flags,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
-from gateway.estimation.local_position import BARO_STALE_S, NEVER_S
-from gateway.estimation.magfield import STALE_MAG_S
+from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
@@ -97,16 +91,3 @@ def flags_of(s: EskfState) -> int:
     # Unaided, the place is that of the last fix and does not move on.
     hold_s = s.hold_s if s.aided == 1 else NO_HOLD_S
     return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.reject_last[0], hold_s)
-
-
-@compiled
-def sensor_flags(s: EskfState) -> int:
-    """Return which sensors are used, and whether one is at fault."""
-    flags = AT_REST if s.at_rest == 1 else 0
-    if s.time_s - s.mag_s < STALE_MAG_S:
-        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
-    if s.time_s - s.baro_s < BARO_STALE_S:
-        flags |= USING_BARO
-    if s.fault == 1:
-        flags |= SENSOR_FAULT | DEGRADED
-    return flags

@@ -2,10 +2,11 @@
 
 from typing import Annotated
 
+from gateway.estimation.filtering.filter_state import FilterGains, filter_gains
 from gateway.estimation.kernel_record import filled_record
-from gateway.estimation.magfield import CompassSettings, FieldGains, field_gains
+from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestGains, RestSettings, rest_gains
+from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
@@ -130,19 +131,10 @@ class EskfSettings(Settings, frozen=True):
             le=100.0,
         ),
     ] = 10.0
-    gps_relock_s: Annotated[
-        float,
-        setting(
-            "After this time of agreeing fixes that were all rejected, they are believed.",
-            "s",
-            ge=0.5,
-            le=120.0,
-        ),
-    ] = 8.0
 
 
-class EskfGains(RestGains, FieldGains):
-    """The settings as variances and densities in SI units, and the latency."""
+class EskfGains(FilterGains):
+    """The settings as variances and densities in SI units."""
 
     gyro_density: float
     """rad2/s."""
@@ -173,8 +165,6 @@ class EskfGains(RestGains, FieldGains):
     dead_reckoning_s: float
     gate_sq: float
     gate_m: float
-    gps_relock_s: float
-    gps_latency_s: float
 
 
 def make_gains(
@@ -230,7 +220,5 @@ def make_gains(
         "dead_reckoning_s": s.dead_reckoning_s,
         "gate_m": s.gate_m,
         "gate_sq": s.gate_sigma**2,
-        "gps_relock_s": s.gps_relock_s,
-        "gps_latency_s": reference.gps_latency_s,
     }
-    return filled_record(EskfGains, values | rest_gains(rest) | field_gains(compass))
+    return filled_record(EskfGains, values | filter_gains(reference, rest, compass))

@@ -2,13 +2,8 @@
 
 from typing import Annotated, Final
 
-from gateway.estimation.alignment.gps_velocity import WayState
-from gateway.estimation.alignment.review import ReviewState
+from gateway.estimation.filtering.filter_state import FilterState
 from gateway.estimation.kernel_record import FloatArray
-from gateway.estimation.local_position import PlaceState
-from gateway.estimation.magfield import FieldState
-from gateway.estimation.rest import RestState
-from gateway.estimation.sensor_faults import HealthState
 
 TILT: Final = 0
 """Attitude error: the rotation in NED that takes the estimate to the truth, rad."""
@@ -27,12 +22,9 @@ BARO_BIAS: Final = 24
 STATES: Final = 25
 
 
-class EskfState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
+class EskfState(FilterState):
     """All that the filter remembers."""
 
-    started: int
-    base_us: int
-    time_us: int
     q_nb: Annotated[FloatArray, (4,)]
     gyro_bias_b: Annotated[FloatArray, (3,)]
     accel_bias_b: Annotated[FloatArray, (3,)]
@@ -66,9 +58,6 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, ReviewState, Way
 
     aided: int
     """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""
-    heading_true: int
-    declination_rad: float
-    mag_s: float
     mag_used_s: float
     field_n: Annotated[FloatArray, (3,)]
     """The field that the compass was last used with, NED, uT; all zero before."""
@@ -78,13 +67,8 @@ class EskfState(HealthState, RestState, FieldState, PlaceState, ReviewState, Way
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
     hold_s: float
     """How long position is dead-reckoned."""
-    baro_s: float
-    baro_known: int
     baro_down_m: float
     """Newest barometer height, positive down."""
-    has_height: int
-    """1 once a fix has told the height above the sea."""
-    fix_s: float
     fix_vel: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""

@@ -8,9 +8,7 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_noise,
     velocity_of_fix,
 )
-from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
-from gateway.estimation.alignment.wahba import align_by_velocity
-from gateway.estimation.columns import GPS_DECLINATION, GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.columns import GPS_DECLINATION
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import EskfState
@@ -27,16 +25,19 @@ from gateway.estimation.eskf.start import (
     restart_at,
     start_height,
 )
-from gateway.estimation.history import recall
-from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
-from gateway.estimation.local_position import (
-    NEVER_S,
-    fix_position,
-    fix_velocity,
-    is_relocked,
-    move_origin,
-    past_state,
+from gateway.estimation.filtering.fix_intake import (
+    accept_fix,
+    is_fix_told,
+    is_flown_unaided,
+    learn_declination,
+    look_back,
+    pair_with,
+    place_fix,
+    wanted_time_s,
 )
+from gateway.estimation.filtering.sample_clock import silence_before
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
+from gateway.estimation.local_position import is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
 
@@ -56,37 +57,28 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     row : ndarray, shape (GPS_COLUMNS,)
         See `columns`.
     """
-    if s.started == 0 or row[GPS_USABLE] == 0.0:
+    if not is_fix_told(s, row):
         return
-    if not (math.isfinite(row[GPS_LAT]) and math.isfinite(row[GPS_LON])):
-        return
-    learn_declination(s, row[GPS_DECLINATION])
+    turn_rad = learn_declination(s, row[GPS_DECLINATION])
+    if turn_rad != 0.0:
+        turn_heading(s, turn_rad)
     set_wander_variance(s, p, row)
-    wanted_s = (time_us - s.base_us) * 1e-6 - p.gps_latency_s
-    catch_up(s, p, wanted_s)
-    valid_s = recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
+    wanted_s = wanted_time_s(s, p, time_us)
+    silent_s = silence_before(s, wanted_s)
+    if silent_s > 0.0:
+        bridge_gap(s, p, silent_s)
+    valid_s = look_back(s, wanted_s)
     lag = s.time_s - valid_s
-    move_origin(s, row[GPS_LAT], row[GPS_LON])
-    pos, vel = fix_position(s, row), fix_velocity(row)
+    pos, vel = place_fix(s, row)
     align(s, p, valid_s, pos, vel)
-    recall(s.ring, s.ring_count, wanted_s, s.time_s, s.integrals, s.then)
+    look_back(s, wanted_s)
     if s.heading_known == 0:
         follow_fix(s, pos, lag)
     elif s.aided == 0:
         restart_at(s, p, pos, as_vec(s.fix_vel), lag)
-        accept(s)
+        accept_fix(s)
     else:
         fuse_fix(s, p, row, pos, vel, lag)
-
-
-@compiled
-def catch_up(s: EskfState, p: EskfGains, valid_s: float) -> None:
-    """Go on to a fix that was valid long after the newest sample: the IMU is silent."""
-    ahead = valid_s - s.time_s
-    if ahead > GAP_S:
-        s.time_us += int(ahead * 1e6)
-        s.time_s = (s.time_us - s.base_us) * 1e-6
-        bridge_gap(s, p, ahead)
 
 
 @compiled
@@ -96,11 +88,9 @@ def align(s: EskfState, p: EskfGains, valid_s: float, pos: Vec3, told: Vec3) -> 
     if not is_sound(vel, FASTEST_MPS):
         return
     write_vec(s.fix_vel, vel)
-    if s.by_gps == 0 and s.aided == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS:
-        # What was found without GPS took the pull of every turn for gravity.
+    if s.aided == 0 and is_flown_unaided(s, vel):
         lose_attitude(s, p)
-    at_s = recall(s.ring, s.ring_count, at_s, s.time_s, s.integrals, s.then)
-    dt = align_by_velocity(s, at_s, vel, as_vec(s.then), velocity_noise(told))
+    dt = pair_with(s, at_s, vel, velocity_noise(told))
     if dt > 0.0:
         review_attitude(s, p, dt)
 
@@ -124,10 +114,10 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
     note_contradiction(s, off_m if unlikely else 0.0)
     if not unlikely or off_m < p.gate_m:
         update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
-        accept(s)
+        accept_fix(s)
     elif is_relocked(s, p.gps_relock_s, pos, vel):
         relock_at(s, p, pos, as_vec(s.fix_vel), lag)
-        accept(s)
+        accept_fix(s)
 
 
 @compiled
@@ -138,13 +128,6 @@ def note_contradiction(s: EskfState, off_m: float) -> None:
 
 
 @compiled
-def accept(s: EskfState) -> None:
-    """Note that a fix was used."""
-    s.fix_s = s.time_s
-    s.reject_s, s.reject_last[0] = 0.0, NEVER_S
-
-
-@compiled
 def follow_fix(s: EskfState, pos: Vec3, lag: float) -> None:
     """Show a fix while it cannot be fused, without a heading; its velocity moves it on."""
     s.fix_s = s.time_s
@@ -152,14 +135,3 @@ def follow_fix(s: EskfState, pos: Vec3, lag: float) -> None:
         moved = s.fix_vel[k] * lag
         if k < 2 or (s.baro_known == 0 and math.isfinite(pos[2])):
             s.pos_n[k] = pos[k] + (moved if math.isfinite(moved) else 0.0)
-
-
-@compiled
-def learn_declination(s: EskfState, declination_rad: float) -> None:
-    """Turn a magnetic heading to true north when the declination becomes known."""
-    if not math.isfinite(declination_rad):
-        return
-    if s.heading_known == 1 and s.heading_true == 0:
-        turn_heading(s, declination_rad)
-        s.heading_true = 1
-    s.declination_rad = declination_rad

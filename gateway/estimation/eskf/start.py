@@ -23,6 +23,7 @@ from gateway.estimation.eskf.eskf_state import (
 )
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
+from gateway.estimation.filtering.sample_clock import begin_clock, silent_rate
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import is_sound, is_start
@@ -65,16 +66,11 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
     """Start at the first sound sample, level by its specific force."""
     if not is_start(s, gyro, accel):
         return
-    s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
-    write_vec(s.gyro_lp, gyro)
-    write_vec(s.gyro_rest, gyro)
-    write_vec(s.accel_lp, accel)
-    write_vec(s.rate_b, gyro)
+    begin_clock(s, time_us, gyro, accel)
     roll = math.atan2(-accel[1], -accel[2])
     pitch = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
     write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
     write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
-    write_vec(s.force_mean_i, accel)
     # One sample may be anything: the alignment finds the level within the first second.
     lose_attitude(s, p)
 
@@ -200,15 +196,11 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     propagate(s, p)
     s.restarts += 1
     s.fault = 1
-    rate = (
-        s.gyro_lp[0] - s.gyro_bias_b[0],
-        s.gyro_lp[1] - s.gyro_bias_b[1],
-        s.gyro_lp[2] - s.gyro_bias_b[2],
-    )
     still = s.at_rest == 1
-    turning = 0.0 if still else math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    rate = silent_rate(s, as_vec(s.gyro_bias_b))
+    turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     turned = (GAP_REST_RATE if still else GAP_TILT_RATE + turning) * dt
-    turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt if not still else 0.0)
+    turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt)
     for k in range(3):
         if s.aided == 1:
             s.pos_n[k] += s.vel_n[k] * dt

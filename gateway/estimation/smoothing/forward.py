@@ -7,11 +7,14 @@ through, this is all that a smoother needs.
 """
 
 import math
+from typing import Final
+
+import numpy as np
 
 from gateway.compiled import compiled
-from gateway.estimation.columns import CLIPPED
+from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import apply_transition, propagate
-from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, move, take_baro, take_imu
+from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, KERNELS, move, take_imu
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
@@ -27,10 +30,11 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply
+
+take_earlier: Final = KERNELS.earlier
 
 
 @compiled
@@ -83,7 +87,8 @@ def move_copy(s: EskfState, p: EskfGains, time_us: int, row: FloatArray, F: Floa
     if s.started == 0 or dt <= 0.0:
         return
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
-    move(s, (row[3], row[4], row[5]), (row[0], row[1], row[2]), row[CLIPPED], dt)
+    gyro, accel, _ = imu_vectors(row)
+    move(s, gyro, accel, row[CLIPPED], dt)
     if s.pending_s >= COVARIANCE_S:
         foresee(s, p, F)
 
@@ -128,21 +133,15 @@ def run_forward(
         Filled: 1 where nothing began anew within the stretch.
     """
     s, copy = states[0], states[1]
-    i_baro, i_gps = 0, 0
+    taken = np.zeros(2, np.int64)
     for k in range(nodes.shape[0] - 1):
         begin_node(s, p, P[k], F[k])
         states[1] = states[0]
         for i in range(nodes[k], nodes[k + 1]):
             now = imu_time_us[i]
-            while i_baro < baro_time_us.shape[0] and baro_time_us[i_baro] <= now:
-                take_baro(s, p, baro_alt_m[i_baro])
-                i_baro += 1
-            while i_gps < gps_time_us.shape[0] and gps_time_us[i_gps] <= now:
-                take_gps(s, p, gps_time_us[i_gps], gps[i_gps])
-                i_gps += 1
-            r = imu[i]
-            take_imu(s, p, now, r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
-            move_copy(copy, p, now, r, F[k])
+            take_earlier(s, p, now, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
+            take_imu(s, p, now, imu[i])
+            move_copy(copy, p, now, imu[i], F[k])
             write_output(s if s.restarts != copy.restarts else copy, out[i])
         propagate(s, p)
         foresee(copy, p, F[k])

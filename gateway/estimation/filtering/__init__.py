@@ -1,0 +1,1 @@
+"""What `complementary` and `eskf` share: how samples and fixes reach a filter, and its clock."""

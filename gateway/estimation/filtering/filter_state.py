@@ -1,0 +1,74 @@
+"""What both filters remember and are set to, whatever their model."""
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_velocity import WayState
+from gateway.estimation.alignment.review import ReviewState
+from gateway.estimation.flagbits import (
+    AT_REST,
+    DEGRADED,
+    MAG_DISTURBED,
+    SENSOR_FAULT,
+    USING_BARO,
+    USING_MAG,
+)
+from gateway.estimation.local_position import BARO_STALE_S, PlaceState
+from gateway.estimation.magfield import (
+    STALE_MAG_S,
+    CompassSettings,
+    FieldGains,
+    FieldState,
+    field_gains,
+)
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
+from gateway.estimation.sensor_faults import HealthState
+
+
+class FilterGains(RestGains, FieldGains):
+    """The settings that both filters have, in SI units."""
+
+    gps_latency_s: float
+    gps_relock_s: float
+
+
+def filter_gains(
+    reference: ReferenceSettings, rest: RestSettings, compass: CompassSettings
+) -> dict[str, float]:
+    """Return the fields of `FilterGains`."""
+    return {
+        "gps_latency_s": reference.gps_latency_s,
+        "gps_relock_s": reference.gps_relock_s,
+        **rest_gains(rest),
+        **field_gains(compass),
+    }
+
+
+class FilterState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
+    """The part of a filter's state that says nothing of its model."""
+
+    started: int
+    base_us: int
+    time_us: int
+    """Time of the newest sample, and of the one that `time_s` counts from."""
+    heading_true: int
+    """1 if the declination was known or the GPS gave the heading."""
+    declination_rad: float
+    baro_known: int
+    baro_s: float
+    has_height: int
+    """1 once a fix has told the height above the sea."""
+    fix_s: float
+    """Arrival of the last accepted fix."""
+
+
+@compiled
+def sensor_flags(s: FilterState) -> int:
+    """Return which sensors are used, and whether one is at fault."""
+    flags = AT_REST if s.at_rest == 1 else 0
+    if s.time_s - s.mag_s < STALE_MAG_S:
+        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+    if s.time_s - s.baro_s < BARO_STALE_S:
+        flags |= USING_BARO
+    if s.fault == 1:
+        flags |= SENSOR_FAULT | DEGRADED
+    return flags

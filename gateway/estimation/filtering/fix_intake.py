@@ -1,0 +1,74 @@
+"""A GPS fix as it arrives: whether it is one, where it lies, what it says to the alignment."""
+
+import math
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment.review import MOVING_MPS
+from gateway.estimation.alignment.wahba import align_by_velocity
+from gateway.estimation.columns import GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.filtering.filter_state import FilterGains, FilterState
+from gateway.estimation.history import recall
+from gateway.estimation.kernel_record import FloatArray, as_vec
+from gateway.estimation.local_position import NEVER_S, fix_position, fix_velocity, move_origin
+from gateway.records import Vec3
+
+
+@compiled
+def is_fix_told(s: FilterState, row: FloatArray) -> bool:
+    """Return whether a row holds a fix that may be fused, and the filter runs."""
+    known = math.isfinite(row[GPS_LAT]) and math.isfinite(row[GPS_LON])
+    return bool(s.started == 1 and row[GPS_USABLE] != 0.0 and known)
+
+
+@compiled
+def wanted_time_s(s: FilterState, p: FilterGains, arrival_us: int) -> float:
+    """Return when a fix was valid, on the filter's own time."""
+    return (arrival_us - s.base_us) * 1e-6 - p.gps_latency_s
+
+
+@compiled
+def look_back(s: FilterState, time_s: float) -> float:
+    """Fill `then` with the integrals of a past time, and return the time that they hold for."""
+    return recall(s.ring, s.ring_count, time_s, s.time_s, s.integrals, s.then)
+
+
+@compiled
+def place_fix(s: FilterState, row: FloatArray) -> tuple[Vec3, Vec3]:
+    """Return place, metres from the origin, and velocity of a fix; the first sets the origin."""
+    move_origin(s, row[GPS_LAT], row[GPS_LON])
+    return (fix_position(s, row), fix_velocity(row))
+
+
+@compiled
+def learn_declination(s: FilterState, declination_rad: float) -> float:
+    """Note the declination, and return by how much it turns a heading that was magnetic, rad."""
+    if not math.isfinite(declination_rad):
+        return 0.0
+    s.declination_rad = declination_rad
+    if s.heading_known == 0 or s.heading_true == 1:
+        return 0.0
+    s.heading_true = 1
+    return declination_rad
+
+
+@compiled
+def is_flown_unaided(s: FilterState, vel: Vec3) -> bool:
+    """Return whether an attitude that gravity alone has levelled was levelled in flight.
+
+    What was found without GPS took the pull of every turn for gravity.
+    """
+    return bool(s.by_gps == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS)
+
+
+@compiled
+def pair_with(s: FilterState, at_s: float, vel: Vec3, noise_mps: float) -> float:
+    """Give a velocity to the alignment as of when it was valid; see `align_by_velocity`."""
+    at_s = look_back(s, at_s)
+    return align_by_velocity(s, at_s, vel, as_vec(s.then), noise_mps)
+
+
+@compiled
+def accept_fix(s: FilterState) -> None:
+    """Note that a fix was used."""
+    s.fix_s = s.time_s
+    s.reject_s, s.reject_last[0] = 0.0, NEVER_S

@@ -1,0 +1,64 @@
+"""The clock of a filter: its begin, its step from sample to sample, and silences."""
+
+from gateway.compiled import compiled
+from gateway.estimation.alignment.review import GAP_S
+from gateway.estimation.filtering.filter_state import FilterState
+from gateway.estimation.kernel_record import write_vec
+from gateway.records import Vec3
+
+
+@compiled
+def begin_clock(s: FilterState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
+    """Begin at a sound sample: the time, and the averages over samples."""
+    s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
+    write_vec(s.gyro_lp, gyro)
+    write_vec(s.gyro_rest, gyro)
+    write_vec(s.accel_lp, accel)
+    write_vec(s.force_mean_i, accel)
+    write_vec(s.rate_b, gyro)
+
+
+@compiled
+def step_clock(s: FilterState, time_us: int) -> float:
+    """Go on to a sample.
+
+    Parameters
+    ----------
+    s : FilterState
+        Changed in place.
+    time_us : int
+        Of the sample, on the gateway's clock.
+
+    Returns
+    -------
+    float
+        Time in s since the sample before. Not positive for one that is late, which is to be left
+        out; below `-GAP_S` the clock is a new one, and begins here.
+    """
+    dt = (time_us - s.time_us) * 1e-6
+    if dt <= 0.0:
+        s.fault = 1
+        if dt < -GAP_S:
+            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
+        return dt
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    return dt
+
+
+@compiled
+def silence_before(s: FilterState, valid_s: float) -> float:
+    """Go on to a fix that was valid long after the newest sample, and tell how long; else 0."""
+    ahead = valid_s - s.time_s
+    if ahead <= GAP_S:
+        return 0.0
+    s.time_us += int(ahead * 1e6)
+    s.time_s = (s.time_us - s.base_us) * 1e-6
+    return ahead
+
+
+@compiled
+def silent_rate(s: FilterState, bias_b: Vec3) -> Vec3:
+    """Return the rate in body FRD at which a turn goes on in a silence, rad/s; none at rest."""
+    if s.at_rest == 1:
+        return (0.0, 0.0, 0.0)
+    return (s.gyro_lp[0] - bias_b[0], s.gyro_lp[1] - bias_b[1], s.gyro_lp[2] - bias_b[2])
