@@ -48,12 +48,15 @@ class MessageBook:
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
         self._entries: dict[Key, _Entry] = {}
+        self._heard: set[tuple[int, int]] = set()
         self.left_out = 0
         """Messages of kinds for which there was no room."""
 
-    def take(self, message: Any) -> None:
-        """Take in one decoded message."""
+    def take(self, message: Any, *, is_sent: bool = False) -> None:
+        """Take in one message: one that was heard, or one that was sent from here."""
         key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
+        if not is_sent:
+            self._heard.add(key[:2])
         now_s = self._now_s()
         entry = self._entries.get(key)
         if entry is not None:
@@ -65,9 +68,9 @@ class MessageBook:
         else:
             self.left_out += 1
 
-    def knows(self, system_id: int, component_id: int) -> bool:
+    def has_heard(self, system_id: int, component_id: int) -> bool:
         """Return whether anything came from a component."""
-        return any(key[:2] == (system_id, component_id) for key in self._entries)
+        return (system_id, component_id) in self._heard
 
     def look_up(self, path: str) -> Any:
         """Return what stands at a place of the tree.
@@ -75,7 +78,8 @@ class MessageBook:
         Parameters
         ----------
         path : str
-            As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all.
+            As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all. A JSON
+            pointer without its first slash, so a slash at the end asks for a name that is empty.
 
         Returns
         -------
@@ -87,12 +91,12 @@ class MessageBook:
         KeyError
             If nothing stands there.
         """
-        parts = [part for part in path.split("/") if part]
+        parts = path.split("/") if path else []
         node: Any = self._tree(parts)
         for part in parts:
             if isinstance(node, dict):
                 node = node[part]
-            elif isinstance(node, list) and part.isdecimal() and int(part) < len(node):
+            elif isinstance(node, list) and part in map(str, range(len(node))):
                 node = node[int(part)]
             else:
                 raise KeyError(part)

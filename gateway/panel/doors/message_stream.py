@@ -28,16 +28,16 @@ class Follower:
     def __init__(self, names: Set[str]) -> None:
         self.names = names
         self.dropped = 0
-        self._waiting: deque[str] = deque(maxlen=MAX_WAITING)
+        self._waiting: deque[str | bytes] = deque(maxlen=MAX_WAITING)
         self._news = asyncio.Event()
 
-    def push(self, text: str) -> None:
-        """Let a text wait; the oldest makes room."""
+    def push(self, text: str | bytes) -> None:
+        """Let a text wait, or bytes; the oldest makes room."""
         self.dropped += len(self._waiting) == MAX_WAITING
         self._waiting.append(text)
         self._news.set()
 
-    async def next(self) -> str:
+    async def next(self) -> str | bytes:
         """Return what is to be sent next."""
         while not self._waiting:
             self._news.clear()

@@ -31,6 +31,9 @@ API_VERSION: Final = 0
 """Of the answers' form, as mavlink2rest counts it."""
 DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
 MAX_ID: Final = 255
+NOTHING: Final = "None"
+"""What stands where nothing does."""
+NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
 NOT_ALLOWED: Final = "whoever may only look may not send; log in as the operator"
 WS_INVALID: Final = 1007
 
@@ -78,8 +81,11 @@ class RestDoor:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
         return self._read(path)
 
-    async def helper(self, name: str) -> Response:
+    async def helper(self, name: str | None = None) -> Response:
         """Return an empty message of a name, to be filled in and sent."""
+        if name is None:
+            text = "Query deserialize error: missing field `name`"
+            return Response(text, HTTPStatus.BAD_REQUEST, media_type="text/plain")
         try:
             message = template(name)
         except ValueError:
@@ -90,14 +96,16 @@ class RestDoor:
         """Send a message, given as `{"header": {...}, "message": {"type": "COMMAND_LONG", ...}}`.
 
         Its header tells who sends: a system and component of one's own, 255 and 0 for a script's.
+        The text is JSON or JSON5.
         """
         if request.scope[ROLE] is not Role.OPERATOR:
             return Response(NOT_ALLOWED, HTTPStatus.FORBIDDEN)
         try:
-            self._send(await request.body())
-        except ValueError as error:
-            text = f"Failed to parse message, not a valid MAVLinkMessage: {error}"
-            return Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+            self._send(_read_json5((await request.body()).decode()))
+        except UnicodeDecodeError as error:
+            return _refused(f"Failed to parse input as UTF-8 string: {error}")
+        except BadMessageError as error:
+            return _refused(f"{NOT_A_MESSAGE} {error}")
         return Response("Ok.", media_type="application/json")
 
     async def follow(self, socket: WebSocket) -> None:
@@ -135,35 +143,36 @@ class RestDoor:
         try:
             return _json(self._book.look_up(path))
         except KeyError:
-            return Response(f"No valid path: {path}", HTTPStatus.NOT_FOUND)
+            return Response(NOTHING, media_type="application/json")
 
     async def _take_all(self, socket: WebSocket, follower: Follower) -> None:
         is_operator = socket.scope[ROLE] is Role.OPERATOR
-        with suppress(WebSocketDisconnect, KeyError):
-            while True:
-                text = await socket.receive_text()
-                follower.push(self._answer(text) if is_operator else NOT_ALLOWED)
+        with suppress(WebSocketDisconnect):
+            while (given := await socket.receive())["type"] == "websocket.receive":
+                text = given.get("text")
+                if text is None:
+                    follower.push(given["bytes"])
+                else:
+                    follower.push(self._answer(text) if is_operator else NOT_ALLOWED)
 
     def _answer(self, text: str) -> str:
         try:
-            return f"Ok({self._send(text)})"
+            return f"Ok({self._send(_read_json(text))})"
         except ValueError as error:
-            return f"Could not convert input message: {error}"
+            return f"Could not convert input message. {error}"
 
-    def _send(self, text: str | bytes) -> int:
-        """Send a message and return its size; raises ValueError if it is none."""
-        try:
-            given = json.loads(text)
-        except RecursionError:
-            raise BadMessageError("it is nested too deeply") from None
+    def _send(self, given: Any) -> int:
+        """Send a message and return its size; raises BadMessageError if it is none."""
         if not isinstance(given, dict):
             raise BadMessageError("it is an object with 'header' and 'message'")
         message = from_json(given.get("message"))
         system_id, component_id = _sender(given.get("header"))
-        if self._book.knows(system_id, component_id):
+        if self._book.has_heard(system_id, component_id):
             # Who is heard cannot be sent for: the gateway takes that for a loop.
             system_id = component_id = 0
-        return self._uplink.send_as(message, system_id, component_id)
+        size = self._uplink.send_as(message, system_id, component_id)
+        self._book.take(message, is_sent=True)
+        return size
 
     def _take(self, message: Any) -> None:
         self._book.take(message)
@@ -173,11 +182,37 @@ class RestDoor:
 async def _send_all(socket: WebSocket, follower: Follower) -> None:
     with suppress(WebSocketDisconnect, RuntimeError):
         while True:
-            await socket.send_text(await follower.next())
+            news = await follower.next()
+            await (socket.send_bytes(news) if isinstance(news, bytes) else socket.send_text(news))
 
 
 async def _docs() -> FileResponse:
     return FileResponse(WEB / "rest.html")
+
+
+def _read_json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise BadMessageError("it is nested too deeply") from None
+    except ValueError as error:
+        raise BadMessageError(str(error)) from None
+
+
+def _read_json5(text: str) -> Any:
+    """Read JSON5, of which JSON is a part that nearly everybody keeps to."""
+    with suppress(BadMessageError):
+        return _read_json(text)
+    import pyjson5
+
+    try:
+        return pyjson5.decode(text)
+    except pyjson5.Json5Exception as error:
+        raise BadMessageError(str(error.args[0])) from None
+
+
+def _refused(text: str) -> Response:
+    return Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
 
 
 def _sender(header: Any) -> tuple[int, int]:

@@ -43,7 +43,7 @@ ATTITUDE = "vehicles/1/components/1/messages/ATTITUDE"
 
 def test_paths(book: MessageBook) -> None:
     assert book.look_up(f"{ATTITUDE}/message/roll") == 5.0
-    assert book.look_up(f"/{ATTITUDE}/message/type/") == "ATTITUDE"
+    assert book.look_up(f"{ATTITUDE}/message/type") == "ATTITUDE"
     assert book.look_up("vehicles/2/components/5/id") == 5
     assert book.look_up("vehicles/2/id") == 2
     everything = book.look_up("")
@@ -70,8 +70,9 @@ def test_elements_of_an_array(book: MessageBook) -> None:
     book.take(link.decode(bytearray(message.pack(link))))
     place = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
     assert book.look_up(f"{place}/1") == "P"
-    with pytest.raises(KeyError):
-        book.look_up(f"{place}/16")
+    for element in ("16", "-1", "01", "+1"):
+        with pytest.raises(KeyError):
+            book.look_up(f"{place}/{element}")
 
 
 @pytest.mark.parametrize(
@@ -82,6 +83,8 @@ def test_elements_of_an_array(book: MessageBook) -> None:
         f"{ATTITUDE}/message/rol",
         f"{ATTITUDE}/message/roll/x",
         "vehicles/x",
+        f"{ATTITUDE}/",
+        f"/{ATTITUDE}",
     ],
 )
 def test_nowhere(book: MessageBook, path: str) -> None:
@@ -99,3 +102,13 @@ def test_forged_ids_do_not_fill_the_memory(
     assert book.left_out == 6
     book.take(attitude(9))
     assert book.look_up(f"{ATTITUDE}/message/roll") == 9
+
+
+def test_what_was_sent_stands_there_and_is_not_heard(book: MessageBook) -> None:
+    assert book.has_heard(1, 1)
+    book.take(attitude(3, 255, 0), is_sent=True)
+    place = "vehicles/255/components/0/messages/ATTITUDE/message/roll"
+    assert book.look_up(place) == 3
+    assert not book.has_heard(255, 0)
+    book.take(attitude(4, 255, 0))
+    assert book.has_heard(255, 0)

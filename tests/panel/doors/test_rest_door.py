@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -131,8 +132,10 @@ class TestReading:
         assert everything["vehicles"]["1"]["components"]["1"]["messages"].keys() >= {"ATTITUDE"}
 
     async def test_nothing_there(self, world: World) -> None:
-        answer = await world.client.get("/v1/mavlink/vehicles/9")
-        assert (answer.status_code, answer.text) == (404, "No valid path: vehicles/9")
+        for path in ("vehicles/9", "vehicles/", "ATTITUDE"):
+            answer = await world.client.get(f"/v1/mavlink/{path}")
+            assert (answer.status_code, answer.text) == (200, "None")
+            assert answer.headers["content-type"] == "application/json"
 
     async def test_helper(self, world: World) -> None:
         answer = (await world.client.get("/v1/helper/mavlink?name=COMMAND_LONG")).json()
@@ -140,6 +143,7 @@ class TestReading:
         assert answer["message"]["command"] == {"type": "MAV_CMD_NAV_WAYPOINT"}
         wrong = await world.client.get("/helper/mavlink?name=NO_SUCH")
         assert (wrong.status_code, wrong.json()) == (404, "Invalid message name.")
+        assert (await world.client.get("/v1/helper/mavlink")).status_code == 400
 
     async def test_info_and_documents(self, world: World) -> None:
         info = (await world.client.get("/info")).json()
@@ -163,6 +167,19 @@ COMMAND = {
 }
 
 
+COMMAND_IN_JSON5 = """
+// Arm, as the README of mavlink2rest comments its examples.
+{
+    header: {system_id: 255, component_id: 0, sequence: 0,},
+    message: {
+        type: 'COMMAND_LONG', command: {type: 'MAV_CMD_COMPONENT_ARM_DISARM'},
+        param1: +1, param2: .5, param3: NaN, param4: 0., param5: 0, param6: 0, param7: 0,
+        target_system: 0x1, target_component: 1, confirmation: 0, /* the end */
+    },
+}
+"""
+
+
 class TestWriting:
     async def test_a_command_goes_out_and_its_answer_comes_back(self, world: World) -> None:
         answer = await world.client.post("/v1/mavlink", json=COMMAND)
@@ -173,6 +190,20 @@ class TestWriting:
         world.send(mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 0))
         place = "/v1/mavlink/vehicles/1/components/1/messages/COMMAND_ACK/message/result/type"
         await world.until_json(place, "MAV_RESULT_ACCEPTED")
+        sent = "/v1/mavlink/vehicles/255/components/0/messages/COMMAND_LONG"
+        found = (await world.client.get(sent)).json()
+        assert found["message"] == COMMAND["message"]
+        assert (await world.client.post("/v1/mavlink", json=COMMAND)).status_code == 200
+        await world.until_json(f"{sent}/status/time/counter", 2)
+
+    async def test_json5(self, world: World) -> None:
+        pytest.importorskip("pyjson5", reason="older than the lock file: install it anew")
+        answer = await world.client.post("/v1/mavlink", content=COMMAND_IN_JSON5)
+        assert (answer.status_code, answer.text) == (200, "Ok.")
+        command = await world.until_commanded()
+        assert (command.command, command.param1, command.param2) == (400, 1.0, 0.5)
+        assert math.isnan(command.param3)
+        assert command.target_system == 1
 
     async def test_under_the_vehicles_own_id_as_the_readme_has_it(self, world: World) -> None:
         """A gateway takes what bears its own id for a loop; and the telemetry must go on."""
@@ -188,17 +219,23 @@ class TestWriting:
     @pytest.mark.parametrize(
         "body",
         [
-            b"", b"[]", b"{}", b"\xff", b"[" * 100_000, b'{"message": {"type": "ATTITUDE"}}',
+            b"", b"[]", b"{}", b"[" * 100_000, b'{"message": {"type": "ATTITUDE"}}',
             json.dumps({"message": COMMAND["message"]}).encode(),
             json.dumps({**COMMAND, "header": {"system_id": 256}}).encode(),
         ],
-        ids=["empty", "list", "object", "no text", "deep", "missing", "no header", "id"],
+        ids=["empty", "list", "object", "deep", "missing", "no header", "id"],
     )  # fmt: skip
     async def test_what_is_no_message(self, world: World, body: bytes) -> None:
+        pytest.importorskip("pyjson5", reason="older than the lock file: install it anew")
         answer = await world.client.post("/v1/mavlink", content=body)
         assert answer.status_code == 404
-        assert answer.text.startswith("Failed to parse message, not a valid MAVLinkMessage")
+        assert answer.text.startswith("Failed to parse message, not a valid MAVLinkMessage. ")
         assert not world.commands()
+
+    async def test_what_is_no_text(self, world: World) -> None:
+        answer = await world.client.post("/v1/mavlink", content=b"\xff")
+        assert answer.status_code == 404
+        assert answer.text.startswith("Failed to parse input as UTF-8 string: ")
 
 
 class TestFollowing:
@@ -217,7 +254,9 @@ class TestFollowing:
                 assert "ATTITUDE" in answer
             assert (await world.until_commanded()).command == 400
             await stream.send("nonsense")
-            assert "Could not convert input message" in str(await stream.recv())
+            assert str(await stream.recv()).startswith("Could not convert input message. ")
+            await stream.send(b"\1\2")
+            assert await stream.recv() == b"\1\2"
 
     @staticmethod
     async def until_followed(world: World, stream: Any) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import socket
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,6 +35,25 @@ async def test_it_calls(rig: Rig) -> None:
             hub.send(rig.out(rig.vehicle.attitude()))
         got = [await receive(link, "ATTITUDE") for _ in range(200)]
         assert [message.get_seq() for message in got] == list(range(2, 202))
+        assert link.mav.total_receive_errors == 0
+    finally:
+        link.close()
+
+
+async def test_it_calls_within_tls(
+    rig: Rig, certificate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+    url = f"wss:127.0.0.1:{hub.listening_ports()[0]}"
+    link = await asyncio.to_thread(mavutil.mavlink_connection, url, source_system=255)
+    try:
+        for _ in range(50):
+            hub.send(rig.out(rig.vehicle.attitude()))
+        got = [await receive(link, "ATTITUDE") for _ in range(50)]
+        assert [message.get_seq() for message in got] == list(range(50))
+        link.mav.command_long_send(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)
+        await rig.until(lambda: bool(rig.incoming))
         assert link.mav.total_receive_errors == 0
     finally:
         link.close()

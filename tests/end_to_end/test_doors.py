@@ -1,0 +1,220 @@
+"""The doors for programs, of a gateway and its panel as processes: what docs/programs.md shows runs
+as it stands there, and the JSON is what UDP clients decode.
+"""
+
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+from websockets.sync.client import connect as follow
+
+from gateway.panel.doors.message_json import template
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+from tests.end_to_end.test_demo import EXPECTED, HOME
+from tests.panel.doors.test_message_json import as_pymavlink_tells
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+PROGRAMS = Path(__file__).resolve().parents[2] / "docs" / "programs.md"
+CONFIG = """
+[hub]
+endpoints = [
+    "udp:127.0.0.1:{{port}}", "udp-listen:127.0.0.1:{{listen}}", "ws-listen:127.0.0.1:{web}",
+]
+[simulator]
+gps_first_fix_s = 0.5
+"""
+FLOWN_DEG = 0.1
+"""In the air by then: about 10 km."""
+ASKED = {"PARAM_VALUE", "AUTOPILOT_VERSION", "MISSION_COUNT", "COMMAND_ACK"}
+
+
+@dataclass
+class Doors:
+    """A gateway with its panel, a station that hears it, and where the doors are."""
+
+    station: Client
+    udp: str
+    web: str
+    panel: str
+
+
+@contextmanager
+def panel(listen_port: int, folder: Path) -> Iterator[str]:
+    """Start the panel's process; yield its host and port."""
+    command = [
+        *(sys.executable, "-m", "gateway.cli", "panel", "--port", "0"),
+        *("--connect", f"udp:127.0.0.1:{listen_port}"),
+    ]
+    env = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=env, text=True)
+    try:
+        assert process.stdout is not None
+        link = next(line for line in process.stdout if "http://" in line)
+        yield link.split("http://")[1].strip().rstrip("/")
+    finally:
+        process.terminate()
+        process.wait(10)
+        process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
+    """Both once for all of them: each start takes seconds, and none leaves them changed."""
+    folder = tmp_path_factory.mktemp("doors")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        web: int = probe.getsockname()[1]
+    gateway = Gateway(folder, "demo", config=CONFIG.format(web=web))
+    station = Client(gateway.port)
+    try:
+        station.until(lambda seen: "GLOBAL_POSITION_INT" in seen)
+        with panel(gateway.listen_port, folder) as place:
+            listen = f"127.0.0.1:{gateway.listen_port}"
+            yield Doors(station, listen, f"127.0.0.1:{web}", place)
+    finally:
+        station.sock.close()
+        gateway.stop()
+
+
+def requests() -> list[dict[str, Any]]:
+    """Return what a ground station asks at first."""
+    header = {"system_id": 255, "component_id": 0, "sequence": 0}
+    target = {"target_system": 1, "target_component": 1}
+    version = {"command": {"type": "MAV_CMD_REQUEST_MESSAGE"}, "param1": 148.0}
+    messages = [
+        {**template("PARAM_REQUEST_LIST"), **target},
+        {**template("MISSION_REQUEST_LIST"), **target},
+        {**template("COMMAND_LONG"), **target, **version},
+    ]
+    return [{"header": header, "message": message} for message in messages]
+
+
+class Ear:
+    """What a UDP client decodes, in the form that the door gives."""
+
+    def __init__(self, client: Client) -> None:
+        self._sock = client.sock
+        self._reader = mavlink.MAVLink(None)
+        self.decoded: set[str] = set()
+
+    def read(self, wait_s: float) -> None:
+        """Take what there is; return once nothing comes for so long."""
+        self._sock.settimeout(wait_s)
+        with suppress(TimeoutError, BlockingIOError):
+            for _ in range(500):
+                for message in self._reader.parse_buffer(self._sock.recv(65_536)) or []:
+                    self.decoded.add(json.dumps(as_pymavlink_tells(message)))
+
+
+def hear(stream: Any, ear: Ear) -> dict[str, list[dict[str, Any]]]:
+    """Follow the vehicle until every kind of message has come."""
+    told: dict[str, list[dict[str, Any]]] = {}
+    while not told.keys() >= EXPECTED | ASKED:
+        text = str(stream.recv(timeout=START_LIMIT_S))
+        ear.read(0)
+        if text.startswith("{"):
+            heard = json.loads(text)
+            if heard["header"]["system_id"] == 1:
+                told.setdefault(heard["message"]["type"], []).append(heard["message"])
+    return told
+
+
+def test_json_is_what_pymavlink_reads(doors: Doors) -> None:
+    ear = Ear(doors.station)
+    ear.read(0)
+    with follow(f"ws://{doors.panel}/v1/ws/mavlink") as stream:
+        for request in requests():
+            stream.send(json.dumps(request))
+        told = hear(stream, ear)
+    path = "/v1/mavlink/vehicles/1/components/1/messages/PARAM_VALUE/message/param_count"
+    with urllib.request.urlopen(f"http://{doors.panel}{path}") as answer:
+        count = json.load(answer)
+    # What was said in the last moment may be on its way to the other client.
+    ear.read(0.5)
+    assert count == told["PARAM_VALUE"][0]["param_count"]
+    to_one_client = ASKED | {"HOME_POSITION", "TIMESYNC", "PING"}
+    compared = [fields for kind in told.keys() - to_one_client for fields in told[kind]]
+    assert len(compared) > len(EXPECTED)
+    assert [fields for fields in compared if json.dumps(fields) not in ear.decoded] == []
+
+
+def block(heading: str, doors: Doors) -> str:
+    """Return the code below a heading as it stands there, for ports of ours."""
+    section = re.search(rf"^## {heading}\n(.*?)^## ", PROGRAMS.read_text(), re.M | re.S)
+    assert section is not None
+    code = "\n".join(line[4:] for line in section[1].splitlines() if line[:4].isspace() or not line)
+    places = {"14551": doors.udp, "56781": doors.web, "14590": doors.panel}
+    for port, ours in places.items():
+        code = code.replace(f"127.0.0.1:{port}", ours)
+    return code
+
+
+def run_until(code: str, pattern: str) -> re.Match[str]:
+    """Run Python until it prints what a pattern finds."""
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    limit = threading.Timer(START_LIMIT_S, process.kill)
+    limit.start()
+    printed = ""
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            printed += line
+            if found := re.search(pattern, line):
+                return found
+    finally:
+        limit.cancel()
+        process.kill()
+        process.communicate()
+    raise AssertionError(f"no {pattern!r} in:\n{printed}")
+
+
+def test_mavsdk(doors: Doors) -> None:
+    place = run_until(block("MAVSDK", doors), r"^(-?\d+\.\d+) (-?\d+\.\d+) (-?\d+\.\d+)$")
+    assert float(place[1]) == pytest.approx(HOME.home_lat_deg, abs=FLOWN_DEG)
+    assert float(place[2]) == pytest.approx(HOME.home_lon_deg, abs=FLOWN_DEG)
+
+
+def test_pymavlink(doors: Doors) -> None:
+    assert run_until(block("pymavlink", doors), r"PARAM_VALUE {param_id : SENS_ACC_CUTOFF,")
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl on this machine")
+def test_curl(doors: Doors, tmp_path: Path) -> None:
+    script = "set -e\n" + block("curl", doors).replace("curl ", "curl --fail-with-body -sS ")
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    attitude, end = json.JSONDecoder().raw_decode(done.stdout)
+    assert attitude["message"]["type"] == "ATTITUDE"
+    rest = re.fullmatch(r"(\S+)Ok\.", done.stdout[end:])
+    assert rest is not None
+    assert abs(float(rest[1])) < 0.2
+    asked = json.loads((tmp_path / "command.json").read_text())["message"]
+    assert asked["command"] == {"type": "MAV_CMD_REQUEST_MESSAGE"}
+    messages = f"http://{doors.panel}/v1/mavlink/vehicles/1/components/1/messages"
+    place = f"{messages}/AUTOPILOT_VERSION/message/type"
+    deadline_s = time.monotonic() + 20.0
+    while urllib.request.urlopen(place).read() != b'"AUTOPILOT_VERSION"':
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
