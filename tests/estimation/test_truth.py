@@ -19,8 +19,6 @@ from tools.flights import Flight, north_east_m, read_flight, simulated_flight
 from tools.score_estimators import (
     OWN,
     attitude_scores,
-    consistency,
-    normalised_errors,
     outage_score,
     position_errors_m,
     rms,
@@ -28,6 +26,7 @@ from tools.score_estimators import (
     run_eskf,
     thinned,
 )
+from tools.score_honesty import consistency, normalised_errors
 
 SEEDS = (21, 22)
 
