@@ -25,6 +25,8 @@ PROGRAM = """
                 os.kill(os.getpid(), signal.SIGINT)
 
     from gateway.cli.__main__ import main
+    # A shell's background job begins with Ctrl-C ignored, and so would this program.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.meta_path.insert(0, Interrupt(sys.argv.pop()))
     sys.argv.append("check-config")
     main()

@@ -9,11 +9,12 @@ import pytest
 from PIL import Image
 
 from gateway.analysis.reporting.compose import make_report
-from gateway.analysis.reporting.page import ReportTable, prose, write_report
+from gateway.analysis.reporting.page import Report, ReportTable, prose, write_report
 from gateway.analysis.reporting.style import CSS_NAMES
 from tests.analysis.flights import short_case
 
-pytestmark = pytest.mark.io
+# Its report takes seconds: one worker makes it for all of them.
+pytestmark = [pytest.mark.io, pytest.mark.xdist_group("report")]
 
 CHROMIUM = shutil.which("chromium")
 OFFLINE = (
@@ -23,9 +24,14 @@ OFFLINE = (
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report() -> Report:
+    return make_report(short_case())
+
+
+@pytest.fixture(scope="module")
+def folder(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    write_report(make_report(short_case()), folder)
+    write_report(report, folder)
     return folder
 
 
@@ -71,8 +77,7 @@ def test_the_pages_theme_colours_the_figures(folder: Path) -> None:
         assert len(re.findall(rf"--{name}: #", text)) == 2
 
 
-def test_every_figure_and_table_is_a_file_too(folder: Path) -> None:
-    report = make_report(short_case())
+def test_every_figure_and_table_is_a_file_too(report: Report, folder: Path) -> None:
     names = {picture.name for section in report.sections for picture in section.pictures}
     tables = {table.name for section in report.sections for table in section.tables}
     assert {path.stem for path in folder.glob("*.svg")} == names
