@@ -99,6 +99,7 @@ class Daemon:
             on_gone=self._on_gone,
             on_trouble=self._on_trouble,
             seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us()),
+            recordings=Path(settings.recording.folder).expanduser(),
         )
         self._recorder = Recorder(
             settings.recording,
@@ -111,7 +112,7 @@ class Daemon:
         self._budget = RecordingBudget()
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
-        self._metrics = MetricsServer(self.snapshot)
+        self._metrics = MetricsServer(self._metrics_text)
         self._notifier = ServiceNotifier()
         self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
@@ -222,6 +223,12 @@ class Daemon:
             aircraft=tuple(_status_of(one) for _, one in aircraft),
             recorder=self._recorder.status(),
         )
+
+    def _metrics_text(self) -> str:
+        # Not above: most gateways serve no metrics, and need not wait for the library.
+        from gateway.edges.operator.metric_families import prometheus_text
+
+        return prometheus_text(self.snapshot())
 
     def announce(self, text: str) -> None:
         """Tell the ground stations an event that is no trouble."""

@@ -7,12 +7,14 @@ and the time stamp that it had; without the key a signed frame passes only if no
 
 import hashlib
 import hmac
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.fleet.id_map import IdMap
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import (
     SIGNATURE_SIZE,
@@ -26,6 +28,8 @@ from gateway.wire.mavlink_splitter import (
 
 HASH_BYTES: Final = 6
 SEQUENCE_MASK: Final = 0xFF
+RATE_MARKS: Final = 6
+"""Five seconds between the first and the last."""
 MAX_LOST: Final = 128
 """A greater step is a restart rather than a loss."""
 
@@ -52,7 +56,13 @@ class VehicleTraffic:
     lost: int = 0
     """By the gaps in its sequence numbers."""
     heard_us: int = 0
-    since_us: int = 0
+    marks: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RATE_MARKS))
+    """When it was looked at in the last seconds, and how many frames there were then."""
+
+    def rate_hz(self, now_us: int) -> float:
+        """Return the frames a second of the last seconds."""
+        since_us, before = self.marks[0]
+        return (self.frames - before) * US_PER_S / max(now_us - since_us, US_PER_S)
 
 
 class _CannotPassError(Exception):
@@ -81,6 +91,11 @@ class FrameTranslation:
         self.traffic: dict[int, VehicleTraffic] = {}
         """By system id at the site."""
 
+    def mark(self, now_us: int) -> None:
+        """Note where the counts are, about once a second: rates are of the last seconds."""
+        for traffic in self.traffic.values():
+            traffic.marks.append((now_us, traffic.frames))
+
     def from_site(self, frame: bytes, now_us: int) -> bytes | None:
         """Return a frame of the site as it is to be seen here; None if it cannot pass."""
         origin = origin_of(frame)
@@ -99,6 +114,10 @@ class FrameTranslation:
         changed = self._rewritten(frame, sender, there)
         return None if changed is None else (there, changed)
 
+    def id_of(self, system_id: int) -> int | None:
+        """Return the id that a system of the site has here, if it has one."""
+        return self._ids.known_id(self._site, system_id)
+
     def _id_there(self, own_id: int) -> int:
         vehicle = self._ids.vehicle_of(own_id)
         return vehicle[1] if vehicle is not None and vehicle[0] == self._site else own_id
@@ -112,7 +131,9 @@ class FrameTranslation:
             return None
 
     def _note(self, frame: bytes, origin: tuple[int, int], now_us: int) -> None:
-        traffic = self.traffic.setdefault(origin[0], VehicleTraffic(since_us=now_us))
+        traffic = self.traffic.setdefault(origin[0], VehicleTraffic())
+        if not traffic.marks:
+            traffic.marks.append((now_us, 0))
         traffic.frames += 1
         traffic.heard_us = now_us
         sequence = sequence_of(frame)

@@ -6,6 +6,8 @@ from typing import Final
 FIRST_ID: Final = 1
 LAST_ID: Final = 249
 """From 250 on there are ground stations."""
+LEFT_OUT: Final = 0
+"""In the place of an id: a vehicle that shall have none."""
 
 Vehicle = tuple[str, int]
 """Site and system id there."""
@@ -20,7 +22,7 @@ class IdMap:
     Parameters
     ----------
     known : mapping
-        Ids given before, by vehicle.
+        Ids given before, by vehicle; `LEFT_OUT` for those that shall have none.
     """
 
     def __init__(self, known: Mapping[Vehicle, int] | None = None) -> None:
@@ -30,15 +32,22 @@ class IdMap:
         """Counts the changes, so that the keeper knows when to write."""
         self.unmapped: set[Vehicle] = set()
         """Vehicles for which there is no id left."""
+        self.left_out: set[Vehicle] = set()
+        """Vehicles that shall have none."""
         for vehicle, own_id in (known or {}).items():
-            self._give(vehicle, own_id)
+            if own_id == LEFT_OUT:
+                self.left_out.add(vehicle)
+            else:
+                self._give(vehicle, own_id)
 
     def id_of(self, site: str, system_id: int) -> int | None:
-        """Return the id of a vehicle here, giving it one if it is new; None if none is left."""
+        """Return the id of a vehicle here, giving it one if it is new; None if it has none."""
         vehicle = (site, system_id)
         own_id = self._ids.get(vehicle)
-        if own_id is not None or not system_id or vehicle in self.unmapped:
+        if own_id is not None or not system_id:
             return own_id
+        if vehicle in self.unmapped or vehicle in self.left_out:
+            return None
         wanted = [system_id, *range(FIRST_ID, LAST_ID + 1)]
         own_id = next((each for each in wanted if self._is_free(each)), None)
         if own_id is None:
@@ -56,7 +65,7 @@ class IdMap:
         return self._vehicles.get(own_id)
 
     def set_by_hand(self, site: str, system_id: int, own_id: int) -> None:
-        """Give a vehicle an id; whoever had it gets another.
+        """Give a vehicle an id; whoever had it gets another, as far as there is one.
 
         Raises
         ------
@@ -78,10 +87,24 @@ class IdMap:
             self._give(holder, former)
         elif holder is not None:
             self.id_of(*holder)
+        elif former is not None:
+            self.unmapped.clear()
+
+    def leave_out(self, site: str, system_id: int) -> None:
+        """Take a vehicle's id away and give it none again; the next one that waits gets it."""
+        vehicle = (site, system_id)
+        own_id = self._ids.pop(vehicle, None)
+        if own_id is not None:
+            del self._vehicles[own_id]
+        self.left_out.add(vehicle)
+        # Whoever waits asks anew with its next frame.
+        self.unmapped.clear()
+        self.version += 1
 
     def items(self) -> list[tuple[Vehicle, int]]:
-        """Return all vehicles with their ids, in the order of the ids."""
-        return sorted(self._ids.items(), key=lambda item: item[1])
+        """Return all vehicles with their ids in the order of these, first those left out."""
+        out = [(vehicle, LEFT_OUT) for vehicle in sorted(self.left_out)]
+        return out + sorted(self._ids.items(), key=lambda item: item[1])
 
     def _is_free(self, own_id: int) -> bool:
         return FIRST_ID <= own_id <= LAST_ID and own_id not in self._vehicles
@@ -90,4 +113,5 @@ class IdMap:
         self._ids[vehicle] = own_id
         self._vehicles[own_id] = vehicle
         self.unmapped.discard(vehicle)
+        self.left_out.discard(vehicle)
         self.version += 1

@@ -1,13 +1,14 @@
 """A site as one client of the hub here: its vehicles are heard behind it, under ids of ours."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.fleet_link.site_keys import in_key
 from gateway.edges.hub.fleet_link.zenoh_session import PATIENT_IDS, Outlets
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.routing.endpoint import Endpoint
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import SplitFault, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
@@ -20,13 +21,19 @@ class SiteClient(Client):
 
     outlets: Callable[[], Outlets | None]
     translation: FrameTranslation
-    is_here: bool = False
-    """Whether its liveliness token is there."""
+    tokens: set[str]
+    """Its sessions that are there by Zenoh's liveliness; more than one are namesakes."""
+
+    @property
+    def is_here(self) -> bool:
+        """Whether a session of it is there."""
+        return bool(self.tokens)
 
     def set_up(
         self, translation: FrameTranslation, outlets: Callable[[], Outlets | None]
     ) -> "SiteClient":
         """Give the site its ids and its way out."""
+        self.tokens = set()
         self.translation = translation
         self.outlets = outlets
         self.become("connecting")
@@ -59,6 +66,33 @@ class SiteClient(Client):
             self.counters.bytes_sent += len(changed)
         else:
             self.counters.dropped += 1
+
+    def describe(self, now_us: int) -> dict[str, Any]:
+        """Return the site and its vehicles as they are now."""
+        round_trip_us, counters = self.round_trip_us, self.translation.counters
+        return {
+            "name": self.endpoint.site,
+            "is_here": self.is_here,
+            "sessions": len(self.tokens),
+            "round_trip_s": None if round_trip_us is None else round_trip_us / US_PER_S,
+            "vehicles": [
+                {
+                    "system_id": system_id,
+                    "id": self.translation.id_of(system_id),
+                    "rate_hz": traffic.rate_hz(now_us),
+                    "age_s": (now_us - traffic.heard_us) / US_PER_S,
+                    "frames": traffic.frames,
+                    "lost": traffic.lost,
+                }
+                for system_id, traffic in sorted(self.translation.traffic.items())
+            ],
+            "sent": self.counters.sent,
+            "dropped": self.counters.dropped,
+            "bytes_garbage": self.counters.bytes_garbage,
+            "unknown": counters.unknown,
+            "signed": counters.signed,
+            "forged": counters.forged,
+        }
 
     @property
     def queued(self) -> int:

@@ -49,8 +49,8 @@ SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
 """How Zenoh names a place."""
 RAW_KEYS: Final = "mavlink_raw"
-SITE_NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-"""What may stand between two slashes of a Zenoh key and means only itself there."""
+SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
+"""What may stand between two slashes of a Zenoh key, or of a path, and means only itself there."""
 
 
 class EndpointKind(StrEnum):

@@ -4,16 +4,24 @@ import asyncio
 import logging
 import signal
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
+from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.asking import AskingTyper, ask
+from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
 from gateway.cli.support.errors import refuse
+from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, table_of
+from gateway.edges.operator.control_socket import ControlError, request
+from gateway.flightlog.moment import civil_time
+from gateway.flightlog.session import NEWEST
+from gateway.routing.endpoint import SITE_NAME
+from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
 
@@ -22,9 +30,14 @@ group = AskingTyper(
     invoke_without_command=True,
 )
 
+recordings_group = AskingTyper(
+    help="List the recordings of the sites, and fetch them.", invoke_without_command=True
+)
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
+    group.add_typer(recordings_group, name="recordings")
     app.add_typer(group, name="fleet")
 
 
@@ -61,7 +74,7 @@ def fleet(
 
 @group.command()
 def status(*, json: JsonOption = False) -> None:
-    """Show sites and vehicles: ids, rates, age, loss."""
+    """Show sites and vehicles: ids, rates, age, loss, round trip."""
     found = ask("fleet.status", of="fleet")
     if json:
         print(msgspec.json.encode(found).decode())
@@ -70,20 +83,27 @@ def status(*, json: JsonOption = False) -> None:
     role = "router at" if found["is_router"] else "connected to"
     lost = "" if found["is_linked"] else ", which is not there"
     console.print(f"{role} {found['router']}{lost}", markup=False)
-    table = table_of("site", "", "system", "id here", "Hz", "age s", "lost")
+    table = table_of("site", "", "ms", "system", "id here", "Hz", "age s", "lost", left=2)
     for each in found["sites"]:
         _add_site(table, each)
     console.print(table)
     if found["unmapped"]:
-        console.print(f"no id left for: {', '.join(found['unmapped'])}", markup=False)
+        text = f"no id left for: {', '.join(found['unmapped'])}; give one by `mavgate fleet id`"
+        console.print(text, markup=False)
+    if found["left_out"]:
+        console.print(f"left out by hand: {', '.join(found['left_out'])}", markup=False)
+    if found["overflowed"]:
+        console.print(f"{found['overflowed']} messages came too fast to be taken", markup=False)
 
 
 @group.command("id")
 def set_id(
     vehicle: Annotated[str, typer.Argument(help="SITE/SYSTEM, as in field-1/1.")],
-    own_id: Annotated[int, typer.Argument(help="System id that it shall have here.")],
+    own_id: Annotated[
+        int, typer.Argument(help="System id that it shall have here; 0 leaves it out.")
+    ],
 ) -> None:
-    """Give a vehicle of a site a system id by hand; it is kept."""
+    """Give a vehicle of a site a system id by hand, or none; it is kept."""
     name, _, system = vehicle.rpartition("/")
     if not name or not system.isdecimal():
         refuse(f"{vehicle!r} is not SITE/SYSTEM, as in field-1/1")
@@ -96,6 +116,8 @@ def _add_site(table: Any, site: Mapping[str, Any]) -> None:
     state = "here" if site["is_here"] else "gone"
     if site["sessions"] > 1:
         state = f"{site['sessions']} of this name"
+    trip_s = site["round_trip_s"]
+    trip = "" if trip_s is None else f"{trip_s * 1000:.1f}"
     for vehicle in site["vehicles"] or [None]:
         cells = ["", "", "", "", ""]
         if vehicle is not None:
@@ -106,7 +128,7 @@ def _add_site(table: Any, site: Mapping[str, Any]) -> None:
                 f"{vehicle['age_s']:.1f}",
                 str(vehicle["lost"]),
             ]
-        table.add_row(site["name"], state, *cells)
+        table.add_row(site["name"], state, trip, *cells)
 
 
 async def _serve(settings: Any, hub_settings: Any) -> None:
@@ -128,3 +150,91 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
         await stopped.wait()
     finally:
         await server.close()
+
+
+@recordings_group.callback()
+@with_socket
+def recordings(
+    context: typer.Context,
+    *,
+    site: Annotated[str, typer.Option("--site", help="Only these sites, such as 'field-*'.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """List the recordings of the sites, the newest last."""
+    if context.invoked_subcommand is not None:
+        return
+    found = ask("fleet.recordings", {"site": site}, of="fleet")
+    if json:
+        print(msgspec.json.encode(found).decode())
+        return
+    grid = table_of("site", "recording", "files", "MB", "last written (UTC)", left=2)
+    for name, listed in found.items():
+        for each in listed:
+            when = civil_time(each["modified_s"] * US_PER_S)
+            grid.add_row(
+                name,
+                each["name"],
+                str(len(each["files"])),
+                f"{_size_of(each) / 1e6:.2f}",
+                "—" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+            )
+    console_of().print(grid)
+
+
+@recordings_group.command()
+def get(
+    site: Annotated[str, typer.Argument(help="The site.")],
+    name: Annotated[str, typer.Argument(help="Name of a recording, or last.")],
+    *,
+    to: Annotated[
+        Path | None, typer.Option("--to", help="Folder; by default one called as the site.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that differ.")] = False,
+) -> None:
+    """Fetch a recording of a site; what has come already is not fetched again."""
+    if not SITE_NAME.fullmatch(site):
+        refuse(f"site {site!r}: letters, digits, . _ and - only")
+    listed = ask("fleet.recordings", {"site": site}, of="fleet").get(site)
+    if listed is None:
+        refuse(f"site {site} does not answer for recordings; see `mavgate fleet status`")
+    recording = _find(listed, name)
+    if recording is None:
+        refuse(f"site {site} has no recording {name!r}; `mavgate fleet recordings` lists them")
+    socket = socket_of("fleet")
+    fetch = RecordingFetch(
+        site,
+        to or Path(site),
+        lambda verb, params, wait_s: request(socket, verb, params, timeout_s=wait_s),
+        force=force,
+    )
+    try:
+        _fetch_all(fetch, recording, to or Path(site))
+    except (FetchError, ControlError, OSError) as error:
+        refuse(str(error))
+
+
+def _fetch_all(fetch: RecordingFetch, recording: dict[str, Any], folder: Path) -> None:
+    console = console_of(stderr=True)
+    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    lines = []
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(recording["name"], total=_size_of(recording))
+        for file in recording["files"]:
+            is_new = fetch.fetch(
+                file["name"], file["size"], lambda count: progress.advance(task, count)
+            )
+            state = "fetched" if is_new else "was here already"
+            lines.append(f"{folder / file['name']} {state}")
+    for line in lines:
+        print(line)
+
+
+def _find(listed: list[dict[str, Any]], name: str) -> dict[str, Any] | None:
+    found = next((each for each in listed if each["name"] == name), None)
+    if found is None and name == NEWEST and listed:
+        return listed[-1]
+    return found
+
+
+def _size_of(recording: dict[str, Any]) -> int:
+    return sum(file["size"] for file in recording["files"])

@@ -44,6 +44,14 @@ def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> 
         refuse(str(error))
 
 
+def socket_of(of: str) -> Path:
+    """Return the socket of the gateway that is meant; end the command if there is none."""
+    try:
+        return _named.get() or find_socket(of)
+    except ControlError as error:
+        refuse(str(error))
+
+
 def is_running() -> bool:
     """Tell whether there is a gateway of this user to ask."""
     return _named.get() is not None or bool(live_sockets("run"))

@@ -40,6 +40,11 @@ def part_of(path: Path) -> int:
     return int(match["part"])
 
 
+def is_file_name(name: str) -> bool:
+    """Return whether a name is that of a recording's file, in the folder itself."""
+    return _FILE_NAME.fullmatch(name) is not None and not {"/", "\0"} & set(name)
+
+
 def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
     """Put the parts of a recording that follow one another together; all else stays alone."""
     found: list[list[Path]] = []

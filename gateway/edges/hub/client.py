@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 from gateway.edges.hub.express import ClientCounters, Express
@@ -142,6 +143,10 @@ class Client:
 
 class HubContext(Protocol):
     """What a transport asks of the hub."""
+
+    @property
+    def recordings(self) -> Path | None:
+        """Where the recordings are that a fleet may fetch, if there are any."""
 
     @property
     def settings(self) -> HubSettings:

@@ -5,6 +5,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 from gateway.edges.hub.client import Client
@@ -53,6 +54,8 @@ class Hub:
         Called with a short text when clients come into trouble or out of it.
     seal : callable, optional
         Numbers, and signs, each frame of ours that leaves; without it none is signed.
+    recordings : Path, optional
+        Where the recordings are that a fleet may fetch.
     """
 
     def __init__(
@@ -64,8 +67,10 @@ class Hub:
         on_gone: Callable[[int], None] | None = None,
         on_trouble: Callable[[str], None] | None = None,
         seal: Seal = restamp,
+        recordings: Path | None = None,
     ) -> None:
         self.settings = settings
+        self.recordings = recordings
         self.seal = seal
         self.now_us = now_us
         self._on_gone = on_gone

@@ -1,37 +1,20 @@
 """What Prometheus is told of the gateway: each family with what it means and what to do then."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Final
+from collections.abc import Callable, Iterator
+from typing import Final
 
-from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from prometheus_client.core import Metric
 
+from gateway.edges.operator.hub_metrics import Labels, counter, gauge, hub_families, text_of
 from gateway.geometry.quaternion import to_euler
 from gateway.records import GpsFix, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.routing.client_table import ClientStats, HubCounters
 from gateway.status import AircraftStatus, Snapshot
 from gateway.units import RAD_PER_DEG, US_PER_S
 
-CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
-
-Labels = tuple[str, ...]
-Sample = tuple[Labels, float]
-
 NODE: Final = ("vehicle", "node")
-CLIENT: Final = ("client", "name", "remote")
-LISTENER: Final = ("name", "endpoint")
 FRACTION: Final = 1e-6
 
-HUB_HELP: Final = {
-    "published": "MAVLink frames that the gateway made itself.",
-    "forwarded": "Frames of other systems, such as an autopilot, that were passed on.",
-    "duplicates": "Copies that came a second way and were dropped: two endpoints reach one peer.",
-    "looped": "Frames of ours that came back: an endpoint leads to a router that sends to us.",
-    "unroutable": "Frames for a system that nobody has heard of, or from one who may not ask.",
-    "unserved": "Requests given up since their client asks for more than its share.",
-}
 NODE_COUNTERS: Final = (
     ("received", "Radio payloads of a node that arrived."),
     ("lost", "Radio payloads of a node that never came: above some percent look at the antennas."),
@@ -102,20 +85,6 @@ FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
     ("satellites", "Satellites in use.", lambda f: float(f.satellites)),
     ("gps_accuracy_metres", "Horizontal accuracy, as the receiver tells it.", lambda f: f.h_acc_m),
 )
-CLIENT_COUNTERS: Final = (
-    ("sent", "Frames sent to a client."),
-    ("dropped", "Frames given up: the client is too slow for them, or out of reach."),
-    ("unheard", "Frames for a port at which nobody listened, as before a station is started."),
-    (
-        "bytes_sent",
-        "Bytes sent to a client; the rate against the width of its link tells its load.",
-    ),
-    ("received", "Frames of a client."),
-    (
-        "bytes_garbage",
-        "Bytes of a client that were no MAVLink: a wrong baud rate or another program.",
-    ),
-)
 
 
 def prometheus_text(snapshot: Snapshot) -> str:
@@ -131,17 +100,7 @@ def prometheus_text(snapshot: Snapshot) -> str:
     str
         One line a sample, with help and type before each family.
     """
-    return generate_latest(_Moment(snapshot)).decode()
-
-
-class _Moment(Collector):
-    """What was gathered of one moment, in place of a registry that counts by itself."""
-
-    def __init__(self, snapshot: Snapshot) -> None:
-        self._snapshot = snapshot
-
-    def collect(self) -> Iterator[Metric]:
-        return families(self._snapshot)
+    return text_of(families(snapshot))
 
 
 def families(snapshot: Snapshot) -> Iterator[Metric]:
@@ -162,50 +121,29 @@ def families(snapshot: Snapshot) -> Iterator[Metric]:
     yield from _boards(snapshot)
     yield from _vehicles(snapshot.states)
     yield from _receptions(snapshot.aircraft)
-    yield from _hub(snapshot.hub)
-    yield from _listeners(snapshot)
-    yield from _clients(snapshot.clients, snapshot.time_us)
-
-
-def _gauge(name: str, text: str, labels: Labels, samples: Iterable[Sample]) -> Metric:
-    family = GaugeMetricFamily(f"mavgate_{name}", text, labels=labels)
-    return _filled(family, samples)
-
-
-def _counter(name: str, text: str, labels: Labels, samples: Iterable[Sample]) -> Metric:
-    """Make a counter; its samples are called by its name and `_total`."""
-    family = CounterMetricFamily(f"mavgate_{name}", text, labels=labels)
-    return _filled(family, samples)
-
-
-def _filled(family: Any, samples: Iterable[Sample]) -> Metric:
-    for labels, value in samples:
-        if not math.isnan(value):
-            family.add_metric(labels, value)
-    filled: Metric = family
-    return filled
+    yield from hub_families(snapshot.hub, snapshot.listeners, snapshot.clients, snapshot.time_us)
 
 
 def _gateway(snapshot: Snapshot) -> Iterator[Metric]:
     report = snapshot.report
     up_s = snapshot.time_us / US_PER_S
-    yield _gauge("up_seconds", "Time since the gateway started.", (), [((), up_s)])
-    yield _gauge(
+    yield gauge("up_seconds", "Time since the gateway started.", (), [((), up_s)])
+    yield gauge(
         "receiver_connected",
         "1 while the receiver's port is open; 0: unplugged, or another program has it.",
         (),
         [((), float(report.connected))],
     )
-    yield _counter(
+    yield counter(
         "receiver_frames", "Frames that the receiver sent.", (), [((), float(report.frames))]
     )
-    yield _counter(
+    yield counter(
         "receiver_frames_lost",
         "Frames that were lost on the serial line: the computer is too busy, or the cable bad.",
         (),
         [((), float(report.frames_lost))],
     )
-    yield _counter(
+    yield counter(
         "receiver_faults",
         "Damage on the serial line by kind: a wrong baud rate, or a bad cable.",
         ("kind",),
@@ -231,24 +169,24 @@ def _refusals(snapshot: Snapshot) -> Iterator[Metric]:
             "Requests with a wrong, old or repeated signature: another passphrase, or an attack.",
         ),
     ):
-        yield _counter(name, text, (), [((), float(count))])
+        yield counter(name, text, (), [((), float(count))])
 
 
 def _nodes(nodes: tuple[NodeLink, ...], now_us: int) -> Iterator[Metric]:
     for field, text in NODE_COUNTERS:
         samples = [(_of(link.node), float(getattr(link, field))) for link in nodes]
-        yield _counter(f"node_{field}", text, NODE, samples)
+        yield counter(f"node_{field}", text, NODE, samples)
     rates = [(_of(link.node), link.rate_hz) for link in nodes]
-    yield _gauge("node_rate_hz", "Radio payloads of a node in the last second.", NODE, rates)
+    yield gauge("node_rate_hz", "Radio payloads of a node in the last second.", NODE, rates)
     silences = [(_of(link.node), (now_us - link.last_time_us) / US_PER_S) for link in nodes]
-    yield _gauge(
+    yield gauge(
         "node_silent_seconds",
         "Time since a node's newest payload: above a second it is off or out of reach.",
         NODE,
         silences,
     )
     skews = [(_of(link.node), link.clock_skew_ppm * FRACTION) for link in nodes]
-    yield _gauge(
+    yield gauge(
         "node_clock_skew_ratio",
         "How much faster than the gateway's a node's clock runs.",
         NODE,
@@ -260,15 +198,15 @@ def _boards(snapshot: Snapshot) -> Iterator[Metric]:
     """Yield what the nodes report of their own boards."""
     boards = [board for one in snapshot.aircraft for board in one.boards]
     for name, text, value_of in BOARD_GAUGES:
-        yield _gauge(f"node_{name}", text, NODE, [(_of(b.node), value_of(b)) for b in boards])
+        yield gauge(f"node_{name}", text, NODE, [(_of(b.node), value_of(b)) for b in boards])
     for field, text in BOARD_COUNTERS:
         samples = [(_of(board.node), float(getattr(board, field))) for board in boards]
-        yield _counter(f"node_{field}", text, NODE, samples)
+        yield counter(f"node_{field}", text, NODE, samples)
     versions = [((*_of(b.node), ".".join(map(str, b.firmware_version))), 1.0) for b in boards]
-    yield _gauge("node_info", "Firmware of a node.", (*NODE, "firmware"), versions)
+    yield gauge("node_info", "Firmware of a node.", (*NODE, "firmware"), versions)
     receiver = snapshot.report.receiver
     pipes = receiver.pipes if receiver is not None else ()
-    yield _counter(
+    yield counter(
         "receiver_overruns",
         "Payloads that the receiver had no room for: too many nodes, or a slow serial line.",
         ("pipe",),
@@ -280,20 +218,20 @@ def _receptions(aircraft: tuple[AircraftStatus, ...]) -> Iterator[Metric]:
     """Yield how well the aircraft's GPS receives, and how far home is."""
     for name, text, value_of in FIX_GAUGES:
         samples = [((str(one.vehicle_id),), value_of(one.fix)) for one in aircraft if one.fix]
-        yield _gauge(f"vehicle_{name}", text, ("vehicle",), samples)
+        yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
     ways = [
         ((str(one.vehicle_id),), one.home.distance_m)
         for one in aircraft
         if one.home is not None and one.home.distance_m is not None
     ]
-    yield _gauge("vehicle_home_distance_metres", "Way over ground to home.", ("vehicle",), ways)
+    yield gauge("vehicle_home_distance_metres", "Way over ground to home.", ("vehicle",), ways)
 
 
 def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
     for name, text, value_of in VEHICLE_GAUGES:
         samples = [((str(vehicle_id),), value_of(state)) for vehicle_id, state in states]
-        yield _gauge(f"vehicle_{name}", text, ("vehicle",), samples)
-    yield _gauge(
+        yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
+    yield gauge(
         "vehicle_valid",
         "1 where the estimate holds, by quantity.",
         ("vehicle", "quantity"),
@@ -303,7 +241,7 @@ def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
             for quantity, flag in VALID.items()
         ],
     )
-    yield _gauge(
+    yield gauge(
         "vehicle_trouble",
         "1 while GPS is rejected, or the magnetometer disturbed (iron or currents near it).",
         ("vehicle", "kind"),
@@ -314,72 +252,6 @@ def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
                 ("gps_rejected", NavFlags.GPS_REJECTED),
                 ("magnetometer_disturbed", NavFlags.MAG_DISTURBED),
             )
-        ],
-    )
-
-
-def _hub(hub: HubCounters) -> Iterator[Metric]:
-    for field, text in HUB_HELP.items():
-        yield _counter(f"hub_{field}", text, (), [((), float(getattr(hub, field)))])
-
-
-def _listeners(snapshot: Snapshot) -> Iterator[Metric]:
-    ports = [((port.name, port.endpoint), port) for port in snapshot.listeners]
-    yield _gauge(
-        "listener_open",
-        "1 while a listening port takes clients; 0: another program has it.",
-        LISTENER,
-        [(labels, float(port.state == "open")) for labels, port in ports],
-    )
-    yield _gauge(
-        "listener_clients",
-        "Clients of a listening port.",
-        LISTENER,
-        [(labels, float(port.clients)) for labels, port in ports],
-    )
-    yield _counter(
-        "listener_turned_away",
-        "Clients that found no room: see max_clients.",
-        LISTENER,
-        [(labels, float(port.turned_away)) for labels, port in ports],
-    )
-
-
-def _clients(clients: tuple[ClientStats, ...], now_us: int) -> Iterator[Metric]:
-    named = [((str(c.client_id), c.name, c.remote), c) for c in clients]
-    for field, text in CLIENT_COUNTERS:
-        samples = [(labels, float(getattr(client, field))) for labels, client in named]
-        yield _counter(f"client_{field}", text, CLIENT, samples)
-    yield _gauge(
-        "client_queued",
-        "Frames that wait for a client: it is slower than what it is sent.",
-        CLIENT,
-        [(labels, float(client.queued)) for labels, client in named],
-    )
-    yield _gauge(
-        "client_open",
-        "1 while frames reach the client as far as is known.",
-        CLIENT,
-        [(labels, float(client.state == "open")) for labels, client in named],
-    )
-    yield _gauge(
-        "client_round_trip_seconds",
-        "Time of the newest answer to PING or TIMESYNC.",
-        CLIENT,
-        [
-            (labels, client.round_trip_us / US_PER_S)
-            for labels, client in named
-            if client.round_trip_us is not None
-        ],
-    )
-    yield _gauge(
-        "client_silent_seconds",
-        "Time since the client's newest frame: ground stations send one a second.",
-        CLIENT,
-        [
-            (labels, (now_us - client.heard_us) / US_PER_S)
-            for labels, client in named
-            if client.heard_us is not None
         ],
     )
 

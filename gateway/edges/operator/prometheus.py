@@ -1,4 +1,4 @@
-"""Prometheus text of the daemon's state, on a loopback port."""
+"""Prometheus text of a gateway's state, on a loopback port."""
 
 import asyncio
 import logging
@@ -8,13 +8,13 @@ from typing import Final
 
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ListenerStats
-from gateway.status import Snapshot
 
 log = logging.getLogger(__name__)
 
 REQUEST_LIMIT_S: Final = 5.0
 MAX_REQUEST_BYTES: Final = 8192
 MAX_CONNECTIONS: Final = 8
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 RETRY_S: Final = 5.0
 """Between attempts to bind a port that is taken: whoever scrapes it asks about as often."""
 
@@ -24,12 +24,12 @@ class MetricsServer:
 
     Parameters
     ----------
-    snapshot : callable
-        Describes the daemon now.
+    text : callable
+        Describes the gateway now, as `metric_families.text_of` writes it.
     """
 
-    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
-        self._snapshot = snapshot
+    def __init__(self, text: Callable[[], str]) -> None:
+        self._text = text
         self._wanted = 0
         self._reason = ""
         self._socket: socket.socket | None = None
@@ -126,10 +126,7 @@ class MetricsServer:
         words = request.split()
         if words[:1] != [b"GET"]:
             return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
-        # Not above: most gateways serve no metrics, and need not wait for the library.
-        from gateway.edges.operator.metric_families import CONTENT_TYPE, prometheus_text
-
-        body = prometheus_text(self._snapshot()).encode()
+        body = self._text().encode()
         head = (
             f"HTTP/1.1 200 OK\r\nContent-Type: {CONTENT_TYPE}\r\n"
             f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"

@@ -3,6 +3,7 @@
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
@@ -99,9 +100,16 @@ class Rig:
         self.vehicle = Sender(1, 1)
         self.closing: list[Callable[[], object]] = []
 
-    def hub(self, *endpoints: str, seal: Seal = restamp, **settings: object) -> Hub:
+    def hub(
+        self,
+        *endpoints: str,
+        seal: Seal = restamp,
+        recordings: Path | None = None,
+        **settings: object,
+    ) -> Hub:
         wanted = HubSettings(endpoints=endpoints, **settings)  # type: ignore[arg-type]
-        hub = Hub(wanted, self.incoming.append, self.clock, self.foreign.append, seal=seal)
+        taps = (self.incoming.append, self.clock, self.foreign.append)
+        hub = Hub(wanted, *taps, seal=seal, recordings=recordings)
         self.closing.append(hub.close)
         hub.start()
         return hub

@@ -175,6 +175,19 @@ class TestSite:
         await until(rig, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
         assert not far.messages(27)
 
+    async def test_a_burst_arrives_whole_and_in_order(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        """Telemetry gives way on a congested link, never on an idle one."""
+        hub = await open_site(rig, router)
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        burst = [rig.vehicle.raw_imu() for _ in range(200)]
+        for frame in burst:
+            hub.send(rig.out(frame))
+        await until(rig, hub, lambda: far.messages(27)[-1:] == burst[-1:])
+        assert far.messages(27) == burst
+
     async def test_untrusted(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
         hub = await open_site(rig, router, "site=field&trusted=no")
         far = visit()

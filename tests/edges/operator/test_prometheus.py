@@ -148,7 +148,7 @@ class TestServer:
         return answer
 
     async def test_serves_and_refuses(self) -> None:
-        server = MetricsServer(lambda: SNAPSHOT)
+        server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         server.listen(_free_port())
         answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
         head, _, body = answer.partition(b"\r\n\r\n")
@@ -164,12 +164,12 @@ class TestServer:
             await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
 
     async def test_zero_serves_none(self) -> None:
-        server = MetricsServer(lambda: SNAPSHOT)
+        server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         server.listen(0)
         assert (server.port, server.listeners()) == (0, ())
 
     async def test_idle_connections_are_no_more_than_a_few(self) -> None:
-        server = MetricsServer(lambda: SNAPSHOT)
+        server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         server.listen(_free_port())
         idle = [
             await asyncio.open_connection("127.0.0.1", server.port)
@@ -194,7 +194,7 @@ class TestServer:
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(prometheus, "RETRY_S", 0.0)
-        server = MetricsServer(lambda: SNAPSHOT)
+        server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         with socket.create_server(("127.0.0.1", 0)) as taken:
             port = taken.getsockname()[1]
             server.listen(port)

@@ -5,6 +5,8 @@
 | `mavlink/SITE/SYSTEM/out`    | frames of a system of the site                              |
 | `mavlink/SITE/SYSTEM/in`     | frames for a system of the site; `0` is for all             |
 | `mavlink/SITE/site/SESSION`  | a token that lives as long as the site's session does       |
+| `mavlink/SITE/ping`          | the site answers queries at once                            |
+| `mavlink/SITE/recordings`    | the site answers queries for its recordings                 |
 | `mavlink_raw/out`, `…/in`    | the same without sites, as mavlink-server has it            |
 """
 
@@ -29,7 +31,17 @@ def presence_key(site: str, session: object) -> str:
     return f"{ROOT}/{site}/site/{session}"
 
 
+def ping_key(site: str) -> str:
+    """Return where a site answers at once, so that the round trip can be measured."""
+    return f"{ROOT}/{site}/ping"
+
+
+def recordings_key(site: str) -> str:
+    """Return where a site answers for its recordings."""
+    return f"{ROOT}/{site}/recordings"
+
+
 def site_of(key: str) -> str:
     """Return the site that a key belongs to; empty if it is none of ours."""
     parts = key.split("/")
-    return parts[1] if len(parts) == 4 and parts[0] == ROOT else ""
+    return parts[1] if len(parts) in (3, 4) and parts[0] == ROOT else ""

@@ -9,7 +9,16 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from gateway.edges.hub.client import Client
-from gateway.edges.hub.fleet_link.site_keys import ALL_SYSTEMS, in_key, out_key, presence_key
+from gateway.edges.hub.fleet_link.query_answers import QueryAnswers
+from gateway.edges.hub.fleet_link.recording_answers import RecordingAnswers
+from gateway.edges.hub.fleet_link.site_keys import (
+    ALL_SYSTEMS,
+    in_key,
+    out_key,
+    ping_key,
+    presence_key,
+    recordings_key,
+)
 from gateway.edges.hub.fleet_link.zenoh_session import (
     HOW_TO_ADD,
     PATIENT_IDS,
@@ -147,7 +156,11 @@ class ZenohClient(Client):
                 lambda sample: presence.put((sample.kind == here, str(sample.key_expr))),
                 history=True,
             ),
+            QueryAnswers(session, ping_key(site), lambda _: b""),
         ]
+        if self.trusted and self.context.recordings is not None:
+            answers = RecordingAnswers(self.context.recordings)
+            self._declared.append(QueryAnswers(session, recordings_key(site), answers))
 
     def _take(self, data: bytes) -> None:
         self.receive(split_datagram(data), len(data), self.context.now_us())

@@ -3,6 +3,10 @@
 Zenoh calls back on a thread of its own: what comes is put aside there and taken by the loop, a
 bounded number at a time. What may be dropped is published by the loop itself, for Zenoh then never
 waits. What may not be is published by a thread, since Zenoh waits while a link is congested.
+
+Nothing is published as `express`: that gives every message a batch of its own, and a link has only
+a few batches, so that a burst of some frames would be dropped by a link that is idle. Messages that
+share batches leave as soon as the link is free, so that nothing is held back for it.
 """
 
 import asyncio
@@ -29,6 +33,8 @@ AT_ONCE: Final = 64
 """Taken in one turn of the loop, so that a flood cannot starve the others."""
 MAX_PATIENT: Final = 1024
 """What waits for a congested link and must not be lost: a whole parameter list."""
+BATCHES: Final = 4
+"""Of 64 KiB that may wait on a link: two thousand frames at once, and not much memory a site."""
 PATIENT_IDS: Final = BULK_IDS | {75, 76, 77, 253}
 """Parameters, missions, files, commands, their answers, texts: none of them comes again."""
 
@@ -65,6 +71,7 @@ def session_config(place: str, file: str, mode: str = "client") -> "zenoh.Config
             # Only where it was told to: no site joins a stranger's network by itself.
             config.insert_json5("scouting/multicast/enabled", "false")
             config.insert_json5("scouting/gossip/enabled", "false")
+            config.insert_json5("transport/link/tx/queue/size/data", str(BATCHES))
         config.insert_json5("mode", f'"{mode}"')
         config.insert_json5(f"{listens}/endpoints", f'["{place}"]')
         drop = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
@@ -218,7 +225,6 @@ class Outlets:
             key,
             congestion_control=control.BLOCK if patient else control.DROP,
             priority=priority.INTERACTIVE_HIGH if patient else priority.DATA,
-            express=True,
         )
         self._publishers[key, patient] = publisher
         return publisher

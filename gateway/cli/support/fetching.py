@@ -1,0 +1,196 @@
+"""Files of a site's recordings, fetched in pieces through a fleet that runs.
+
+What has come is beside the target as `.NAME.part` until all of it has come and its SHA-256 is that
+of the site's file: nothing incomplete ever looks whole. What is there already is gone on with, if
+it is the beginning of the site's file.
+"""
+
+import base64
+import fcntl
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from gateway.edges.disk.recordings import is_file_name
+from gateway.output import sync_folder
+
+SMALLEST: Final = 4 << 10
+LARGEST: Final = 128 << 10
+"""The most that a site answers at once."""
+FAST_S: Final = 0.05
+SLOW_S: Final = 0.2
+RETRY_S: Final = 1.0
+PATIENCE_S: Final = 60.0
+"""How long a site that has gone is waited for."""
+DIGEST_WAIT_S: Final = 330.0
+PIECE_WAIT_S: Final = 20.0
+READ_SIZE: Final = 1 << 20
+
+Ask = Callable[[str, dict[str, Any], float], Any]
+"""Asks a fleet: the verb, its parameters, the longest wait in seconds."""
+
+
+class FetchError(Exception):
+    """A file that cannot be fetched; the text says why, and what to do."""
+
+
+class PiecePace:
+    """How much to ask for at once: what takes about a tenth of a second.
+
+    Telemetry that comes while a piece is on a narrow link waits behind it, so pieces are small
+    there; where they come at once they grow.
+    """
+
+    def __init__(self) -> None:
+        self.size = SMALLEST
+
+    def note(self, took_s: float) -> None:
+        """Note how long a piece of this size took."""
+        if took_s < FAST_S:
+            self.size = min(self.size * 2, LARGEST)
+        elif took_s > SLOW_S:
+            self.size = max(self.size // 2, SMALLEST)
+
+
+class RecordingFetch:
+    """Fetch files of one site into a folder.
+
+    Parameters
+    ----------
+    site : str
+        Its name.
+    folder : Path
+        Where to; made if it is not there.
+    ask : callable
+        See `Ask`; raises `ControlError` for what is refused.
+    force : bool
+        Replace files that differ.
+    wait : callable
+        Waits some seconds.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        folder: Path,
+        ask: Ask,
+        *,
+        force: bool = False,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._site = site
+        self._folder = folder
+        self._ask = ask
+        self._force = force
+        self._wait = wait
+        self._pace = PiecePace()
+
+    def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
+        """Fetch one file, or the rest of it.
+
+        Parameters
+        ----------
+        name : str
+            As the site lists it.
+        size : int
+            As the site lists it; what has been written since is left for the next time.
+        advance : callable
+            Called with the bytes that are there more.
+
+        Returns
+        -------
+        bool
+            Whether anything had to be fetched.
+
+        Raises
+        ------
+        FetchError
+            If it cannot be fetched.
+        OSError
+            What the disk does not like.
+        """
+        if not is_file_name(name):
+            raise FetchError(f"the site lists {name!r}, which is no file of a recording")
+        target, part = self._folder / name, self._folder / f".{name}.part"
+        if target.exists():
+            if self._is_same(target, size, name):
+                advance(size)
+                return False
+            if not self._force:
+                raise FetchError(f"{target} is there and differs; --force fetches it anew")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with part.open("a+b") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise FetchError(f"{target} is being fetched by another program") from error
+            self._fill(file, name, size, advance)
+            file.flush()
+            os.fsync(file.fileno())
+            part.replace(target)
+        sync_folder(self._folder)
+        return True
+
+    def _is_same(self, target: Path, size: int, name: str) -> bool:
+        if target.stat().st_size != size:
+            return False
+        with target.open("rb") as file:
+            return self._digest(name, size) == _digest_of(file).hexdigest()
+
+    def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
+        """Fetch until the file is whole and is the site's."""
+        digest = _digest_of(file)
+        have = file.seek(0, os.SEEK_END)
+        if have and (have > size or digest.hexdigest() != self._digest(name, have)):
+            file.truncate(0)
+            digest, have = hashlib.sha256(), 0
+        advance(have)
+        while have < size:
+            piece = self._piece(name, have, min(self._pace.size, size - have))
+            if not piece:
+                raise FetchError(f"{name} has become shorter at the site; fetch it again")
+            file.write(piece)
+            digest.update(piece)
+            have += len(piece)
+            advance(len(piece))
+        if digest.hexdigest() != self._digest(name, size):
+            file.truncate(0)
+            raise FetchError(f"{name} has changed at the site meanwhile; fetch it again")
+
+    def _piece(self, name: str, offset: int, size: int) -> bytes:
+        params = {"file": name, "offset": offset, "size": size}
+        begin_s = time.monotonic()
+        data = base64.b64decode(self._persist("fleet.piece", params, "data", PIECE_WAIT_S))
+        took_s = time.monotonic() - begin_s
+        self._pace.note(took_s)
+        # The other half of the time is the telemetry's.
+        self._wait(min(took_s, SLOW_S))
+        return data
+
+    def _digest(self, name: str, size: int) -> str:
+        params = {"file": name, "size": size}
+        return self._persist("fleet.digest", params, "sha256", DIGEST_WAIT_S)
+
+    def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
+        """Ask until there is an answer: links break, and come again."""
+        end_s = time.monotonic() + PATIENCE_S
+        while True:
+            answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]
+            if answer is not None:
+                return answer
+            if time.monotonic() > end_s:
+                raise FetchError(
+                    f"site {self._site} does not answer; the same command goes on from here"
+                )
+            self._wait(RETRY_S)
+
+
+def _digest_of(file: BinaryIO) -> "hashlib._Hash":
+    digest = hashlib.sha256()
+    file.seek(0)
+    while piece := file.read(READ_SIZE):
+        digest.update(piece)
+    return digest

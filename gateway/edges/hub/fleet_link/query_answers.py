@@ -1,0 +1,59 @@
+"""Answers the queries on one key, on a thread of its own: the event loop never waits for it."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+MAX_QUERIES: Final = 64
+"""That wait for their answer; then the oldest gets none."""
+
+
+class RefusedQueryError(Exception):
+    """A query that cannot be answered; the text says why."""
+
+
+class QueryAnswers:
+    """Answer queries one after another.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        An open session.
+    key : str
+        Where it is asked.
+    answer : callable
+        Turns a query's payload into the answer's; raises RefusedQueryError. Called on the thread.
+    """
+
+    def __init__(
+        self, session: "zenoh.Session", key: str, answer: Callable[[bytes], bytes]
+    ) -> None:
+        import zenoh
+
+        self._key = key
+        self._answer = answer
+        self._failure = zenoh.ZError
+        waiting: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_QUERIES)
+        self._queryable: Any = session.declare_queryable(key, waiting)
+        threading.Thread(target=self._serve, name=key, daemon=True).start()
+
+    def undeclare(self) -> None:
+        """Answer no more, and let the thread end."""
+        self._queryable.undeclare()
+
+    def _serve(self) -> None:
+        for query in self._queryable:
+            with query:
+                asked = b"" if query.payload is None else query.payload.to_bytes()
+                try:
+                    query.reply(self._key, self._answer(asked))
+                except RefusedQueryError as error:
+                    query.reply_err(str(error).encode())
+                except self._failure as error:
+                    log.debug("not answered: %s", error)

@@ -1,0 +1,250 @@
+"""The Zenoh session of a fleet: opened until it works, declared, asked, and ended."""
+
+import asyncio
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from gateway.edges.hub.fleet_link.site_keys import out_key, ping_key, presence_key, site_of
+from gateway.edges.hub.fleet_link.zenoh_session import (
+    Inlet,
+    Outlets,
+    end_session,
+    open_session,
+    session_config,
+)
+from gateway.fleet.fleet_settings import FleetSettings
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+PATTERN: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}")
+PING_TIMEOUT_S: Final = 5.0
+"""An answer that takes longer tells nothing of the link."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionEvents:
+    """What is called on the loop."""
+
+    frames: Callable[[str, bytes], None]
+    """With a site and what it has published."""
+    presence: Callable[[str, str, bool], None]
+    """With a site, one of its sessions, and whether that has come or gone."""
+    round_trip: Callable[[str, int], None]
+    """With a site and the microseconds until it had answered."""
+
+
+class NoAnswerError(Exception):
+    """Nobody answered a query: the site, or the router, is not there."""
+
+
+class QueryRefusedError(Exception):
+    """A site refused a query; the text says why."""
+
+
+class FleetSession:
+    """A session that subscribes to sites.
+
+    Parameters
+    ----------
+    settings : FleetSettings
+        Which sites, the router, and Zenoh's own file.
+    events : SessionEvents
+        Who takes what comes.
+    now_us : callable
+        The gateway clock.
+
+    Raises
+    ------
+    ValueError
+        If a pattern, Zenoh's file or the place is wrong.
+    ModuleNotFoundError
+        If Zenoh is not installed.
+    """
+
+    def __init__(
+        self,
+        settings: FleetSettings,
+        events: SessionEvents,
+        now_us: Callable[[], int],
+    ) -> None:
+        self.is_router = not settings.router
+        self.place = settings.router or settings.listen
+        mode = "router" if self.is_router else "client"
+        self._config = session_config(self.place, settings.zenoh_config, mode)
+        self.patterns = [key_pattern(site) for site in settings.sites]
+        self._events = events
+        self._now_us = now_us
+        self._session: zenoh.Session | None = None
+        self.outlets: Outlets | None = None
+        self._inlets: list[Inlet[Any]] = []
+        self._declared: list[object] = []
+        self._trouble = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a session, with a router or without."""
+        return self._session is not None
+
+    @property
+    def is_linked(self) -> bool:
+        """Whether sites can be reached."""
+        session = self._session
+        return session is not None and (self.is_router or bool(session.info.routers_zid()))
+
+    @property
+    def overflowed(self) -> int:
+        """Messages that came faster than they could be taken."""
+        return sum(inlet.dropped for inlet in self._inlets)
+
+    async def open(self) -> None:
+        """Open the session if it is not open, and declare what is wanted; trouble is told once."""
+        if self._session is not None:
+            return
+        try:
+            session = await asyncio.to_thread(open_session, self._config)
+        except OSError as error:
+            if str(error) != self._trouble:
+                self._trouble = str(error)
+                log.warning("%s: %s; trying again until it works", self.place, error)
+            return
+        self._trouble = ""
+        self._session, self.outlets = session, Outlets(session)
+        self._declare(session)
+
+    async def close(self) -> None:
+        """End the session."""
+        for inlet in self._inlets:
+            inlet.close()
+        if self.outlets is not None:
+            self._declared += self.outlets.close()
+            self.outlets = None
+        if self._session is not None:
+            session, self._session = self._session, None
+            await asyncio.to_thread(end_session, session, self._declared)
+
+    def ask_round_trips(self) -> None:
+        """Ask every site to answer at once; one query does for all that a pattern matches."""
+        import zenoh
+
+        if self._session is None or not self.is_linked:
+            return
+        asked_us, inlet = self._now_us(), self._inlets[-1]
+
+        def note(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                inlet.put((site_of(str(reply.ok.key_expr)), self._now_us() - asked_us))
+
+        for pattern in self.patterns:
+            self._session.get(
+                ping_key(pattern),
+                note,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                timeout=PING_TIMEOUT_S,
+            )
+
+    async def query(self, key: str, payload: bytes, timeout_s: float) -> dict[str, bytes]:
+        """Ask the sites of a key, so that no telemetry waits for question or answer.
+
+        Parameters
+        ----------
+        key : str
+            Of one site or, with a pattern, of several.
+        payload : bytes
+            The question.
+        timeout_s : float
+            Longest wait.
+
+        Returns
+        -------
+        dict of str to bytes
+            The first answer of each site.
+
+        Raises
+        ------
+        NoAnswerError
+            If there is none.
+        QueryRefusedError
+            If the only answers are refusals.
+        """
+        if self._session is None:
+            raise NoAnswerError(f"{self.place}: no session")
+        return await asyncio.to_thread(_query, self._session, key, payload, timeout_s)
+
+    def _declare(self, session: "zenoh.Session") -> None:
+        import zenoh
+
+        events = self._events
+        frames: Inlet[tuple[str, bytes]] = Inlet(
+            lambda sample: events.frames(site_of(sample[0]), sample[1])
+        )
+        presence: Inlet[tuple[str, bool]] = Inlet(self._note_token)
+        trips: Inlet[tuple[str, int]] = Inlet(lambda item: events.round_trip(*item))
+        self._inlets = [frames, presence, trips]
+        here = zenoh.SampleKind.PUT
+        for pattern in self.patterns:
+            self._declared += [
+                session.declare_subscriber(
+                    out_key(pattern, "*"),
+                    lambda sample: frames.put((str(sample.key_expr), sample.payload.to_bytes())),
+                ),
+                session.liveliness().declare_subscriber(
+                    presence_key(pattern, "*"),
+                    lambda sample: presence.put((str(sample.key_expr), sample.kind == here)),
+                    history=True,
+                ),
+            ]
+
+    def _note_token(self, news: tuple[str, bool]) -> None:
+        key, is_here = news
+        self._events.presence(site_of(key), key.rpartition("/")[2], is_here)
+
+
+def key_pattern(site: str) -> str:
+    """Return a pattern of sites as Zenoh writes it in one part of a key.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    if not PATTERN.fullmatch(site) or "**" in site:
+        raise ValueError(f"site {site!r}: letters, digits, . _ - and single * only")
+    return site if site == "*" else site.replace("*", "$*")
+
+
+def _query(
+    session: "zenoh.Session", key: str, payload: bytes, timeout_s: float
+) -> dict[str, bytes]:
+    import zenoh
+
+    found: dict[str, bytes] = {}
+    refusal = ""
+    try:
+        for reply in session.get(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=zenoh.Priority.BACKGROUND,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            timeout=timeout_s,
+            payload=payload,
+        ):
+            if reply.ok is not None:
+                found.setdefault(site_of(str(reply.ok.key_expr)), reply.ok.payload.to_bytes())
+            elif reply.err is not None:
+                refusal = reply.err.payload.to_bytes().decode(errors="replace")
+    except zenoh.ZError as error:
+        raise NoAnswerError(str(error)) from error
+    if found:
+        return found
+    if refusal and refusal != "Timeout":
+        raise QueryRefusedError(refusal)
+    raise NoAnswerError("no answer")

@@ -1,0 +1,104 @@
+"""A fleet that is a router, sites behind it with real sessions, and one ground station."""
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.fleet.fleet_server import FleetServer
+from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
+from gateway.routing.hub_settings import HubSettings
+from tests.edges.hub.conftest import Rig, Sender, Station, rig
+
+__all__ = ["rig"]
+
+
+class World:
+    """A fleet that is a router, sites of one aircraft 1 each, and one ground station."""
+
+    def __init__(self, rig: Rig, fleet: FleetServer, place: str, station: Station) -> None:
+        self.rig = rig
+        self.fleet = fleet
+        self.place = place
+        self.station = station
+        self.sites: dict[str, Any] = {}
+        self.heard: dict[str, list[Any]] = {}
+        self.vehicles: dict[str, Sender] = {}
+        self.got: list[Any] = []
+
+    def open_site(self, name: str, options: str = "", recordings: Path | None = None) -> Any:
+        incoming: list[Any] = []
+        rig = Rig()
+        rig.clock = self.rig.clock
+        rig.incoming = incoming
+        hub = rig.hub(f"zenoh:{self.place}?site={name}{options}", recordings=recordings)
+        self.rig.closing += rig.closing
+        self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
+        return hub
+
+    def say(self) -> None:
+        """Let every vehicle and the station speak, and take what the station gets."""
+        for name, hub in self.sites.items():
+            if hub._timer is not None:
+                self.rig.tick(hub)
+                hub.send(self.rig.out(self.vehicles[name].heartbeat()))
+                hub.send(self.rig.out(self.vehicles[name].attitude()))
+        self.station.say(self.station.sender.heartbeat())
+        reader = mavlink.MAVLink(None)
+        while True:
+            try:
+                data = self.station.socket.recv(65536)
+            except BlockingIOError:
+                return
+            self.got += reader.parse_buffer(data) or []
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(30):
+            while not condition():
+                self.rig.clock.us += 100_000
+                self.say()
+                await asyncio.sleep(0.01)
+
+    def systems(self) -> set[int]:
+        return {m.get_srcSystem() for m in self.got if m.get_type() == "ATTITUDE"}
+
+    def commands(self, name: str) -> list[Any]:
+        link = mavlink.MAVLink(None)
+        found = [link.decode(bytearray(each.frame)) for each in self.heard[name]]
+        return [message for message in found if message.get_type() == "COMMAND_LONG"]
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    with socket.socket() as place:
+        place.bind(("127.0.0.1", 0))
+        port = place.getsockname()[1]
+    return FleetSettings(
+        listen=f"tcp/127.0.0.1:{port}",
+        sites=("field-*",),
+        ids_file=str(tmp_path / "fleet.json"),
+        site=(SiteSettings(name="field-s", passphrase="secret"),),
+    )
+
+
+@pytest.fixture
+async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
+    fleet = FleetServer(settings, HubSettings(endpoints=("udp-listen:127.0.0.1:0",)))
+    await fleet.start()
+    station = rig.station(fleet._hub.listening_ports()[0])
+    world = World(rig, fleet, settings.listen, station)
+    async with asyncio.timeout(20):
+        while not fleet._session.is_open:
+            await asyncio.sleep(0.01)
+    yield world
+    await fleet.close()
+    for close in rig.closing:
+        close()
+    rig.closing.clear()
+    await asyncio.sleep(0.1)

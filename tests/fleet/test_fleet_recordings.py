@@ -1,0 +1,247 @@
+"""Recordings of a site listed and fetched over real sessions, with breaks, and what is refused."""
+
+import asyncio
+import base64
+import hashlib
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.support import fetching
+from gateway.cli.support.fetching import FetchError, PiecePace, RecordingFetch
+from gateway.edges.hub.fleet_link.query_answers import RefusedQueryError
+from gateway.edges.hub.fleet_link.recording_answers import MAX_PIECE, RecordingAnswers
+from gateway.edges.operator.control_socket import ControlError, request
+from tests.fleet.conftest import World
+
+pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+
+NAME, SIZE = "flight_01.tlog", 300_000
+CONTENT = np.random.default_rng(1).bytes(SIZE)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A site's recordings, and a secret beside them."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    (folder / NAME).write_bytes(CONTENT)
+    (folder / "flight_01_v1.csv").write_text("time_us\n1\n")
+    (tmp_path / "secret_01.tlog").write_text("secret")
+    (folder / "link_01.tlog").symlink_to(tmp_path / "secret_01.tlog")
+    (folder / "notes.txt").write_text("private")
+    return folder
+
+
+def over(world: World) -> Callable[[str, dict[str, Any], float], Any]:
+    """Ask as the command does."""
+    path = world.fleet.control_socket
+    return lambda verb, params, wait_s: request(path, verb, params, timeout_s=wait_s)
+
+
+async def opened(world: World, folder: Path) -> None:
+    world.open_site("field-a", recordings=folder)
+    await world.until(lambda: bool(world.systems()))
+
+
+async def spoken_for(world: World, work: "asyncio.Task[Any]") -> Any:
+    """Let all go on while somebody works in a thread."""
+    await world.until(work.done)
+    return work.result()
+
+
+class TestOverTheSession:
+    async def test_list_and_get(self, world: World, folder: Path, tmp_path: Path) -> None:
+        await opened(world, folder)
+        runner = CliRunner()
+
+        async def run(*words: str) -> Any:
+            task = asyncio.create_task(asyncio.to_thread(runner.invoke, app, list(words)))
+            return await spoken_for(world, task)
+
+        listed = await run("fleet", "recordings", "--json")
+        assert {each["name"] for each in json.loads(listed.output)["field-a"]} == {"flight", "link"}
+        shown = await run("fleet", "recordings", "--site", "field-*")
+        assert "flight" in shown.output
+        to = tmp_path / "fetched"
+        words = ("fleet", "recordings", "get", "field-a", "flight", "--to", str(to))
+        assert (await run(*words)).exit_code == 0
+        assert (to / NAME).read_bytes() == CONTENT
+        assert sorted(path.name for path in to.iterdir()) == [NAME, "flight_01_v1.csv"]
+        assert f"{NAME} was here already" in (await run(*words)).output
+        (to / NAME).write_bytes(b"other")
+        refused = await run(*words)
+        assert refused.exit_code == 2
+        assert "--force" in refused.output
+        assert (await run(*words, "--force")).exit_code == 0
+        assert (to / NAME).read_bytes() == CONTENT
+        none = await run("fleet", "recordings", "get", "field-b", "flight")
+        assert (none.exit_code, "does not answer" in none.output) == (2, True)
+
+    async def test_the_site_goes_in_the_middle_and_comes_back(
+        self, world: World, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(fetching, "LARGEST", fetching.SMALLEST)
+        await opened(world, folder)
+        ask, asked = over(world), []
+        gone, retried = threading.Event(), threading.Event()
+
+        def noting(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+            asked.append((verb, params.get("offset")))
+            if len(asked) == 20:
+                assert gone.wait(30)
+            return ask(verb, params, wait_s)
+
+        def wait(seconds: float) -> None:
+            if seconds == fetching.RETRY_S:
+                retried.set()
+                back.wait(0.05)
+
+        back = threading.Event()
+        to = tmp_path / "fetched"
+        fetch = RecordingFetch("field-a", to, noting, wait=wait)
+        task = asyncio.create_task(asyncio.to_thread(fetch.fetch, NAME, SIZE, lambda _: None))
+        await world.until(lambda: len(asked) == 20)
+        world.sites.pop("field-a").close()
+        await world.until(lambda: not world.fleet.status()["sites"][0]["is_here"])
+        gone.set()
+        await world.until(retried.is_set)
+        assert [path.name for path in to.iterdir()] == [f".{NAME}.part"], "nothing looks whole"
+        world.open_site("field-a", recordings=folder)
+        assert await spoken_for(world, task) is True
+        assert (to / NAME).read_bytes() == CONTENT
+        offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
+        assert sorted(set(offsets)) == [*range(0, SIZE, fetching.SMALLEST)], "none from the start"
+
+    async def test_a_stopped_fetch_goes_on_where_it_was(
+        self, world: World, folder: Path, tmp_path: Path
+    ) -> None:
+        await opened(world, folder)
+        asked: list[int] = []
+        ask = over(world)
+
+        def noting(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+            asked.append(params.get("offset", -1))
+            if len(asked) == 5:
+                raise ControlError("stopped")
+            return ask(verb, params, wait_s)
+
+        async def fetch() -> Any:
+            one = RecordingFetch("field-a", tmp_path / "fetched", noting)
+            work = asyncio.to_thread(one.fetch, NAME, SIZE, lambda _: None)
+            return await spoken_for(world, asyncio.create_task(work))
+
+        with pytest.raises(ControlError):
+            await fetch()
+        have = (tmp_path / "fetched" / f".{NAME}.part").stat().st_size
+        assert 0 < have < SIZE
+        del asked[:]
+        asked += [-1] * 5
+        assert await fetch() is True
+        assert min(offset for offset in asked if offset >= 0) == have
+        assert (tmp_path / "fetched" / NAME).read_bytes() == CONTENT
+
+    async def test_who_is_not_trusted_gets_none(self, world: World, folder: Path) -> None:
+        world.open_site("field-a", "&trusted=no", recordings=folder)
+        await world.until(lambda: bool(world.systems()))
+        work = asyncio.to_thread(over(world), "fleet.recordings", {"site": "field-a"}, 20.0)
+        assert await spoken_for(world, asyncio.create_task(work)) == {}
+
+
+class TestAnswers:
+    @pytest.mark.parametrize(
+        "file", ["../secret_01.tlog", "notes.txt", "link_01.tlog", "/etc/passwd", "a\0_01.tlog"]
+    )
+    def test_names_that_leave_the_folder(self, folder: Path, file: str) -> None:
+        asked = json.dumps({"file": file, "size": 10}).encode()
+        with pytest.raises(RefusedQueryError):
+            RecordingAnswers(folder)(asked)
+
+    @pytest.mark.parametrize(
+        "asked",
+        [
+            b"garbage",
+            b'{"file": 1}',
+            b'{"file": "flight_01.tlog", "size": 0}',
+            b'{"file": "flight_01.tlog", "size": 1e99}',
+            b'{"file": "flight_01.tlog", "size": 1, "offset": -1}',
+            b'{"file": "flight_01.tlog", "size": 1, "offset": 9223372036854775807}',
+            json.dumps({"file": NAME, "size": MAX_PIECE + 1}).encode(),
+        ],
+    )
+    def test_what_is_no_query(self, folder: Path, asked: bytes) -> None:
+        with pytest.raises(RefusedQueryError):
+            RecordingAnswers(folder)(asked)
+
+    def test_pieces_and_digests(self, folder: Path) -> None:
+        answer = RecordingAnswers(folder)
+
+        def ask(**fields: object) -> bytes:
+            return answer(json.dumps({"file": NAME, **fields}).encode())
+
+        assert ask(offset=SIZE - 3, size=10) == CONTENT[-3:]
+        assert ask(offset=SIZE, size=10) == b""
+        whole = hashlib.sha256(CONTENT[:1000]).hexdigest().encode()
+        assert ask(size=1000, digest=True) == whole
+
+
+class TestFetch:
+    """Without a network: what the other end may do."""
+
+    def fetch(self, folder: Path, content: bytes, digest: str, size: int = 10_000) -> bool:
+        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+            if verb == "fleet.digest":
+                return {"sha256": digest}
+            begin = params["offset"]
+            return {"data": base64.b64encode(content[begin : begin + params["size"]]).decode()}
+
+        one = RecordingFetch("site", folder, ask, wait=lambda _: None)
+        return one.fetch(NAME, size, lambda _: None)
+
+    def test_what_changed_meanwhile_is_not_kept(self, tmp_path: Path) -> None:
+        with pytest.raises(FetchError, match="changed"):
+            self.fetch(tmp_path, CONTENT, "0" * 64)
+        assert not (tmp_path / NAME).exists()
+        good = hashlib.sha256(CONTENT[:10_000]).hexdigest()
+        assert self.fetch(tmp_path, CONTENT, good)
+        assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
+
+    def test_another_file_under_the_name_is_begun_anew(self, tmp_path: Path) -> None:
+        (tmp_path / f".{NAME}.part").write_bytes(b"x" * 5000)
+        assert self.fetch(tmp_path, CONTENT, hashlib.sha256(CONTENT[:10_000]).hexdigest())
+        assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
+
+    def test_a_file_that_became_shorter(self, tmp_path: Path) -> None:
+        with pytest.raises(FetchError, match="shorter"):
+            self.fetch(tmp_path, CONTENT[:100], "", size=10_000)
+
+    def test_a_site_that_never_answers(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(fetching, "PATIENCE_S", -1.0)
+        one = RecordingFetch("site", tmp_path, lambda *_: {"data": None}, wait=lambda _: None)
+        with pytest.raises(FetchError, match="goes on from here"):
+            one.fetch(NAME, 10, lambda _: None)
+
+    @pytest.mark.parametrize("name", ["../flight_01.tlog", "flight.txt", "x/flight_01.tlog"])
+    def test_names_that_leave_the_folder(self, tmp_path: Path, name: str) -> None:
+        one = RecordingFetch("site", tmp_path, lambda *_: {}, wait=lambda _: None)
+        with pytest.raises(FetchError, match="no file of a recording"):
+            one.fetch(name, 10, lambda _: None)
+
+    def test_pieces_follow_the_link(self) -> None:
+        pace = PiecePace()
+        sizes = []
+        for took_s in [0.01] * 8 + [0.1] + [0.5] * 3:
+            pace.note(took_s)
+            sizes.append(pace.size)
+        assert sizes[4:9] == [MAX_PIECE] * 5
+        assert sizes[-1] == MAX_PIECE // 8
+        assert fetching.LARGEST == MAX_PIECE

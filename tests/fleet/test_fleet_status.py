@@ -1,0 +1,95 @@
+"""What a fleet tells of its sites: round trips, rates, namesakes, and the same as metrics."""
+
+import asyncio
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.edges.operator.control_socket import request
+from tests.fleet.conftest import World
+
+pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+
+
+def site_of(world: World, name: str) -> dict[str, Any]:
+    return {site["name"]: site for site in world.fleet.status()["sites"]}.get(name, {})
+
+
+async def run(*words: str) -> str:
+    """Run a command as a person does, in a thread, since the fleet answers it here."""
+    result = await asyncio.to_thread(CliRunner().invoke, app, list(words))
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+async def test_round_trip_rate_and_table(world: World) -> None:
+    world.open_site("field-a")
+    world.open_site("field-b")
+    await world.until(lambda: len(world.systems()) == 2)
+
+    def asked() -> bool:
+        world.fleet._session.ask_round_trips()
+        return all(site_of(world, name)["round_trip_s"] for name in ("field-a", "field-b"))
+
+    await world.until(asked)
+    assert 0 < site_of(world, "field-a")["round_trip_s"] < 5
+    assert site_of(world, "field-a")["vehicles"][0]["rate_hz"] > 0
+    shown = await run("fleet", "status")
+    head, *rows = [line.split() for line in shown.splitlines() if line.strip()][1:]
+    assert head == ["site", "ms", "system", "id", "here", "Hz", "age", "s", "lost"]
+    assert {row[0] for row in rows} >= {"field-a", "field-b"}
+    listed = json.loads(await run("fleet", "status", "--json"))
+    assert {site["name"] for site in listed["sites"]} == {"field-a", "field-b"}
+
+
+async def test_metrics(world: World) -> None:
+    world.open_site("field-a")
+    await world.until(lambda: bool(world.systems()))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    world.fleet._metrics.listen(port)
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+    text = (await reader.read()).decode()
+    writer.close()
+    assert "mavgate_fleet_linked 1.0" in text
+    assert 'mavgate_fleet_site_here{site="field-a"} 1.0' in text
+    assert 'mavgate_fleet_vehicle_lost_total{id="1",site="field-a",system="1"} 0.0' in text
+    assert "mavgate_hub_forwarded_total" in text
+
+
+async def test_two_sites_of_one_name_are_told_here_too(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = world.open_site("field-a")
+    await world.until(lambda: site_of(world, "field-a").get("sessions") == 1)
+    world.open_site("field-a")
+    await world.until(lambda: site_of(world, "field-a")["sessions"] == 2)
+    assert "2 sites are called 'field-a'" in caplog.text
+    assert "2 of this name" in await run("fleet", "status")
+    first.close()
+    await world.until(lambda: site_of(world, "field-a")["sessions"] == 1)
+    assert site_of(world, "field-a")["is_here"], "the other one is there still"
+
+
+async def test_a_vehicle_that_is_left_out(world: World, tmp_path: Path) -> None:
+    world.open_site("field-a")
+    world.open_site("field-b")
+    await world.until(lambda: len(world.systems()) == 2)
+    await run("fleet", "id", "field-a/1", "0")
+
+    def one_is_left() -> bool:
+        del world.got[:-100]
+        return len(world.got) == 100 and len(world.systems()) == 1
+
+    await world.until(one_is_left)
+    assert "left out by hand: field-a/1" in await run("fleet", "status")
+    assert json.loads((tmp_path / "fleet.json").read_text())["field-a/1"] == 0
+    params = {"site": "field-a", "system_id": 1, "own_id": 9}
+    await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", params)
+    await world.until(lambda: 9 in world.systems())
