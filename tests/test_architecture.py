@@ -36,7 +36,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "edges": FOUNDATION
     | {"wire", "vehicle", "flightlog", "routing", "simulator", "status", "output"},
     "analysis": FOUNDATION | STAGES | JOINED | {"replay", "output"},
-    "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis"},
+    "season": FOUNDATION
+    | STAGES
+    | JOINED
+    | {"replay", "edges", "flights", "analysis", "extensions", "output"},
+    "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis", "season"},
     "fleet": FOUNDATION | STAGES | {"edges"},
     "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "fleet", "output"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
@@ -46,12 +50,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"replay", "status", "edges", "flights", "config", "daemon", "player", "analysis"}
-    | {"extensions", "panel", "fleet", "output"},
+    | {"extensions", "panel", "fleet", "season", "output"},
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
 PURE = FOUNDATION | STAGES | JOINED | {"replay", "status"}
-PURE_FOLDERS = {"panel/state"}
+PURE_FOLDERS = {"panel/state", "season/reckoning"}
 """Pure parts of rooms that are not."""
 
 IMPURE_MODULES = {
@@ -143,7 +147,9 @@ def test_no_stage_knows_an_edge() -> None:
         for module in imported_modules(tree_of(path))
         if module.startswith("gateway.edges")
     }
-    assert knowing <= {"edges", "flights", "daemon", "player", "cli", "config", "panel", "fleet"}
+    assert knowing <= (
+        {"edges", "flights", "season", "daemon", "player", "cli", "config", "panel", "fleet"}
+    )
 
 
 def test_no_folder_outgrows_a_glance() -> None:

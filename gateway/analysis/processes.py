@@ -37,7 +37,7 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
     Pool
         Open it before a thread is started, such as that of a progress bar.
     """
-    with _no_warning_of_threads():
+    with no_warning_of_threads():
         pool = multiprocessing.get_context(START).Pool(count, begin, arguments)
     with pool:
         yield pool
@@ -54,7 +54,7 @@ def run_copies(
     called some times a second.
     """
     processes = [multiprocessing.Process(target=work, args=(a,), daemon=True) for a in arguments]
-    with _no_warning_of_threads():
+    with no_warning_of_threads():
         for process in processes:
             process.start()
     for process in processes:
@@ -64,7 +64,7 @@ def run_copies(
 
 
 @contextmanager
-def _no_warning_of_threads() -> Iterator[None]:
+def no_warning_of_threads() -> Iterator[None]:
     """Let processes fork: the threads that Python warns of, the linear algebra's, are idle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)

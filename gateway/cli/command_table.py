@@ -81,6 +81,11 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
         RECORDINGS,
     ),
+    "hangar": CommandEntry(
+        "recorded.hangar",
+        "Index all recordings under a folder, and list and search what is in them.",
+        RECORDINGS,
+    ),
     "recover": CommandEntry(
         "recorded.info",
         "Write what is sound in a damaged recording to a new file, and tell what was left out.",

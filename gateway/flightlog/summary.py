@@ -78,13 +78,14 @@ class FileInfo:
 
 
 @dataclass(slots=True)
-class _Way:
+class GroundWay:
     """Sums up the way between positions."""
 
     distance_m: float = 0.0
     last: tuple[int, float, float] | None = None
 
     def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
+        """Go on to a position, unless it is too near the last one in time or place."""
         if self.last is not None:
             if 0 <= time_us - self.last[0] < STEP_US:
                 return
@@ -126,7 +127,7 @@ class TlogSummary:
         self._index = TlogIndex()
         self._counts: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[int, tuple[int, int]] = {}
-        self._ways: dict[int, _Way] = {}
+        self._ways: dict[int, GroundWay] = {}
         self._gaps = _Gaps()
 
     def add(self, batch: Batch) -> None:
@@ -167,7 +168,7 @@ class TlogSummary:
         )
 
     def _add_position(self, batch: Batch, i: int) -> None:
-        way = self._ways.setdefault(int(batch.origins[i]) >> 8, _Way())
+        way = self._ways.setdefault(int(batch.origins[i]) >> 8, GroundWay())
         time_us = int(batch.time_us[i])
         if way.last is not None and 0 <= time_us - way.last[0] < STEP_US:
             return
@@ -182,7 +183,7 @@ class TlogSummary:
             system_id=system_id,
             mav_type=mav_type,
             autopilot=autopilot,
-            distance_m=self._ways.get(system_id, _Way()).distance_m,
+            distance_m=self._ways.get(system_id, GroundWay()).distance_m,
             rates=tuple(
                 _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
                 for key in sorted(counts)
@@ -200,7 +201,7 @@ class TableSummary:
         self._damaged_bytes = 0
         self._first_us: int | None = None
         self._last_us: int | None = None
-        self._way = _Way()
+        self._way = GroundWay()
         self._gaps = _Gaps()
 
     def add(self, events: list[TableEvent], header: TableHeader | None) -> None:

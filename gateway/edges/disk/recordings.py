@@ -45,6 +45,12 @@ def is_file_name(name: str) -> bool:
     return _FILE_NAME.fullmatch(name) is not None and not {"/", "\0"} & set(name)
 
 
+def recording_name(path: Path) -> str:
+    """Return the name of the recording that a file is of; of another file its name."""
+    match = _FILE_NAME.fullmatch(path.name)
+    return path.name if match is None else match["name"]
+
+
 def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
     """Put the parts of a recording that follow one another together; all else stays alone."""
     found: list[list[Path]] = []

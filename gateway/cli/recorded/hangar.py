@@ -1,0 +1,187 @@
+"""`mavgate hangar`: the catalogue of all recordings under a folder."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import msgspec
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from typer.core import TyperGroup
+
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.named_recordings import folder_of
+from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
+from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.support.terminal import JsonOption, console_of, table_of
+from gateway.flights.reading import ReadOptions
+from gateway.season.executors import LocalProcesses
+from gateway.season.hangar.hangar_file import HangarError, Row, find_flights, geojson_of
+from gateway.season.hangar.indexing import index_folder
+
+INDEX: Final = "index"
+UNKNOWN: Final = "—"
+
+
+class _IndexByDefault(TyperGroup):
+    """A group whose first word is a folder to index, where it is none of its commands."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the command in its place."""
+        if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
+            args = [INDEX, *args]
+        return super().parse_args(ctx, args)
+
+
+group = typer.Typer(
+    cls=_IndexByDefault,
+    help="Index all recordings under a folder, and list and search what is in them.",
+)
+
+FolderOption = Annotated[
+    Path | None,
+    typer.Option("--folder", "-d", help="Folder of the catalogue; by default the recordings'."),
+]
+WhereOption = Annotated[
+    str,
+    typer.Option("--where", help="Condition in SQL: 'duration > 300 and loss > 0.05'."),
+]
+GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for maps.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.add_typer(group, name="hangar", rich_help_panel=PANEL)
+
+
+@group.command(INDEX)
+def index(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(help="Folder; by default that of the recordings.", show_default=False),
+    ] = None,
+    *,
+    columns: ColumnsOption = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Bring the catalogue of a folder up to date; the word `index` may be left out."""
+    settings = read_settings(config)
+    place = (folder or folder_of(settings)).expanduser()
+    if not place.is_dir():
+        refuse(f"{place}: is no folder")
+    with refusing():
+        options = ReadOptions(pipeline_settings(settings), columns=read_column_map(columns))
+    console = console_of(stderr=True)
+    shown = (TextColumn("reading"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(
+        *shown, console=console, transient=True, auto_refresh=False,
+        disable=not console.is_terminal,
+    ) as progress, _asking():  # fmt: skip
+        task = progress.add_task("reading", total=None)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total, refresh=True)
+
+        report = index_folder(place, options, LocalProcesses(jobs), show)
+    console_of().print(
+        f"{place}: {report.read} read, {report.unchanged} unchanged, {report.gone} gone; "
+        f"{report.broken} of those read are broken",
+        markup=False,
+    )
+
+
+@group.command("list")
+def list_flights(
+    *,
+    where: WhereOption = "",
+    folder: FolderOption = None,
+    json: JsonOption = False,
+    geojson: GeojsonOption = False,
+    config: ConfigOption = None,
+) -> None:
+    """List the flights of the catalogue, or those for which a condition holds."""
+    place = _place(folder, config)
+    with _asking():
+        if geojson:
+            print(msgspec.json.encode(geojson_of(place, where)).decode())
+            return
+        rows = find_flights(place, where)
+    if json:
+        print(msgspec.json.encode(rows).decode())
+        return
+    _show_table(rows)
+
+
+@group.command()
+def show(
+    name: Annotated[str, typer.Argument(help="A recording's name, or a file's path.")],
+    *,
+    folder: FolderOption = None,
+    json: JsonOption = False,
+    geojson: GeojsonOption = False,
+    config: ConfigOption = None,
+) -> None:
+    """Show all that the catalogue knows of one recording."""
+    place = _place(folder, config)
+    quoted = name.replace("'", "''")
+    where = f"name = '{quoted}' or path = '{quoted}'"
+    with _asking():
+        rows = find_flights(place, where)
+        if not rows:
+            refuse(f"{name}: is not in the catalogue of {place}; `mavgate hangar list` shows it")
+        if geojson:
+            print(msgspec.json.encode(geojson_of(place, where)).decode())
+            return
+    if json:
+        print(msgspec.json.encode(rows).decode())
+        return
+    for number, row in enumerate(rows):
+        print(end="\n" if number else "")
+        grid = table_of("what", "value", left=2)
+        for key, value in row.items():
+            if value is not None and key != "modified":
+                grid.add_row(key, f"{value:.7g}" if isinstance(value, float) else str(value))
+        console_of().print(grid)
+
+
+def _place(folder: Path | None, config: Path | None) -> Path:
+    return (folder or folder_of(read_settings(config))).expanduser()
+
+
+@contextmanager
+def _asking() -> Iterator[None]:
+    """End the command with a clear word where the catalogue cannot answer."""
+    try:
+        yield
+    except HangarError as error:
+        refuse(str(error))
+
+
+def _show_table(rows: list[Row]) -> None:
+    grid = table_of(
+        "recording", "kind", "began (UTC)", "aircraft", "s", "km", "m up", "m/s", "GPS lost",
+        "faults", "loss", left=3,
+    )  # fmt: skip
+    for row in rows:
+        if row["error"] is not None:
+            grid.add_row(row["path"], "broken", row["error"], *[UNKNOWN] * 8)
+            continue
+        km = None if row["distance"] is None else row["distance"] / 1000.0
+        loss = None if row["loss"] is None else f"{row['loss']:.1%}"
+        grid.add_row(
+            row["path"], row["kind"], row["began"] or UNKNOWN, _text(row["vehicle"]),
+            _text(row["duration"], 0), _text(km, 2), _text(row["highest"], 0),
+            _text(row["fastest"], 1), _text(row["gps_outages"]), _text(row["faults"]),
+            loss or UNKNOWN,
+        )  # fmt: skip
+    console = console_of()
+    console.print(grid)
+    hours = sum(row["duration"] or 0.0 for row in rows) / 3600.0
+    broken = sum(row["error"] is not None for row in rows)
+    console.print(f"{len(rows) - broken} flights, {hours:.1f} h; {broken} broken files")
+
+
+def _text(value: float | None, digits: int = 0) -> str:
+    return UNKNOWN if value is None else f"{value:.{digits}f}"

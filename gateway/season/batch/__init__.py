@@ -1,0 +1,1 @@
+"""One work on many recordings, in processes here or on other machines."""

@@ -1,0 +1,1 @@
+"""The catalogue of the recordings under a folder."""

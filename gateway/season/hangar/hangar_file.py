@@ -1,0 +1,251 @@
+"""The catalogue as a file of SQLite beside the recordings: kept up to date, and asked."""
+
+import sqlite3
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, get_type_hints
+from urllib.parse import quote
+
+import msgspec
+
+from gateway.season.reckoning.flight_facts import FlightFacts
+from gateway.season.reckoning.recording_tally import Flown
+from gateway.season.reckoning.track_shape import Place, feature, feature_collection
+
+HANGAR_NAME: Final = "hangar.sqlite"
+SCHEMA: Final = 1
+"""Of another one, the catalogue is made anew."""
+BUSY_S: Final = 10.0
+"""How long a writer waits for another one to end."""
+MAX_STEPS: Final = 20_000_000
+"""Of SQLite's machine for one query; some seconds."""
+_STEPS: Final = 100_000
+
+_FILE_COLUMNS: Final = {
+    "path": "TEXT NOT NULL", "name": "TEXT NOT NULL", "kind": "TEXT", "size": "INTEGER NOT NULL",
+    "modified": "INTEGER NOT NULL", "digest": "TEXT NOT NULL", "error": "TEXT",
+}  # fmt: skip
+_SQL: Final = {int | None: "INTEGER", float | None: "REAL", str | None: "TEXT"}
+_FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(FlightFacts).items()}
+COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
+"""What a query may use."""
+_PLACE: Final = struct.Struct("<iii")
+"""Latitude and longitude in 1e-7 deg, height in cm."""
+_ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
+
+Row = dict[str, Any]
+
+
+class HangarError(Exception):
+    """A catalogue that cannot be read, or a question that it does not understand."""
+
+
+@dataclass(frozen=True, slots=True)
+class CataloguedFile:
+    """One file of the catalogue, and what is in it."""
+
+    path: str
+    """From the folder of the catalogue on."""
+    name: str
+    """Of the recording that it is a part of."""
+    kind: str | None
+    size: int
+    modified_ns: int
+    digest: str
+    """SHA-256 of its bytes, in hexadecimal digits."""
+    error: str | None = None
+    """Why it is broken."""
+    flights: tuple[Flown, ...] = ()
+    """One for each vehicle; none in a broken file."""
+
+
+class Hangar:
+    """The catalogue, open to be changed.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings.
+
+    Raises
+    ------
+    HangarError
+        If the file cannot be made or is of another program.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / HANGAR_NAME
+        with _told(self.path):
+            self._db = sqlite3.connect(self.path, timeout=BUSY_S)
+            if self._db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
+                self._make()
+
+    def close(self) -> None:
+        """Keep what was added."""
+        self._db.commit()
+        self._db.close()
+
+    def known(self) -> dict[str, tuple[int, int, str]]:
+        """Return size, time of modification and digest of every file."""
+        rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
+        return {path: (size, modified, digest) for path, size, modified, digest in rows}
+
+    def put(self, files: Iterable[CataloguedFile]) -> None:
+        """Put files in the place of what was known of them, all or none."""
+        with _told(self.path), self._db:
+            for file in files:
+                self._forget(file.path)
+                self._insert(file)
+
+    def touch(self, path: str, modified_ns: int) -> None:
+        """Note that a file has another time of modification and the same bytes."""
+        with _told(self.path), self._db:
+            self._db.execute("UPDATE flights SET modified = ? WHERE path = ?", (modified_ns, path))
+
+    def forget(self, paths: Iterable[str]) -> None:
+        """Drop files that are gone."""
+        with _told(self.path), self._db:
+            for path in paths:
+                self._forget(path)
+
+    def _make(self) -> None:
+        columns = {**_FILE_COLUMNS, **_FACT_COLUMNS}
+        listed = ", ".join(f"{name} {kind}" for name, kind in columns.items())
+        with self._db:
+            self._db.execute("DROP TABLE IF EXISTS flights")
+            self._db.execute("DROP TABLE IF EXISTS tracks")
+            self._db.execute(f"CREATE TABLE flights (id INTEGER PRIMARY KEY, {listed})")
+            self._db.execute("CREATE INDEX flights_path ON flights (path)")
+            self._db.execute("CREATE TABLE tracks (id INTEGER PRIMARY KEY, places BLOB NOT NULL)")
+            self._db.execute(f"PRAGMA user_version = {SCHEMA}")
+
+    def _forget(self, path: str) -> None:
+        ids = "SELECT id FROM flights WHERE path = ?"
+        self._db.execute(f"DELETE FROM tracks WHERE id IN ({ids})", (path,))
+        self._db.execute("DELETE FROM flights WHERE path = ?", (path,))
+
+    def _insert(self, file: CataloguedFile) -> None:
+        of_file = (file.path, file.name, file.kind, file.size, file.modified_ns, file.digest)
+        marks = ", ".join("?" * len(COLUMNS))
+        for facts, track in file.flights or ((FlightFacts(), []),):
+            cursor = self._db.execute(
+                f"INSERT INTO flights ({', '.join(COLUMNS)}) VALUES ({marks})",
+                (*of_file, file.error, *msgspec.structs.astuple(facts)),
+            )
+            if track:
+                packed = b"".join(_PLACE.pack(*_counts(place)) for place in track)
+                self._db.execute("INSERT INTO tracks VALUES (?, ?)", (cursor.lastrowid, packed))
+
+
+def find_flights(folder: Path, where: str = "") -> list[Row]:
+    """Ask a catalogue.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings.
+    where : str
+        What stands behind WHERE in SQL, in the names of `COLUMNS`; all flights by default.
+
+    Returns
+    -------
+    list of dict
+        The columns of each flight, by time.
+
+    Raises
+    ------
+    HangarError
+        If there is no catalogue, or the condition is none.
+    """
+    with _asked(folder) as db:
+        rows = _select(db, ", ".join(COLUMNS), where)
+        return [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+
+
+def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
+    """Lay the tracks of flights out as GeoJSON; see `find_flights`."""
+    with _asked(folder) as db:
+        packed = dict(db.execute("SELECT id, places FROM tracks"))
+        found = [
+            (row[0], dict(zip(COLUMNS, row[1:], strict=True)))
+            for row in _select(db, f"id, {', '.join(COLUMNS)}", where)
+        ]
+    return feature_collection(
+        feature(_unpacked(packed[number]), row) for number, row in found if number in packed
+    )
+
+
+@contextmanager
+def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
+    """Open a catalogue for reading alone."""
+    path = folder / HANGAR_NAME
+    if not path.exists():
+        raise HangarError(f"{folder} has no catalogue yet; `mavgate hangar {folder}` makes one")
+    with _told(path):
+        db = sqlite3.connect(
+            f"file:{quote(str(path.absolute()))}?mode=ro", uri=True, timeout=BUSY_S
+        )
+        try:
+            if db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
+                raise HangarError(
+                    f"{path} is of another version; `mavgate hangar {folder}` makes it anew"
+                )
+            yield db
+        finally:
+            db.close()
+
+
+def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[Any, ...]]:
+    """Run a query that can read columns of flights, call functions, and nothing else."""
+    steps = 0
+
+    def allow(action: int, table: str | None, column: str | None, *_: object) -> int:
+        if action == sqlite3.SQLITE_FUNCTION:
+            return sqlite3.SQLITE_DENY if column == "load_extension" else sqlite3.SQLITE_OK
+        own = action != sqlite3.SQLITE_READ or table == "flights"
+        return sqlite3.SQLITE_OK if action in _ALLOWED and own else sqlite3.SQLITE_DENY
+
+    def is_too_long() -> int:
+        nonlocal steps
+        steps += _STEPS
+        return int(steps > MAX_STEPS)
+
+    db.set_authorizer(allow)
+    db.set_progress_handler(is_too_long, _STEPS)
+    condition = f"WHERE ({where}\n)" if where.strip() else ""
+    try:
+        return db.execute(
+            f"SELECT {columns} FROM flights {condition} ORDER BY began, path"
+        ).fetchall()
+    except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
+        text = "it takes too long" if steps > MAX_STEPS else str(error)
+        raise HangarError(
+            f"--where {where!r}: {text}; write a condition such as "
+            f"'duration > 300 and loss > 0.05', of {', '.join(COLUMNS)}"
+        ) from error
+    finally:
+        db.set_authorizer(None)
+        db.set_progress_handler(None, 0)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say which catalogue SQLite cannot work with."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise HangarError(
+            f"{path}: {error}; if it is no catalogue or damaged, delete it and index again"
+        ) from error
+
+
+def _counts(place: Place) -> tuple[int, int, int]:
+    lat, lon, alt = place
+    return round(lat * 1e7), round(lon * 1e7), round(alt * 100.0) if alt == alt else 0
+
+
+def _unpacked(places: bytes) -> list[Place]:
+    return [(lat * 1e-7, lon * 1e-7, alt / 100.0) for lat, lon, alt in _PLACE.iter_unpack(places)]

@@ -1,0 +1,223 @@
+"""Keeping the catalogue of a folder: what changed is read, by many processes, the rest is not."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Final
+
+from gateway.edges.disk.recording_streams import (
+    CHUNK,
+    GZIP,
+    OTHER_FORMATS,
+    FileKind,
+    kind_of,
+    other_format,
+    read_batches,
+    read_chunks,
+)
+from gateway.edges.disk.recordings import recording_name
+from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
+from gateway.season.executors import Executor, WorkFailed
+from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
+from gateway.season.reckoning.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows
+
+ENDINGS: Final = (".tlog", ".csv")
+"""Files of other endings are looked at where a format knows their first bytes."""
+CHUNK_FILES: Final = 8
+"""Files that one process reads before it tells."""
+KEEP_S: Final = 1.0
+"""What is read is stored so often: an interruption costs no more than that."""
+
+Known = tuple[int, int, str]
+"""Size, time of modification and digest."""
+Wanted = tuple[str, str]
+"""Path from the folder on, and the digest that is known of it or nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class IndexReport:
+    """What an indexing did."""
+
+    read: int = 0
+    unchanged: int = 0
+    gone: int = 0
+    broken: int = 0
+    """Of those that were read."""
+
+
+def index_folder(
+    folder: Path,
+    options: ReadOptions,
+    executor: Executor,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> IndexReport:
+    """Bring the catalogue of a folder up to date.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings; those in folders below it belong to it.
+    options : ReadOptions
+        How other programs' files are read.
+    executor : Executor
+        Reads them.
+    on_progress : callable
+        Called with how many files were read, and of how many.
+
+    Returns
+    -------
+    IndexReport
+
+    Raises
+    ------
+    HangarError
+        If the catalogue cannot be written.
+    """
+    hangar = Hangar(folder)
+    try:
+        known = hangar.known()
+        there = {str(path.relative_to(folder)): path for path in recordings_below(folder)}
+        gone = known.keys() - there.keys()
+        hangar.forget(gone)
+        wanted = [
+            (name, known[name][2] if name in known else "")
+            for name, path in there.items()
+            if name not in known or _stamp(path) != known[name][:2]
+        ]
+        report = IndexReport(unchanged=len(there) - len(wanted), gone=len(gone))
+        return _read_all(hangar, folder, options, executor, wanted, on_progress, report)
+    finally:
+        hangar.close()
+
+
+def recordings_below(folder: Path) -> Iterator[Path]:
+    """Find all files that may be recordings, by path; hidden ones and folders are passed over."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            path = Path(place, name)
+            if not name.startswith(".") and path.is_file() and _may_be_recording(path):
+                yield path
+
+
+def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedFile:
+    """Read one file for the catalogue; whatever is wrong with it stands in its `error`."""
+    name, known_digest = wanted
+    path = folder / name
+    found = CataloguedFile(name, recording_name(path), None, 0, 0, "")
+    try:
+        size, modified_ns = _stamp(path)
+        found = replace(found, size=size, modified_ns=modified_ns, digest=digest_of(path))
+        if found.digest == known_digest:
+            return found
+        found = replace(found, kind=_kind_name(path))
+        flights = tuple(_flights_in(path, options))
+    except OSError as error:
+        return replace(found, error=error.strerror or str(error))
+    except (FlightError, ValueError) as error:
+        return replace(found, error=str(error).removeprefix(f"{path}: "))
+    return replace(found, flights=flights, error=None if flights else NO_RECORDING)
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes; raises OSError."""
+    digest = sha256()
+    with path.open("rb") as file:
+        while data := file.read(CHUNK):
+            digest.update(data)
+    return digest.hexdigest()
+
+
+def _read_all(
+    hangar: Hangar,
+    folder: Path,
+    options: ReadOptions,
+    executor: Executor,
+    wanted: list[Wanted],
+    on_progress: Callable[[int, int], None] | None,
+    report: IndexReport,
+) -> IndexReport:
+    pieces = [wanted[k : k + CHUNK_FILES] for k in range(0, len(wanted), CHUNK_FILES)]
+    waiting: list[CataloguedFile] = []
+    kept_s, done = time.monotonic(), 0
+    try:
+        for number, outcome in executor.run(partial(_read_piece, folder, options), pieces):
+            piece = pieces[number]
+            files = (
+                [_unread(folder, name, outcome.reason) for name, _ in piece]
+                if isinstance(outcome, WorkFailed)
+                else outcome
+            )
+            known = dict(piece)
+            same = [file for file in files if file.digest and file.digest == known[file.path]]
+            for file in same:
+                hangar.touch(file.path, file.modified_ns)
+            fresh = [file for file in files if file not in same]
+            waiting += fresh
+            report = replace(
+                report,
+                read=report.read + len(files),
+                broken=report.broken + sum(file.error is not None for file in fresh),
+            )
+            if time.monotonic() - kept_s > KEEP_S:
+                hangar.put(waiting)
+                waiting, kept_s = [], time.monotonic()
+            done += len(piece)
+            if on_progress is not None:
+                on_progress(done, len(wanted))
+    finally:
+        hangar.put(waiting)
+    return report
+
+
+def _read_piece(folder: Path, options: ReadOptions, piece: list[Wanted]) -> list[CataloguedFile]:
+    return [read_file(folder, options, wanted) for wanted in piece]
+
+
+def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
+    size, modified_ns = _stamp(folder / name) if (folder / name).exists() else (0, 0)
+    return CataloguedFile(name, recording_name(folder / name), None, size, modified_ns, "", reason)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    told = path.stat()
+    return told.st_size, told.st_mtime_ns
+
+
+def _may_be_recording(path: Path) -> bool:
+    if path.name.removesuffix(GZIP).endswith(ENDINGS):
+        return True
+    return any(knows(_first_bytes(path)) for knows in OTHER_FORMATS.values())
+
+
+def _first_bytes(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(512)
+    except OSError:
+        return b""
+
+
+def _kind_name(path: Path) -> str:
+    kind = kind_of(path)
+    return other_format(path) if kind is FileKind.OTHER else kind.value
+
+
+def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
+    kind = kind_of(path)
+    if kind is FileKind.TLOG:
+        tlog = TlogTally()
+        for batch in read_batches(path):
+            tlog.add(batch)
+        return tlog.flown()
+    if kind is FileKind.TABLE:
+        table = TableSkimmer()
+        for data in read_chunks(path):
+            table.feed(data)
+        return table.flown()
+    rows = open_rows(path, options)
+    return tally_rows(rows.plain_rows, rows.header)

@@ -1,0 +1,1 @@
+"""What is reckoned of many flights: facts, folds, chances; pure."""

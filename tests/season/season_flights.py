@@ -1,0 +1,72 @@
+"""Short simulated recordings that differ in aircraft, day and noise, made in no time."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from gateway.aircraft import AircraftSettings
+from gateway.analysis.sources import ideal_calibration
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import encode_head
+from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
+from gateway.replay import header_for
+from gateway.simulator.flight import SimulatedFlight, fly
+from gateway.simulator.simulator_settings import SimulatorSettings
+
+OUTAGE_S = (28.0, 3.0)
+DURATION_S = 40.0
+DAY_0_US = 1_780_000_000_000_000
+DAY_US = 86_400_000_000
+
+
+@cache
+def simulated() -> SimulatedFlight:
+    settings = SimulatorSettings(imu_rate_hz=50, baro_rate_hz=5, gps_outages_s=(OUTAGE_S,))
+    return fly(settings, duration_s=DURATION_S)
+
+
+@cache
+def _records() -> tuple[ImuRaw | BaroRaw | GpsFix, ...]:
+    return tuple(r for r in simulated().records() if isinstance(r, ImuRaw | BaroRaw | GpsFix))
+
+
+def write_flight(
+    path: Path, *, vehicle: int = 1, day: int = 0, noise_m: float = 0.0, lost: int = 0
+) -> Path:
+    """Write the flight as a recording.
+
+    `noise_m` is added to every fix, seeded by aircraft and day; every `lost`-th IMU sample is lost.
+    """
+    rng = np.random.default_rng([vehicle, day])
+    aircraft = AircraftSettings(calibration=ideal_calibration(simulated().errors))
+    header = msgspec.structs.replace(
+        header_for(aircraft, vehicle), unix_us_at_zero=DAY_0_US + day * DAY_US
+    )
+    lines = [encode_head(header)]
+    imu = 0
+    for record in _records():
+        node = NodeId(vehicle, record.node.node_id)
+        match record:
+            case ImuRaw():
+                imu += 1
+                if not lost or imu % lost:
+                    row = TableRow(record.time_us, raw=replace(record, node=node))
+                    lines.append(row_to_line(row))
+            case BaroRaw():
+                row = TableRow(record.time_us, baro=replace(record, node=node))
+                lines.append(row_to_line(row))
+            case GpsFix():
+                north, east = (rng.normal(0.0, noise_m, 2) / 0.0111).astype(int).tolist()
+                fix = replace(
+                    record,
+                    node=node,
+                    lat_dege7=record.lat_dege7 + north,
+                    lon_dege7=record.lon_dege7 + east,
+                )
+                lines.append(row_to_line(TableRow(record.time_us, gps=fix)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(lines))
+    return path

@@ -1,0 +1,292 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from typer.testing import CliRunner
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.app import app
+from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flights.reading import ReadOptions
+from gateway.pipeline import PipelineSettings
+from gateway.season.executors import LocalProcesses
+from gateway.season.hangar import indexing
+from gateway.season.hangar.hangar_file import (
+    COLUMNS,
+    HANGAR_NAME,
+    CataloguedFile,
+    Hangar,
+    HangarError,
+    find_flights,
+    geojson_of,
+)
+from gateway.season.hangar.indexing import index_folder, read_file
+from gateway.season.reckoning.flight_facts import FlightFacts, lost_share
+from gateway.season.reckoning.track_shape import feature, simplified
+from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
+
+
+class InThisProcess:
+    """Does the work at once, and remembers on what."""
+
+    def __init__(self) -> None:
+        self.seen: list[object] = []
+
+    def run(self, work, items):
+        for number, item in enumerate(items):
+            self.seen += item
+            yield number, work(item)
+
+
+def write_tlog(path: Path) -> Path:
+    """Ten minutes of two vehicles: one flies two sides of a square, the other tells no position."""
+    records = []
+
+    def send(time_s: float, system: int, message: mavlink.MAVLink_message) -> None:
+        frame = bytes(message.pack(mavlink.MAVLink(None, system, 1)))
+        records.append(TlogRecord(1_780_000_000_000_000 + round(time_s * 1e6), frame))
+
+    for second in range(600):
+        for system in (1, 2):
+            send(second, system, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3))
+        send(second, 255, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+        north, east = min(second, 300) * 3.5, max(second - 300, 0) * 4.0
+        lat, lon = 470_000_000 + round(north / 0.0111319), 80_000_000 + round(east / 0.0075920)
+        height = 400_000 + (50_000 if second > 20 else 0)
+        position = mavlink.MAVLink_global_position_int_message(
+            0, lat, lon, height, 0, 350 if second < 300 else 0, 0 if second < 300 else 400, 0, 0
+        )
+        send(second + 0.1, 1, position)
+        fix = 1 if 100 <= second < 110 else 3
+        send(second + 0.2, 1, mavlink.MAVLink_gps_raw_int_message(0, fix, 0, 0, 0, 0, 0, 0, 0, 9))
+    send(300.3, 1, mavlink.MAVLink_statustext_message(2, b"it burns"))
+    send(300.4, 1, mavlink.MAVLink_statustext_message(6, b"all is well"))
+    for number, drop in enumerate((0, 400)):
+        status = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, 0, drop, 0, 0, 0, 0, 0)
+        send(400 + number, 1, status)
+    records.sort(key=lambda record: record.time_us)
+    path.write_bytes(b"".join(encode_record(r.time_us, r.frame) for r in records))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all kinds of files, indexed."""
+    place = tmp_path_factory.mktemp("season")
+    write_flight(place / "one_01_v1.csv", vehicle=1, day=0)
+    write_flight(place / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
+    write_tlog(place / "far.tlog")
+    (place / "empty.csv").write_text("")
+    (place / "noise.tlog").write_bytes(bytes(np.random.default_rng(1).integers(0, 255, 5000)))
+    (place / "readme.txt").write_text("no recording")
+    (place / ".hidden.csv").write_text("time_us,x\n")
+    index_folder(place, OPTIONS, InThisProcess())
+    return place
+
+
+def row_of(folder: Path, path: str) -> dict:
+    (found,) = find_flights(folder, f"path = '{path}'")
+    return found
+
+
+def test_a_table_tells_its_flight(folder: Path) -> None:
+    row = row_of(folder, "one_01_v1.csv")
+    flown = simulated()
+    truth = flown.trajectory.truth_at(np.arange(0.0, DURATION_S, 0.2))
+    height = truth.alt_amsl_m - truth.alt_amsl_m[0]
+    assert (row["name"], row["vehicle"], row["kind"]) == ("one", 1, "table")
+    assert row["began"] == "2026-05-28 20:26:40"
+    assert row["duration"] == pytest.approx(DURATION_S, abs=0.2)
+    assert row["highest"] == pytest.approx(height.max(), abs=6.0)
+    speed = np.hypot(*truth.vel_n_mps[:, :2].T)
+    assert row["fastest"] == pytest.approx(speed.max(), abs=1.5)
+    assert row["distance"] == pytest.approx(speed.sum() * 0.2, rel=0.1)
+    assert row["lat_min"] - 1e-4 < truth.lat_deg.min() < truth.lat_deg.max() < row["lat_max"] + 1e-4
+    assert row["gps_outages"] == 1
+    assert row["gps_lost"] == pytest.approx(OUTAGE_S[1], abs=0.6)
+    assert (row["loss"], row["faults"], row["damaged"], row["error"]) == (0.0, 0, 0, None)
+    assert len(row["settings"]) == 12
+
+
+def test_lost_samples_and_settings_tell_flights_apart(folder: Path) -> None:
+    one, two = row_of(folder, "one_01_v1.csv"), row_of(folder, "deeper/two_01_v2.csv")
+    assert two["loss"] == pytest.approx(0.1, abs=0.005)
+    assert two["settings"] == one["settings"]
+    assert two["began"] == "2026-05-31 20:26:40"
+
+
+def test_a_tlog_tells_each_of_its_vehicles(folder: Path) -> None:
+    first, second = find_flights(folder, "path = 'far.tlog'")
+    assert (first["vehicle"], second["vehicle"]) == (1, 2)
+    assert first["distance"] == pytest.approx(1050.0 + 1196.0, rel=0.01)
+    assert (first["highest"], first["fastest"]) == (50.0, 4.0)
+    assert (first["gps_outages"], first["gps_lost"]) == (1, 11.0)
+    assert (first["faults"], first["loss"]) == (1, 0.02)
+    assert first["takeoff_lat"] == pytest.approx(47.0 + 20 * 3.5 / 111_319.0, abs=1e-5)
+    assert second["distance"] is None
+
+
+def test_a_broken_file_has_a_row_that_says_why(folder: Path) -> None:
+    broken = {row["path"]: row["error"] for row in find_flights(folder, "error is not null")}
+    assert set(broken) == {"empty.csv", "noise.tlog"}
+    assert "is no recording" in broken["noise.tlog"]
+
+
+def test_only_what_changed_is_read_again(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.csv").write_text(f"time_us,x\n{name},1\n")
+    index_folder(tmp_path, OPTIONS, InThisProcess())
+    (tmp_path / "a.csv").write_text("time_us,x\nother,1,2\n")
+    (tmp_path / "b.csv").unlink()
+    os.utime(tmp_path / "c.csv", ns=(1, 1))
+    executor = InThisProcess()
+    report = index_folder(tmp_path, OPTIONS, executor)
+    assert sorted(name for name, _ in executor.seen) == ["a.csv", "c.csv"]
+    assert (report.read, report.unchanged, report.gone) == (2, 0, 1)
+    assert [row["path"] for row in find_flights(tmp_path)] == ["a.csv", "c.csv"]
+    assert index_folder(tmp_path, OPTIONS, executor).unchanged == 2
+
+
+def test_an_interruption_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(indexing, "CHUNK_FILES", 1)
+    for number in range(5):
+        (tmp_path / f"{number}.csv").write_text("x")
+
+    class Interrupted(InThisProcess):
+        def run(self, work, items):
+            for number, done in super().run(work, items):
+                if number == 3:
+                    raise KeyboardInterrupt
+                yield number, done
+
+    with pytest.raises(KeyboardInterrupt):
+        index_folder(tmp_path, OPTIONS, Interrupted())
+    assert index_folder(tmp_path, OPTIONS, InThisProcess()).read == 2
+
+
+def test_a_half_written_table_is_read_as_far_as_it_goes(tmp_path: Path, folder: Path) -> None:
+    whole = (folder / "one_01_v1.csv").read_bytes()
+    (tmp_path / "cut.csv").write_bytes(whole[: len(whole) // 2])
+    found = read_file(tmp_path, OPTIONS, ("cut.csv", ""))
+    ((facts, _),) = found.flights
+    assert found.error is None
+    assert 0 < facts.damaged < 500
+    assert 15.0 < facts.duration < 25.0
+
+
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [
+        ("altitude > 3", "no such column: altitude"),
+        ("duration >", "syntax error|incomplete"),
+        ("1) UNION SELECT 1", "syntax error"),
+        ("id IN (SELECT id FROM tracks)", "prohibited"),
+        ("path IN (SELECT sql FROM sqlite_master)", "prohibited"),
+        ("1; DROP TABLE flights", "syntax error|one statement"),
+        ("load_extension('x') > 0", "not authorized|prohibited|no such function"),
+        ("duration > 0 -- and", ""),
+        ("(WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT max(i) FROM n)",
+         "too long|not authorized|prohibited"),
+    ],
+)  # fmt: skip
+def test_a_condition_can_only_read(folder: Path, where: str, told: str) -> None:
+    if not told:
+        assert len(find_flights(folder, where)) == 4
+        return
+    with pytest.raises(HangarError, match=f"(?s)({told}).*duration > 300"):
+        find_flights(folder, where)
+    assert len(find_flights(folder)) == 6
+
+
+def test_what_is_no_catalogue_is_said(tmp_path: Path) -> None:
+    with pytest.raises(HangarError, match="no catalogue yet"):
+        find_flights(tmp_path)
+    (tmp_path / HANGAR_NAME).write_text("a diary" * 1000)
+    with pytest.raises(HangarError, match="delete it"):
+        Hangar(tmp_path)
+
+
+def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
+    hangar = Hangar(tmp_path)
+    hangar.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
+    hangar._db.execute("PRAGMA user_version = 99")
+    hangar.close()
+    with pytest.raises(HangarError, match="another version"):
+        find_flights(tmp_path)
+    Hangar(tmp_path).close()
+    assert find_flights(tmp_path) == []
+
+
+def test_the_tracks_are_geojson(folder: Path) -> None:
+    found = geojson_of(folder, "kind = 'tlog'")
+    (flight,) = found["features"]
+    (line,) = flight["geometry"]["coordinates"]
+    assert line[0][:2] == pytest.approx([8.0, 47.0])
+    # Of a square's two sides the corner is all that is needed, and the step up costs one place.
+    assert 3 <= len(line) <= 5
+    assert flight["properties"]["vehicle"] == 1
+
+
+def test_a_track_across_180_degrees_is_cut() -> None:
+    line = feature([(0.0, 179.9, 0.0), (0.0, -179.9, 0.0)], {})["geometry"]["coordinates"]
+    assert [[place[0] for place in part] for part in line] == [[179.9, 179.9], [-179.9, -179.9]]
+
+
+def test_a_track_is_shown_within_the_tolerance(rng: np.random.Generator) -> None:
+    turn = np.linspace(0.0, 20.0, 3000)
+    places = [(1e-3 * a * np.cos(a), 1e-3 * a * np.sin(a), 10.0) for a in turn]
+    kept = simplified(places)
+    assert kept[0] == places[0]
+    assert kept[-1] == places[-1]
+    assert 20 < len(kept) < 400
+    lost = np.interp(turn, [turn[places.index(place)] for place in kept], [p[0] for p in kept])
+    assert np.abs(lost - np.array(places)[:, 0]).max() * 111_000.0 < 15.0
+
+
+def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:
+    times = np.array([0, 10, 20, 50, 60, 5, 15, 25])
+    assert lost_share(times) == pytest.approx(2 / 10)
+    assert lost_share(np.array([1])) is None
+
+
+def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> None:
+    (tmp_path / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
+    (tmp_path / "bad.csv").write_text("")
+    run = CliRunner().invoke
+    done = run(app, ["hangar", str(tmp_path), "--jobs", "1"])
+    assert done.exit_code == 0, done.output
+    assert "2 read, 0 unchanged, 0 gone; 1 of those read are broken" in done.output
+    listed = run(app, ["hangar", "list", "--folder", str(tmp_path)])
+    assert "one_01_v1.csv" in listed.output
+    assert "broken" in listed.output
+    wanted = ["hangar", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
+    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one"]
+    shown = run(app, ["hangar", "show", "one", "-d", str(tmp_path)])
+    assert "takeoff" in shown.output or "fastest" in shown.output
+    geo = json.loads(run(app, ["hangar", "show", "one", "-d", str(tmp_path), "--geojson"]).output)
+    assert geo["type"] == "FeatureCollection"
+    refused = run(app, ["hangar", "list", "-d", str(tmp_path), "--where", "nonsense"])
+    assert refused.exit_code == 2
+    assert "no such column" in refused.output
+    assert run(app, ["hangar", "show", "nobody", "-d", str(tmp_path)]).exit_code == 2
+
+
+def test_every_column_has_a_place_in_the_book() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "batch.md").read_text()
+    assert [name for name in COLUMNS if f"`{name}`" not in text] == []
+
+
+def test_processes_give_what_this_one_gives(folder: Path, tmp_path: Path) -> None:
+    for name in ("one_01_v1.csv", "far.tlog"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    index_folder(tmp_path, OPTIONS, LocalProcesses(2))
+    facts = [{k: row[k] for k in FlightFacts.__struct_fields__} for row in find_flights(tmp_path)]
+    expected = find_flights(folder, "path in ('one_01_v1.csv', 'far.tlog')")
+    assert facts == [{k: row[k] for k in FlightFacts.__struct_fields__} for row in expected]
