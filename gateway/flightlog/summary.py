@@ -75,6 +75,8 @@ class FileInfo:
     damaged_runs: int
     header: TableHeader | None = None
     marks: tuple[TableMark, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """What its reader found to say of it."""
 
 
 @dataclass(slots=True)

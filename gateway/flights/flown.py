@@ -1,5 +1,6 @@
 """Any recording as a flight that the simulated receiver sends once more."""
 
+import logging
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +17,8 @@ from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain, pressure_altitude_m
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S
+
+log = logging.getLogger(__name__)
 
 COLUMNS: Final = (
     *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),
@@ -55,6 +58,8 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     table = joined_rows([open_rows(file, options) for file in files])
     aircraft = aircraft_of(table, options)
     columns = np.array(_cells(table.plain_rows, aircraft), float).reshape(-1, len(COLUMNS))
+    for remark in table.remarks:
+        log.warning(remark)
     latency_s = aircraft.estimation.reference.gps_latency_s
     try:
         return RecordedFlight.from_columns(dict(zip(COLUMNS, columns.T, strict=True)), latency_s)

@@ -3,7 +3,7 @@
 import math
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -84,6 +84,18 @@ class _Drawn:
     def put(self, kind: PlaceKind, name: str, at: TrackPoint) -> None:
         if len(self.track.places) < MAX_PLACES:
             self.track.places.append(MapPlace(kind, name, at))
+
+
+def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:
+    """Yield the positions that one vehicle told; the first that tells one by default."""
+    for record in records:
+        if message_id_of(record.frame) != GLOBAL_POSITION_INT_ID:
+            continue
+        sender = origin_of(record.frame)[0]
+        system_id = sender if system_id is None else system_id
+        _, lat, lon, alt = _POSITION.unpack(payload_of(record.frame, _POSITION.size))
+        if sender == system_id and (lat or lon):
+            yield _point(record.time_us, lat, lon, alt, None)
 
 
 def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:

@@ -1,14 +1,15 @@
-"""Recordings as streams for the commands: rows to fuse, frames to send, points to draw."""
+"""Recordings as streams for the commands: rows to fuse, frames to send."""
 
 import codecs
 import heapq
-import struct
+import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 
@@ -23,8 +24,6 @@ from gateway.edges.disk.recording_streams import (
     read_chunks,
     read_events,
 )
-from gateway.flightlog.mapshape import TrackPoint
-from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
 from gateway.flightlog.table.row import RowBuilder, TableRow
@@ -50,13 +49,9 @@ from gateway.records import (
 )
 from gateway.replay import header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
-from gateway.units import DEG_PER_DEGE7, M_PER_MM
-from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
-GLOBAL_POSITION_INT_ID: Final = 33
 TRACKER_LOG: Final = files("gateway.flights") / "tracker-log.toml"
 """The map for logs whose columns are time_s, ax, gx and so on."""
-_POSITION: Final = struct.Struct("<Iiii")
 
 Position = Literal["causal", "interpolated"]
 SettingsChoice = Literal["recorded", "current"]
@@ -99,6 +94,8 @@ class RecordedTable:
     rows: Iterator[Line]
     """A header among them tells of settings that were changed in flight, a state of what the
     fusion remembered there, a mark of what somebody remarked."""
+    remarks: list[str] = field(default_factory=list)
+    """What the user should know of the file; whole once the rows are read."""
 
     @property
     def plain_rows(self) -> Iterator[TableRow]:
@@ -133,6 +130,29 @@ def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
     if name in READERS:
         raise ValueError(f"{name} files are read already")
     OTHER_FORMATS[name], READERS[name] = knows, read
+
+
+def import_format(module: str, name: str) -> Any:
+    """Import what reads or writes a format, which needs an extra; raises FlightError if absent."""
+    try:
+        return import_module(f"gateway.flights.formats.{module}")
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("gateway"):
+            raise
+        raise FlightError(
+            f"{name} needs {error.name}, the extra mavgate[formats]:\n"
+            f"{sys.executable} -m pip install 'mavgate[formats]'"
+        ) from error
+
+
+def _add_packaged(name: str, heads: tuple[bytes, ...], module: str) -> None:
+    """Add a reader whose packages are imported with the first file of its format."""
+
+    def read(path: Path, options: ReadOptions) -> RecordedTable:
+        table: RecordedTable = import_format(module, name).read(path, options)
+        return table
+
+    add_reader(name, lambda head: head.startswith(heads), read)
 
 
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
@@ -205,6 +225,7 @@ def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
         listed = " and ".join(map(str, vehicles))
         raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
     first = tables[0].header
+    remarks: list[str] = []
 
     def rows() -> Iterator[Line]:
         known = first
@@ -215,8 +236,9 @@ def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
             for row in table.rows:
                 known = row if isinstance(row, TableHeader) else known
                 yield from shifted(row, _shift_us(header, first))
+            remarks.extend(table.remarks)
 
-    return RecordedTable(first, rows())
+    return RecordedTable(first, rows(), remarks)
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int:
@@ -244,20 +266,6 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
             _moved(row.imu, shift_us),
             _moved(row.state, shift_us),
         )
-
-
-def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:
-    """Yield the positions that one vehicle told; the first that tells one by default."""
-    for record in records:
-        if message_id_of(record.frame) != GLOBAL_POSITION_INT_ID:
-            continue
-        sender = origin_of(record.frame)[0]
-        system_id = sender if system_id is None else system_id
-        _, lat, lon, alt = _POSITION.unpack(payload_of(record.frame, _POSITION.size))
-        if sender == system_id and (lat or lon):
-            yield TrackPoint(
-                record.time_us, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM
-            )
 
 
 def _moved(record: Moved | None, shift_us: int) -> Moved | None:
@@ -366,3 +374,7 @@ def table_of_rows(
     known = header_for(calibrated, vehicle_id)
     header = msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
     return RecordedTable(header, rows)
+
+
+_add_packaged("ULog", (b"ULog\x01\x12\x35",), "ulog_file")
+_add_packaged("DataFlash", (b"\xa3\x95", b"FMT,"), "dataflash_file")

@@ -85,7 +85,10 @@ class Refusion:
     @property
     def remarks(self) -> list[str]:
         """What the user should know of the states, as far as it was seen by now."""
-        return [SETTLES.format(reason) for reason in self._replay.refused]
+        return [
+            *(SETTLES.format(reason) for reason in self._replay.refused),
+            *self._table.remarks,
+        ]
 
     def introduction(self) -> Iterator[bytes]:
         """Yield the frames that tell who flies here, and by which parameters it is fused."""

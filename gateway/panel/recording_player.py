@@ -18,7 +18,8 @@ from typing import Any, Final
 from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.edges.operator.control_socket import ControlError
 from gateway.flightlog.mapshape import thin_out
-from gateway.flights.reading import FlightError, points_of_frames, recorded_frames
+from gateway.flights.map_tracks import points_of_frames
+from gateway.flights.reading import FlightError, recorded_frames
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.uplink import Uplink

@@ -21,6 +21,7 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     read_moment,
     refusing,
+    tell_remarks,
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -89,6 +90,5 @@ def convert(
         )
         inputs = [*files, columns, config]
         size = write_new(out, write(flight), overwrite=force, inputs=inputs)
-    for remark in flight.remarks:
-        console_of(stderr=True).print(remark, markup=False)
+    tell_remarks(flight.remarks)
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)

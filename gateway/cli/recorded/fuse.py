@@ -21,6 +21,7 @@ from gateway.cli.support.recording_options import (
     progress_of,
     read_column_map,
     refusing,
+    tell_remarks,
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -132,6 +133,7 @@ def fuse_log(
             header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
         )
         write_new(out, _lines(header, time_us, states), overwrite=force, inputs=inputs)
+    tell_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 

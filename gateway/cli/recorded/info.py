@@ -25,6 +25,7 @@ from gateway.edges.disk.recording_streams import (
     FileKind,
     Progress,
     kind_of,
+    other_format,
     read_batches,
     read_events,
 )
@@ -38,7 +39,7 @@ from gateway.flightlog.table.table import (
     encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
+from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows, shifted
 from gateway.output import write_new
 from gateway.units import US_PER_S
 
@@ -143,9 +144,11 @@ def describe(file: Path, options: ReadOptions) -> FileInfo:
     table, reader = TableSummary(), TableReader()
     if kind in (FileKind.FOREIGN, FileKind.OTHER):
         foreign = open_rows(file, options)
+        zero_us = foreign.header.unix_us_at_zero or 0
         for row in foreign.plain_rows:
-            table.add([row], foreign.header)
-        return replace(table.result(size), kind=kind.value, header=None)
+            table.add([*shifted(row, zero_us)], foreign.header)
+        name = other_format(file) if kind is FileKind.OTHER else kind.value
+        return replace(table.result(size), kind=name, header=None, remarks=tuple(foreign.remarks))
     for event in read_events(file, reader, advance):
         table.add([event], reader.header)
     return table.result(size)
@@ -204,6 +207,8 @@ def _show(file: Path, found: FileInfo) -> None:
             f"[red]damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
             "`mavgate recover` leaves them out[/red]"
         )
+    for remark in found.remarks:
+        console.print(remark, markup=False)
 
 
 def _heading(vehicle: VehicleInfo, kind: str) -> str:

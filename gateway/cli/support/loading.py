@@ -10,7 +10,12 @@ import typer
 from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
 from gateway.cli.support.named_recordings import files_of, folder_of
-from gateway.cli.support.recording_options import progress_of, read_column_map, refusing
+from gateway.cli.support.recording_options import (
+    progress_of,
+    read_column_map,
+    refusing,
+    tell_remarks,
+)
 from gateway.cli.support.settings_options import (
     pipeline_settings,
 )
@@ -87,6 +92,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
             )
         except ValueError as error:
             raise FlightError(str(error)) from error
+        tell_remarks(table.remarks)
         if loading.reference is None:
             return flight
         return judged_by(

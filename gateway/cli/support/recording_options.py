@@ -80,6 +80,12 @@ def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
         yield lambda count: progress.advance(task, count)
 
 
+def tell_remarks(remarks: Iterable[str]) -> None:
+    """Say what the user should know of a file, beside the output."""
+    for remark in remarks:
+        console_of(stderr=True).print(remark, markup=False)
+
+
 @contextmanager
 def refusing() -> Iterator[None]:
     """End the command with a clear word where a file is not as it should be."""

@@ -153,11 +153,10 @@ class ForeignReader:
     def _baro(self, value: Mapping[str, float], time_us: int) -> BaroRaw | None:
         if "baro_pressure_pa" in value:
             pressure_pa = value["baro_pressure_pa"]
-        elif value.get("baro_alt_m", math.inf) < _SCALE_M:
-            # The standard atmosphere backwards, so that the height comes out again.
-            pressure_pa = SEA_LEVEL_PA * (1.0 - value["baro_alt_m"] / _SCALE_M) ** _EXPONENT
         else:
-            return None
+            pressure_pa = pressure_at_height(value.get("baro_alt_m", NAN))
+            if math.isnan(pressure_pa):
+                return None
         return BaroRaw(
             time_us=round(value.get("baro_time_us", time_us)),
             node=NodeId(self._vehicle_id, 0),
@@ -190,6 +189,16 @@ class ForeignReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
+
+
+def pressure_at_height(alt_m: float) -> float:
+    """Return the pressure in Pa from which the standard atmosphere makes this height again.
+
+    NaN for a height that has none.
+    """
+    if not alt_m < _SCALE_M:
+        return NAN
+    return float(SEA_LEVEL_PA * (1.0 - alt_m / _SCALE_M) ** _EXPONENT)
 
 
 def _velocity(value: Mapping[str, float]) -> Vec3:

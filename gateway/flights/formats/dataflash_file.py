@@ -1,0 +1,137 @@
+"""DataFlash, the log of ArduPilot, in binary (.bin) and as text (.log), read by pymavlink."""
+
+import contextlib
+import io
+import re
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+from pymavlink.DFReader import DFReader_binary, DFReader_text
+
+from gateway.edges.disk.recording_streams import GZIP, read_chunks
+from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
+from gateway.flightlog.table.autopilot import Imported
+from gateway.flightlog.table.row import RowBuilder, TableRow
+from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.units import US_PER_S
+
+MAGIC: Final = b"\xa3\x95"
+SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
+_SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
+BROKEN: Final = (
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError, AssertionError),
+    *(struct.error, RecursionError),
+)
+"""What damage makes pymavlink raise."""
+
+
+class _Complaints(io.TextIOBase):
+    """Counts what pymavlink says on the terminal of damage."""
+
+    def __init__(self) -> None:
+        self.bytes = self.messages = 0
+        self.spoken = False
+
+    def write(self, text: str) -> int:
+        self.spoken = True
+        self.bytes += sum(map(int, _SKIPPED.findall(text)))
+        return len(text)
+
+    def quietly(self, call: Callable[[], Any]) -> Any:
+        """Call while what is said is counted."""
+        with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
+            return call()
+
+
+def read(path: Path, options: ReadOptions) -> RecordedTable:
+    """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
+    heard = _Complaints()
+    log = _open(path, options, heard)
+    named = (log.params.get(name) for name in SYSTEM_IDS)
+    known = next((int(value) for value in named if value is not None), 1)
+    vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
+    reader = ArdupilotReader(vehicle_id)
+    remarks: list[str] = []
+
+    def rows() -> Iterator[TableRow]:
+        builder = RowBuilder()
+        with contextlib.closing(log):
+            for record in _records(log, heard, reader):
+                yield from builder.add(record)
+            yield from builder.flush()
+            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, heard, reader))
+
+    stream = rows()
+    first = next((row for row in stream if row.imu is not None), None)
+    if first is None:
+        raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
+    # By the first week and time that GPS told; 0 where it never did.
+    unix_us = round(log.clock.timebase * US_PER_S) if log.clock.timebase else None
+    zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
+    table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
+    table.remarks = remarks
+    return table
+
+
+def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
+    """Open a log; one that is packed, or text, is laid out plainly in a file beside."""
+    content = read_chunks(path, options.progress)
+    first = next(content, b"")
+    is_binary = first.startswith(MAGIC)
+    kind = DFReader_binary if is_binary else DFReader_text
+    with tempfile.NamedTemporaryFile() as plain:
+        file = path
+        if path.suffix == GZIP or not is_binary:
+            for data in chain([first], content):
+                # A byte that is no text must not end the reading.
+                plain.write(data if is_binary else data.decode("ascii", "replace").encode())
+            plain.flush()
+            file = Path(plain.name)
+        log = kind.__new__(kind)
+        # The fast indexer writes what it says past Python, onto the terminal.
+        log.init_arrays_fast = log.init_arrays
+        try:
+            heard.quietly(lambda: kind.__init__(log, str(file)))
+        except BROKEN as error:
+            log.close()
+            raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
+        return log
+
+
+def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[Imported]:
+    """Read the log through; a message that cannot be understood is counted.
+
+    Of a sound log only what is of use is decoded. The index of a damaged one ends at the damage, so
+    that is read message by message.
+    """
+
+    def wanted() -> Any:
+        return log.recv_match(type=reader.names, strict=True)
+
+    take = log.recv_msg if heard.spoken else wanted
+    while True:
+        begin = log.offset
+        try:
+            message = heard.quietly(take)
+            found = [] if message is None else reader.feed(message.get_type(), message)
+        except BROKEN:
+            heard.messages += 1
+            log.offset = max(log.offset, begin + 1)
+            continue
+        if message is None:
+            yield from reader.flush()
+            return
+        yield from found
+
+
+def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:
+    if heard.bytes:
+        yield f"is damaged: {heard.bytes} bytes are no messages and were left out"
+    if log.offset < log.data_len:
+        yield f"ends within a message: {log.data_len - log.offset} bytes were left out"
+    if broken := reader.dropped + heard.messages:
+        yield f"is damaged: {broken} messages cannot be understood and were left out"

@@ -1,0 +1,210 @@
+"""PX4's and ArduPilot's own logs: written by the published formats, read back, fused."""
+
+import gzip
+import itertools
+import json
+import math
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.analysis.metrics import rms, rotation_error, total_error_rad
+from gateway.cli.app import app
+from gateway.config import GatewaySettings
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableReader
+from gateway.flights.flown import open_flown
+from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, open_rows
+from gateway.pipeline import PipelineSettings
+from gateway.records import BaroRaw, GpsFix, ImuCalibrated
+from tests.flights.formats import flown
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+MAKERS: dict[str, tuple[Callable[[], bytes], int]] = {
+    "new.ulg": (flown.make_ulog, 7),
+    "old.ulg": (lambda: flown.make_ulog(old=True), 7),
+    "flight.bin": (flown.make_dataflash, 9),
+    "flight.log": (flown.make_dataflash_text, 9),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    for name, (make, _) in MAKERS.items():
+        flown.write(folder / name, make())
+    return folder
+
+
+@cache
+def whole(path: Path) -> tuple[RecordedTable, list[TableRow]]:
+    return rows_of(path)
+
+
+def rows_of(path: Path) -> tuple[RecordedTable, list[TableRow]]:
+    table = open_rows(path, OPTIONS)
+    return table, list(table.plain_rows)
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_what_was_logged_is_read(folder: Path, name: str) -> None:
+    table, rows = whole(folder / name)
+    assert table.header.vehicle_id == MAKERS[name][1]
+    assert table.remarks == []
+    zero_us = flown.records()[0].time_us
+    logged = [r for r in flown.records() if isinstance(r, ImuCalibrated)]
+    imus = [row.imu for row in rows if row.imu is not None]
+    assert [imu.time_us for imu in imus] == [r.time_us - zero_us for r in logged]
+    for axis in ("accel_b_mps2", "gyro_b_radps"):
+        np.testing.assert_allclose(
+            [getattr(imu, axis) for imu in imus], [getattr(r, axis) for r in logged], rtol=1e-6
+        )
+    mags = [imu.mag_b_ut for imu in imus if imu.mag_b_ut]
+    np.testing.assert_allclose(mags, [r.mag_b_ut for r in logged if r.mag_b_ut], atol=0.051)
+    baros = [row.baro.pressure_pa for row in rows if row.baro]
+    told = [r.pressure_pa for r in flown.records() if isinstance(r, BaroRaw)]
+    np.testing.assert_allclose(baros, told, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
+    table, rows = whole(folder / name)
+    fixes = [row.gps for row in rows if row.gps]
+    told = [r for r in flown.records() if isinstance(r, GpsFix)]
+    assert [f.fix_ok for f in fixes] == [r.fix_ok for r in told]
+    pairs = [(f, r) for f, r in zip(fixes, told, strict=True) if r.fix_ok]
+    assert len(pairs) > 100
+    for f, r in pairs:
+        assert (f.lat_dege7, f.lon_dege7, f.satellites) == (
+            r.lat_dege7,
+            r.lon_dege7,
+            r.satellites,
+        )
+        assert f.alt_amsl_m == pytest.approx(r.alt_amsl_m, abs=0.006)
+        assert f.vel_n_mps == pytest.approx(r.vel_n_mps, abs=1e-4)
+        assert f.h_acc_m == pytest.approx(r.h_acc_m, abs=0.006)
+        assert f.v_acc_m == pytest.approx(r.v_acc_m, abs=0.006)
+        assert f.speed_acc_mps == pytest.approx(r.speed_acc_mps, abs=0.006)
+        assert f.utc_us is not None
+        assert r.utc_us is not None
+        assert abs(f.utc_us - r.utc_us) <= 1000
+    first = pairs[0][1]
+    assert table.header.unix_us_at_zero is not None
+    zero_us = flown.records()[0].time_us
+    at_us = (first.utc_us or 0) - (first.time_us - zero_us)
+    assert table.header.unix_us_at_zero == pytest.approx(at_us, abs=200_000)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_what_the_autopilot_believed_is_there_to_compare_with(folder: Path, name: str) -> None:
+    _, rows = whole(folder / name)
+    states = [row.state for row in rows if row.state]
+    assert len(states) > 0.9 * len(flown.believed())
+    zero_us = flown.records()[0].time_us
+    told = {b.time_us - zero_us: b for b in flown.believed()}
+    near = [(s, told[s.time_us]) for s in states if s.time_us in told]
+    assert len(near) > 0.9 * len(states)
+    error = total_error_rad(
+        rotation_error(np.array([s.q_nb for s, _ in near]), np.array([b.q_nb for _, b in near]))
+    )
+    assert math.degrees(float(error.max())) < 0.02
+    for s, b in near[20::50]:
+        assert (s.lat_deg, s.lon_deg) == pytest.approx((b.lat_deg, b.lon_deg), abs=1e-7)
+        assert s.vel_n_mps == pytest.approx(b.vel_n_mps, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
+def test_it_is_fused_to_what_was_true(folder: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "states.csv"
+    run("fuse", folder / name, "-o", out, "--gps-latency", "0.15", "--estimator", "eskf")
+    rows = [
+        row
+        for row in TableReader().feed(out.read_bytes(), final=True)
+        if isinstance(row, TableRow) and row.state and row.time_us > 30_000_000
+    ]
+    assert len(rows) > 2000
+    time_s = np.array([row.time_us + flown.records()[0].time_us for row in rows]) / 1e6
+    truth = flown.simulated().trajectory.truth_at(time_s)
+    q_nb = np.array([row.state.q_nb for row in rows if row.state])
+    assert math.degrees(rms(total_error_rad(rotation_error(q_nb, truth.q_nb)))) < 2.0
+    alt = np.array([row.state.alt_amsl_m for row in rows if row.state])
+    assert rms(alt - truth.alt_amsl_m) < 3.0
+    lat = np.array([row.state.lat_deg for row in rows if row.state])
+    assert rms((lat - truth.lat_deg) * 111_000) < 3.0
+
+
+def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
+    found = json.loads(run("info", folder / "new.ulg", "--json"))
+    assert found["kind"] == "ULog"
+    assert found["duration_s"] == pytest.approx(flown.DURATION_S, abs=1.0)
+    assert "2026-06-14" in run("info", folder / "flight.bin")
+    packed = flown.write(tmp_path / "a.bin.gz", gzip.compress((folder / "flight.bin").read_bytes()))
+    run("convert", packed, "-o", tmp_path / "a.kml")
+    assert (tmp_path / "a.kml").read_text().count("<gx:coord>") > 100
+    flight = open_flown([folder / "new.ulg"], OPTIONS)
+    assert flight.duration_s == pytest.approx(flown.DURATION_S, abs=1.0)
+
+
+def test_what_is_not_installed_is_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "gateway.flights.formats.ulog_file", raising=False)
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.csv", code=2)
+    assert "needs pyulog, the extra mavgate[formats]" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
+def test_damage_is_counted_and_told(folder: Path, tmp_path: Path, name: str) -> None:
+    data = (folder / name).read_bytes()
+    _, all_rows = whole(folder / name)
+    middle = len(data) // 2
+    spoilt = flown.write(
+        tmp_path / name, data[:middle] + b"\x00\xff" * 300 + data[middle + 77 : -11]
+    )
+    table, rows = rows_of(spoilt)
+    assert len(all_rows) > len(rows) > 0.9 * len(all_rows)
+    assert any("is damaged" in remark for remark in table.remarks)
+    text = run("convert", spoilt, "-o", tmp_path / "x.csv")
+    assert "is damaged" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.01])
+def test_what_is_cut_off_early_is_refused(
+    folder: Path, tmp_path: Path, name: str, share: float
+) -> None:
+    data = (folder / name).read_bytes()
+    stub = flown.write(tmp_path / name, data[: 100 + int(share * 8000)])
+    with pytest.raises(FlightError, match=name):
+        list(open_rows(stub, OPTIONS).rows)
+    assert name in run("info", stub, code=2)
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("name", MAKERS)
+def test_no_damage_is_fatal(folder: Path, tmp_path: Path, name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray((folder / name).read_bytes()[:60_000])
+    for place in rng.integers(0 if seed % 2 else 2000, len(data), 40).tolist():
+        data[place] = int(rng.integers(256))
+    spoilt = flown.write(tmp_path / name, bytes(data[: int(rng.integers(3000, len(data)))]))
+    try:
+        table, rows = rows_of(spoilt)
+    except (FlightError, OSError):
+        return
+    assert all(a.time_us <= b.time_us for a, b in itertools.pairwise(rows))
+    assert all(isinstance(remark, str) for remark in table.remarks)
