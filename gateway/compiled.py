@@ -45,7 +45,9 @@ def _borrowed(names: dict[str, Any]) -> Iterator[tuple[str, object]]:
     """Return what machine code may hold of other files: their constants, and what they compile."""
     for name, value in names.items():
         if isinstance(value, ModuleType):
-            yield from ((n, v) for n, v in vars(value).items() if isinstance(v, int | float))
+            # What is private may be an address, which is another one in every process.
+            public = ((n, v) for n, v in vars(value).items() if not n.startswith("_"))
+            yield from ((n, v) for n, v in public if isinstance(v, int | float))
         elif isinstance(value, int | float | tuple | np.dtype):
             yield (name, value)
         elif isinstance(files := _files(value), _FileBySignature):

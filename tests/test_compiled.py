@@ -1,5 +1,6 @@
 import importlib
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.compiled import is_kept
+from gateway.compiled import is_kept, record_at
 
 SOURCE = """
 from gateway.compiled import compiled
@@ -55,6 +56,16 @@ def test_two_processes_compile_for_different_types_at_once(tmp_path: Path) -> No
     assert after(FAR) == 2.0
     assert after(NEAR) == 1.0
     assert after.stats.cache_hits[after.signatures[0]] == 1
+
+
+@pytest.mark.io
+def test_every_process_takes_the_code_for_made_of_the_same() -> None:
+    tell = (
+        "from gateway.compiled import record_at as at; print(at._cache._cache_file._source_stamp)"
+    )
+    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
+    here: Any = record_at
+    assert other.stdout.strip() == here._cache._cache_file._source_stamp
 
 
 @pytest.mark.io
