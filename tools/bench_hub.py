@@ -1,21 +1,25 @@
 """Measure how the hub forwards MAVLink over UDP and WebSocket, beside a plain UDP forwarder.
 
-A source sends frames of a foreign vehicle to the forwarder, which passes them to N clients, all on
+A source sends frames of foreign vehicles to the forwarder, which passes them to N clients, all on
 loopback. Three figures for each forwarder and N:
 
-* the lossless maximum: the source keeps at most a window of frames under way, so nothing can be
-  lost and the forwarder sets the pace;
+* the lossless maximum: the source keeps at most a window of frames under way and the forwarder
+  sets the pace; the run lasts until every frame has come to every client, so that nothing is left
+  in any buffer, and what has not come within half a second is lost;
 * the CPU time that the forwarder uses for each delivered message meanwhile;
 * latency and CPU share at a fixed rate, from the source's clock before the send to the kernel's
-  stamp at the client's socket, so that the clients' own wake-ups do not count.
+  stamp at the client's socket, datagram or stream, so that the clients' own wake-ups do not count.
+  The kernel gives bytes of a stream that lie there together the stamp of the last: the clients
+  read whatever comes at once.
 
 The plain forwarder receives with a blocking `recvfrom` and sends with a blocking `sendto` for each
 client, looking at nothing. Forwarders take turns in short rounds, so that other load on the
-machine meets them alike. Such load only ever slows: the best round counts for the maximum and its
-CPU time, the median round for latencies.
+machine meets them alike; all are sent to from the same port. Such load only ever slows: the best
+round counts for the maximum and its CPU time, the median round for latencies.
 
-"WebSocket" is the hub with its clients at a WebSocket port. Their stamps are taken when this
-process reads, since the kernel stamps no bytes of a stream: its wake-up is in the latencies.
+"WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients take
+several frames in one datagram. `--systems` shows another thing: the source is a link with so many
+vehicles behind it, and the first client sends each of them a command.
 """
 
 import argparse
@@ -40,7 +44,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-CLIENTS = (1, 4, 16)
+CLIENTS = (1, 4, 16, 64)
 RATE_HZ = 1000
 SOURCE_SYSTEM = 42
 FRAMES = 20_000
@@ -52,6 +56,9 @@ START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
 WEB = "WebSocket"
 """The hub again, its clients at a WebSocket port."""
+PACKED = "packed"
+"""The hub again, its clients' frames packed."""
+COMMANDED_S = 3.0
 
 PLAIN = """
 import socket, sys
@@ -66,14 +73,16 @@ while True:
 
 HUB = """
 import asyncio, sys
+OPTIONS = "%s"
 from gateway.edges.clock import GatewayClock
 from gateway.edges.hub.hub import Hub
 from gateway.routing.hub_settings import HubSettings
 
 async def main():
-    clients = tuple(f"udp:127.0.0.1:{port}" for port in sys.argv[2:])
+    clients = tuple(f"udp:127.0.0.1:{port}{OPTIONS}" for port in sys.argv[2:])
     endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", *clients)
-    hub = Hub(HubSettings(endpoints=endpoints), lambda incoming: None, GatewayClock())
+    hub = Hub(HubSettings(endpoints=endpoints, max_clients=500), lambda incoming: None,
+              GatewayClock())
     hub.start()
     await asyncio.Event().wait()
 
@@ -152,12 +161,18 @@ def mavproxy(command: str) -> Command:
     return build
 
 
-def source_frames() -> list[bytes]:
-    """Encode the frames that the source sends."""
-    link = mavlink.MAVLink(None, SOURCE_SYSTEM, 1)
+def hub(options: str = "") -> Command:
+    """Make the command line of our hub, its clients with some options of an endpoint."""
+    return python(HUB % options)
+
+
+def source_frames(systems: int = 1) -> list[bytes]:
+    """Encode the frames that the source sends, of so many vehicles in turns."""
+    links = [mavlink.MAVLink(None, SOURCE_SYSTEM + n, 1) for n in range(systems)]
     frames = []
     for number in range(FRAMES):
-        link.seq = number % 256
+        link = links[number % systems]
+        link.seq = number // systems % 256
         angle = number / FRAMES
         message = mavlink.MAVLink_attitude_quaternion_message(
             number, 1.0, angle, -angle, angle, 0.1, 0.2, 0.3
@@ -172,11 +187,11 @@ def heartbeat() -> bytes:
     return bytes(message.pack(mavlink.MAVLink(None, SOURCE_SYSTEM, 1)))
 
 
-def udp_socket() -> socket.socket:
-    """Open a socket on a free loopback port."""
+def udp_socket(port: int = 0) -> socket.socket:
+    """Open a socket on a loopback port, a free one if none is named."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-    sock.bind(("127.0.0.1", 0))
+    sock.bind(("127.0.0.1", port))
     sock.setblocking(False)
     return sock
 
@@ -194,8 +209,17 @@ def resident_kib(pid: int) -> int:
     return int(status.partition("VmRSS:")[2].split()[0])
 
 
+def stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
+    """Return when the kernel took what a `recvmsg` gave."""
+    seconds, nanoseconds = struct.unpack("=qq", ancillary[0][2])
+    return int(seconds * 1_000_000_000 + nanoseconds)
+
+
 class Bench:
     """A running forwarder with its source and its clients."""
+
+    source_port = 0
+    """Whence frames are sent: the first free port, and from then on that one."""
 
     def __init__(self, command: Command, clients: int, frames: list[bytes]) -> None:
         self._frames = frames
@@ -208,7 +232,8 @@ class Bench:
             self._poll.register(sink, select.POLLIN)
         with udp_socket() as probe:
             self.port: int = probe.getsockname()[1]
-        self._source = udp_socket()
+        self._source = udp_socket(self.source_port)
+        Bench.source_port = self._source.getsockname()[1]
         self._source.connect(("127.0.0.1", self.port))
         self._counts = [0] * clients
         self._stamps: list[list[int]] | None = None
@@ -238,20 +263,23 @@ class Bench:
         begin_ns, begin_cpu = time.perf_counter_ns(), cpu_ns(self.process.pid)
         end_ns = begin_ns + round(seconds * 1e9)
         moved_ns = begin_ns
-        while (now_ns := time.perf_counter_ns()) < end_ns:
-            while sent - lost - min(self._counts) < window:
+        while True:
+            now_ns = time.perf_counter_ns()
+            while now_ns < end_ns and sent - lost - min(self._counts) < window:
                 self._send(self._frames[sent % FRAMES])
                 sent += 1
+            if now_ns >= end_ns and min(self._counts) == sent:
+                break
             if self._drain(20):
-                moved_ns = now_ns
+                moved_ns = time.perf_counter_ns()
             elif now_ns - moved_ns > STALL_S * 1e9:
-                lost = sent - min(self._counts)
-                moved_ns = now_ns
-        elapsed_s = (time.perf_counter_ns() - begin_ns) / 1e9
+                lost, moved_ns = sent - min(self._counts), now_ns
+                if now_ns >= end_ns:
+                    break
+        elapsed_s = (moved_ns - begin_ns) / 1e9
         used_ns = cpu_ns(self.process.pid) - begin_cpu
         delivered = sum(self._counts)
-        self._settle()
-        lost = sent * len(self._sinks) - sum(self._counts)
+        lost = sent * len(self._sinks) - delivered
         return Throughput(delivered / elapsed_s, used_ns / max(1, delivered) / 1000, lost)
 
     def latency(self, seconds: float, rate_hz: int) -> Latency:
@@ -263,11 +291,10 @@ class Bench:
         for number in range(round(seconds * rate_hz)):
             due_ns = begin_ns + number * 1_000_000_000 // rate_hz
             while (wait_ns := due_ns - time.time_ns()) > 0:
-                time.sleep(wait_ns / 1e9)
+                for sink in select.select(self._sinks, (), (), wait_ns / 1e9)[0]:
+                    self._take(sink.fileno())
             sent_ns.append(time.time_ns())
             self._send(self._frames[number % FRAMES])
-            if number % 64 == 63:
-                self._drain(0)
         elapsed_ns = time.time_ns() - begin_ns
         used_ns = cpu_ns(self.process.pid) - begin_cpu
         self._settle()
@@ -283,6 +310,31 @@ class Bench:
             gap_us=max((float(np.diff(row).max()) for row in stamps if len(row) > 1), default=0.0)
             / 1000,
         )
+
+    def commanded(self, systems: int) -> int:
+        """Let the first client send a command to each of so many vehicles; tell how many came."""
+        for number in range(2 * systems):
+            self._send(self._frames[number])
+        self._sinks[0].setblocking(True)
+        _, forwarder = self._sinks[0].recvfrom(2048)
+        self._sinks[0].setblocking(False)
+        self._settle()
+        station = mavlink.MAVLink(None, 255, 190)
+        for number in range(systems):
+            ask = mavlink.MAVLink_command_long_message(
+                SOURCE_SYSTEM + number, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *(0,) * 7
+            )
+            self._sinks[0].sendto(ask.pack(station), forwarder)
+            station.seq = (station.seq + 1) % 256
+            time.sleep(0.005)
+        reached, end_s = set(), time.monotonic() + COMMANDED_S
+        reader = mavlink.MAVLink(None)
+        while time.monotonic() < end_s and len(reached) < systems:
+            if select.select([self._source], (), (), 0.1)[0]:
+                for message in reader.parse_buffer(self._source.recv(2048)) or []:
+                    if message.get_type() == "COMMAND_LONG":
+                        reached.add(message.target_system)
+        return len(reached)
 
     def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:
         """Forward until so many messages were delivered; yield count and KiB now and then."""
@@ -318,20 +370,21 @@ class Bench:
             pass
 
     def _drain(self, wait_ms: int) -> int:
-        """Take what has come; return how many datagrams that were."""
-        taken = 0
-        for fd, _ in self._poll.poll(wait_ms):
-            place = self._by_fd[fd]
-            count = self._read_stamps(place) if self._stamps else self._read(place)
-            self._counts[place] += count
-            taken += count
-        return taken
+        """Take what has come; return how many frames that were."""
+        return sum(self._take(fd) for fd, _ in self._poll.poll(wait_ms))
+
+    def _take(self, fd: int) -> int:
+        place = self._by_fd[fd]
+        count = self._read_stamps(place) if self._stamps else self._read(place)
+        self._counts[place] += count
+        return count
 
     def _read(self, place: int) -> int:
+        # Other frames, such as heartbeats, are shorter than ours; several of ours may be in one.
         receive, length, count = self._sinks[place].recv, self._length, 0
         try:
             while True:
-                count += len(receive(2048)) == length
+                count += len(receive(2048)) // length
         except BlockingIOError:
             return count
 
@@ -341,9 +394,7 @@ class Bench:
         try:
             while True:
                 data, ancillary, _, _ = sink.recvmsg(2048, 64)
-                if len(data) == self._length:
-                    seconds, nanoseconds = struct.unpack("=qq", ancillary[0][2])
-                    row.append(seconds * 1_000_000_000 + nanoseconds)
+                row += [stamp_ns(ancillary)] * (len(data) // self._length)
         except BlockingIOError:
             return len(row) - before
 
@@ -370,6 +421,7 @@ class WebBench(Bench):
         self._by_fd = {sink.fileno(): place for place, sink in enumerate(self._sinks)}
         self._rests = [b""] * len(self._sinks)
         for sink in self._sinks:
+            sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._poll.register(sink, select.POLLIN)
         super()._wait_until_up()
 
@@ -391,28 +443,31 @@ class WebBench(Bench):
         return sink
 
     def _read(self, place: int) -> int:
-        return len(self._messages(place))
+        return self._messages(place, self._received(place)[0])
 
     def _read_stamps(self, place: int) -> int:
         assert self._stamps is not None
-        count, now_ns = len(self._messages(place)), time.time_ns()
-        self._stamps[place] += [now_ns] * count
+        data, ancillary = self._received(place)
+        count = self._messages(place, data)
+        self._stamps[place] += [stamp_ns(ancillary)] * count if count else []
         return count
 
-    def _messages(self, place: int) -> list[bytes]:
-        """Return the messages of one frame of ours each that have come."""
-        data = self._rests[place]
+    def _received(self, place: int) -> tuple[bytes, list[tuple[int, int, bytes]]]:
         try:
-            while chunk := self._sinks[place].recv(65536):
-                data += chunk
+            data, ancillary, _, _ = self._sinks[place].recvmsg(1 << 20, 64)
         except BlockingIOError:
-            pass
-        found, at = [], 0
+            return b"", []
+        return data, ancillary
+
+    def _messages(self, place: int, chunk: bytes) -> int:
+        """Return how many messages of one frame of ours each are complete."""
+        data = self._rests[place] + chunk
+        count, at = 0, 0
         while at + 2 <= len(data) and at + 2 + data[at + 1] <= len(data):
-            found.append(data[at + 2 : at + 2 + data[at + 1]])
+            count += data[at + 1] == self._length
             at += 2 + data[at + 1]
         self._rests[place] = data[at:]
-        return [message for message in found if len(message) == self._length]
+        return count
 
 
 def lossless(bench: Bench, seconds: float) -> Throughput:
@@ -487,9 +542,40 @@ def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
     Console(width=120).print(table)
 
 
+def measure_systems(
+    forwarders: dict[str, Command], systems: int, clients: int, seconds: float
+) -> dict[str, dict[str, float]]:
+    """Reach so many vehicles behind one link, and see what each of their frames costs."""
+    found: dict[str, dict[str, float]] = {}
+    table = Table(title=f"{systems} vehicles behind one link", box=box.SIMPLE_HEAD)
+    for column in ("forwarder", "commanded", "CPU µs/msg", "of one vehicle"):
+        table.add_column(column, justify="right")
+    for name, command in forwarders.items():
+        if name in (WEB, "plain"):
+            continue
+        costs: dict[int, float] = {}
+        for behind in (1, systems):
+            bench = Bench(command, clients, source_frames(behind))
+            try:
+                runs = [bench.throughput(seconds, WINDOWS[-1]) for _ in range(3)]
+                costs[behind] = min(run.cpu_us_per_message for run in runs)
+                reached = bench.commanded(behind)
+            finally:
+                bench.close()
+        found[name] = {
+            "commanded": reached,
+            "cpu_us_per_message": costs[systems],
+            "cpu_us_of_one_vehicle": costs[1],
+        }
+        figures = [f"{value:.2f}" for value in list(found[name].values())[1:]]
+        table.add_row(name, f"{found[name]['commanded']} of {systems}", *figures)
+    Console(width=120).print(table)
+    return found
+
+
 def watch_memory(messages: int) -> dict[str, int]:
     """Forward many messages through the hub to 16 clients and watch its memory."""
-    bench = Bench(python(HUB), 16, source_frames())
+    bench = Bench(hub(), 16, source_frames())
     track: list[tuple[int, int]] = []
     try:
         for total, kib in bench.run_until(messages):
@@ -509,19 +595,26 @@ def main() -> None:
     parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
     parser.add_argument("--mavlink-router", metavar="COMMAND", help="compare mavlink-routerd")
     parser.add_argument("--mavproxy", metavar="COMMAND", help="compare mavproxy.py")
+    parser.add_argument("--systems", type=int, help="only command so many vehicles behind one link")
     parser.add_argument(
         "--memory", type=int, metavar="MESSAGES", help="only watch memory over so many messages"
     )
     options = parser.parse_args()
     report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
+    forwarders = {
+        "plain": python(PLAIN), "mavgate": hub(), PACKED: hub("?pack=1100"), WEB: python(WEB_HUB)
+    }  # fmt: skip
+    if options.mavlink_router:
+        forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
+    if options.mavproxy:
+        forwarders["mavproxy"] = mavproxy(options.mavproxy)
     if options.memory:
         report["memory"] = watch_memory(options.memory)
+    elif options.systems:
+        report["systems"] = measure_systems(
+            forwarders, options.systems, options.clients[0], options.seconds
+        )
     else:
-        forwarders = {"plain": python(PLAIN), "mavgate": python(HUB), WEB: python(WEB_HUB)}
-        if options.mavlink_router:
-            forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
-        if options.mavproxy:
-            forwarders["mavproxy"] = mavproxy(options.mavproxy)
         figures = {
             str(clients): measure(forwarders, clients, options.rounds, options.seconds)
             for clients in options.clients
