@@ -52,15 +52,25 @@ def _held(mag: np.ndarray) -> np.ndarray:
     return mag[index]
 
 
+def vqf_input(
+    flight: Flight,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return specific force, rate, the held compass, where it is new, and the interval in s."""
+    imu, new, dt_s, _ = _uniform(flight)
+    mag = _held(imu[:, 6:9]) if new.any() else imu[:, 6:9]
+    imu = np.column_stack([imu[:, :6], mag]) * np.tile([1.0, -1.0, -1.0], 3)
+    accel, gyro, mag = (np.ascontiguousarray(imu[:, k : k + 3]) for k in (0, 3, 6))
+    return accel, gyro, mag, new, dt_s
+
+
 def run_vqf(flight: Flight) -> np.ndarray:
     """VQF of Laidig and Seel, its defaults."""
     from vqf import VQF
 
-    imu, new, dt_s, back = _uniform(flight)
-    imu = imu * np.tile([1.0, -1.0, -1.0], 3)
+    accel, gyro, mag, new, dt_s = vqf_input(flight)
+    *_, back = _uniform(flight)
     use_mag = bool(new.any())
     vqf = VQF(dt_s, magTs=dt_s / float(new.mean())) if use_mag else VQF(dt_s)
-    accel, gyro, mag = (np.ascontiguousarray(imu[:, k : k + 3]) for k in (0, 3, 6))
     out = np.empty((len(gyro), 4))
     for i in range(len(gyro)):
         vqf.updateGyr(gyro[i])

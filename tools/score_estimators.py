@@ -37,6 +37,7 @@ from gateway.estimation.smoothing.smoother import smooth
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
 from tools.peers import PEERS
 from tools.score_honesty import consistency, share, two_sigma
+from tools.score_speeds import singly_per_s, vqf_per_s
 from tools.score_tables import (
     SPEEDS,
     Scores,
@@ -250,6 +251,12 @@ def score(flight: Flight, name: str, run: Run) -> Scores:
         scores |= honesty_scores(flight, run, out)
     scores["finite"] = float(np.isfinite(out[:, :4]).all())
     scores["samples_per_s"] = len(out) / best_s
+    if name in OWN:
+        scores["singly_per_s"] = singly_per_s(flight, name)
+    elif name == "vqf":
+        scores["samples_per_s"], scores["singly_per_s"] = vqf_per_s(flight)
+    elif name in PEERS:
+        scores["singly_per_s"] = scores.pop("samples_per_s")
     return scores
 
 

@@ -39,6 +39,8 @@ SCORES = {
     "out10": "10 s", "fix_out10": "to fixes", "out30": "30 s", "fix_out30": "to fixes",
 }  # fmt: skip
 """Columns of the first table: what is scored, and its heading."""
+RATES = ("samples_per_s", "singly_per_s")
+"""Over a whole log at once, and sample by sample."""
 KINDS = ("tilt", "heading", "place")
 SPANS = {"2s": "", "out10": "10 s\n", "out30": "30 s\n", "alone": "no GPS\n"}
 """With GPS, in outages of two lengths, and without GPS throughout."""
@@ -55,11 +57,11 @@ def targets_for(flight: str, name: str, rows: dict[str, Scores]) -> Scores:
 def show_scores(board: dict[str, dict[str, Scores]]) -> None:
     """Print how far off each estimator is on each flight."""
     title = "RMSE in deg and m; over outages also to the fixes that were withheld"
-    table = table_of(title, (*SCORES.values(), "samples/s"))
+    table = table_of(title, (*SCORES.values(), "samples/s", "singly/s"))
     for flight, rows in board.items():
         for name, scores in rows.items():
             wanted = targets_for(flight, name, rows)
-            cells = [cell(scores, column, wanted) for column in (*SCORES, "samples_per_s")]
+            cells = [cell(scores, column, wanted) for column in (*SCORES, *RATES)]
             table.add_row(flight, name, *cells)
         table.add_section()
     Console(width=WIDTH).print(table)
@@ -128,7 +130,7 @@ def cell(scores: Scores, column: str, wanted: Scores) -> str:
     value = scores.get(column, math.nan)
     if not math.isfinite(value):
         return ""
-    text = f"{value:,.0f}" if column == "samples_per_s" else f"{value:.2f}"
+    text = f"{value:,.0f}" if column in RATES else f"{value:.2f}"
     if column not in wanted:
         return text
     more = column == "samples_per_s"
