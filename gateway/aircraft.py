@@ -230,12 +230,15 @@ class Aircraft:
         found = self.vehicle.take_settings("calibration", calibration)
         return changed + self.perform(found, now_us)
 
-    def change(self, settings: AircraftSettings) -> None:
-        """Take over what differs between these settings and those that hold."""
+    def change(self, settings: AircraftSettings, now_us: int) -> list[Action]:
+        """Take over what differs from the settings that hold, and tell parameters that differ."""
+        actions: list[Action] = []
         for section in ("sensing", "calibration", "estimation"):
             wanted = getattr(settings, section)
             if wanted != getattr(self.settings, section):
-                self._change(section, wanted)
+                actions += self._change(section, wanted)
+                actions += self.perform(self.vehicle.take_settings(section, wanted), now_us)
+        return actions
 
     def sign_by(self, passphrase: str, now_us: int) -> list[Action]:
         """Sign, and check signatures, by another passphrase from now on."""

@@ -132,10 +132,10 @@ class Pipeline:
     def _ever(self) -> list[Aircraft]:
         return [*self.aircraft.values(), *self._gone.values()]
 
-    def change(self, vehicle_id: int, settings: AircraftSettings) -> None:
+    def change(self, vehicle_id: int, settings: AircraftSettings, now_us: int) -> list[Action]:
         """Let an aircraft go on with other settings, as it did when it was recorded."""
-        if vehicle_id in self.aircraft:
-            self.aircraft[vehicle_id].change(settings)
+        aircraft = self.aircraft.get(vehicle_id)
+        return [] if aircraft is None else aircraft.change(settings, now_us)
 
     def restore(self, state: FusionState) -> None:
         """Let an aircraft's fusion go on from a state; raises ValueError as `make_fusion`."""

@@ -9,7 +9,7 @@ import msgspec
 from gateway import __version__
 from gateway.aircraft import Action, AircraftSettings
 from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableHeader
+from gateway.flightlog.table.table import REMARK, TableHeader, TableMark
 from gateway.pipeline import Pipeline
 from gateway.records import (
     BaroRaw,
@@ -22,6 +22,7 @@ from gateway.records import (
     NodeStatus,
 )
 from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.vehicle.telemetry.events import INFO, StatusText
 
 HALF_TURN_DEGE7: Final = 1_800_000_000
 LONGEST_SILENCE_US: Final = 1_000_000
@@ -48,13 +49,13 @@ class Replay:
         """Why states of the file were not gone on from: it then settles like a cold start."""
 
     def take(
-        self, row: TableRow | TableHeader | FusionState | NodeStatus
+        self, row: TableRow | TableHeader | TableMark | FusionState | NodeStatus
     ) -> Iterator[tuple[int, Action]]:
-        """Take one row, a change of settings, or a state to go on from.
+        """Take one row, a change of settings, a mark, or a state to go on from.
 
         Parameters
         ----------
-        row : TableRow, TableHeader, FusionState or NodeStatus
+        row : TableRow, TableHeader, TableMark, FusionState or NodeStatus
             The next of the file.
 
         Yields
@@ -64,7 +65,15 @@ class Replay:
         """
         if isinstance(row, TableHeader):
             if self._follow:
-                self._pipeline.change(row.vehicle_id, settings_of(row))
+                now_us = self._now_us or 0
+                for action in self._pipeline.change(row.vehicle_id, settings_of(row), now_us):
+                    yield now_us, action
+            return
+        if isinstance(row, TableMark):
+            yield from self._wait(row.time_us)
+            now_us = self._now_us or 0
+            for action in self._pipeline.say(StatusText(INFO, REMARK + row.text), now_us):
+                yield now_us, action
             return
         if isinstance(row, FusionState):
             self.restore(row)

@@ -234,7 +234,7 @@ def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
     monkeypatch.setattr("gateway.aircraft.make_estimator", fail)
     before = aircraft.settings
     with pytest.raises(ArithmeticError):
-        aircraft.change(with_estimator("eskf"))
+        aircraft.change(with_estimator("eskf"), 0)
     assert aircraft.settings == before
 
 

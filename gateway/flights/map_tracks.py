@@ -11,7 +11,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.flightlog.mapshape import INTERVAL_US, MapPlace, PlaceKind, TrackPoint, VehicleTrack
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableMark
+from gateway.flightlog.table.table import REMARK, TableMark
 from gateway.flightlog.tlog.recorded_commands import is_station
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.reading import RecordedTable
@@ -38,8 +38,6 @@ INFO: Final = 6
 """MAV_SEVERITY_INFO; what is less is for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
 """How the gateway tells a place that somebody marked."""
-REMARK: Final = "Mark: "
-"""How it tells a remark that somebody made."""
 MAX_PLACES: Final = 10_000
 """Of one vehicle; a flood of texts must not fill the memory."""
 

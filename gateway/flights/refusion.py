@@ -101,8 +101,6 @@ class Refusion:
         """Yield the MAVLink that the gateway would have sent, at civil times."""
         stamper = Stamper(self._zero_us or 0)
         for row in self._table.rows:
-            if isinstance(row, TableMark):
-                continue
             for now_us, action in self._replay.take(row):
                 if isinstance(action, Outgoing) and action.client_id is None:
                     yield TlogRecord(stamper.stamp(now_us), action.frame)

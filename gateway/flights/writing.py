@@ -1,6 +1,7 @@
 """Flights written as files: one writer a format, by the ending of the file's name."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -25,6 +26,7 @@ from gateway.flights.reading import (
     ReadOptions,
     RecordedTable,
     aircraft_of,
+    import_format,
     joined_rows,
     open_rows,
     recorded_frames,
@@ -78,6 +80,7 @@ class FlightToWrite:
         """Whether the frames are those that were recorded, and the rows are read out of them."""
         self._as_recorded = kinds == {FileKind.TABLE} and not fuse
         self._refusion: Refusion | None = None
+        self._remarks: list[str] = []
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink: as recorded, or what the gateway would send for the rows."""
@@ -100,7 +103,11 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """What the user should know, once all is written."""
-        return self._refusion.remarks if self._refusion else []
+        return [*self._remarks, *(self._refusion.remarks if self._refusion else ())]
+
+    def remark(self, text: str) -> None:
+        """Let the user know something of what was written."""
+        self._remarks.append(text)
 
     def _fused(self) -> Refusion:
         self._refusion = Refusion(self.files, self.options, smooth=self._smooth)
@@ -113,7 +120,19 @@ WRITERS: Final[dict[str, Write]] = {}
 """By the ending of the file's name."""
 
 
-def add_writer(ending: str, write: Write) -> None:
+@dataclass(frozen=True, slots=True)
+class Lacks:
+    """What a format cannot hold, in words."""
+
+    of_tables: str = ""
+    of_tlogs: str = ""
+
+
+LACKS: Final[dict[str, Lacks]] = {}
+"""By the ending of the file's name."""
+
+
+def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
     """Let `mavgate convert` write one more format.
 
     Parameters
@@ -122,6 +141,8 @@ def add_writer(ending: str, write: Write) -> None:
         Of the file's name, with its dot.
     write : callable
         Yields the file's bytes piece by piece.
+    lacks : Lacks
+        What of a recording the format cannot hold, which the user is told.
 
     Raises
     ------
@@ -130,7 +151,7 @@ def add_writer(ending: str, write: Write) -> None:
     """
     if ending in WRITERS:
         raise ValueError(f"files that end in {ending} are written already")
-    WRITERS[ending] = write
+    WRITERS[ending], LACKS[ending] = write, lacks
 
 
 def _write_tlog(flight: FlightToWrite) -> Iterator[bytes]:
@@ -168,10 +189,24 @@ def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
     return found
 
 
-add_writer(".tlog", _write_tlog)
-add_writer(".csv", _write_table)
-add_writer(".kml", _write_kml)
-add_writer(".gpx", _write_gpx)
+def _packaged(module: str, name: str) -> Write:
+    """Return a writer whose packages are imported when it is wanted."""
+
+    def write(flight: FlightToWrite) -> Iterable[bytes]:
+        pieces: Iterable[bytes] = import_format(module, name).write(flight)
+        return pieces
+
+    return write
+
+
+NOT_FUSED: Final = "raw samples, settings and the states' digits"
+NOT_DRAWN: Final = "samples, velocities and settings", "messages but positions, attitude and texts"
+
+add_writer(".tlog", _write_tlog, Lacks(of_tables=NOT_FUSED))
+add_writer(".csv", _write_table, Lacks(of_tlogs="what is no sample, fix or state of one vehicle"))
+add_writer(".kml", _write_kml, Lacks(*NOT_DRAWN))
+add_writer(".gpx", _write_gpx, Lacks(*NOT_DRAWN))
+add_writer(".mcap", _packaged("mcap_file", "MCAP"), Lacks(of_tables=NOT_FUSED))
 
 
 def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:

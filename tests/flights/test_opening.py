@@ -11,11 +11,12 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.config import GatewaySettings
 from gateway.flightlog.answers import VehicleAnswers
 from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import encode_head
+from gateway.flightlog.table.table import encode_head, encode_header
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.opening import PlayedFlight, lay_out, open_flights
 from gateway.flights.reading import FlightError, ReadOptions
 from gateway.pipeline import PipelineSettings
+from gateway.replay import header_for
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight, read
 
@@ -78,6 +79,30 @@ def test_a_fused_flight_answers_with_the_settings_that_it_is_fused_by(
     (silent,) = (f for n, f in answers.parameters().items() if "SILENT" in n)
     assert mavlink.MAVLink(None).decode(bytearray(silent)).param_value == 7.5
     assert len(answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)) == 1
+
+
+def test_settings_changed_in_flight_are_answered_from_then_on(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    then = GatewaySettings().default_aircraft
+    sensing = msgspec.structs.replace(then.sensing, accel_cutoff_hz=3.5)
+    changed = header_for(msgspec.structs.replace(then, sensing=sensing), 1)
+    header, rows = read(fly(then, make_flight(rng, 6))[0])
+    half = len(rows) // 2
+    path = tmp_path / "a_01_v1.csv"
+    lines = [*map(row_to_line, rows[:half]), encode_header(changed), *map(row_to_line, rows[half:])]
+    path.write_text(encode_head(header) + "".join(lines))
+    with ExitStack() as opened:
+        (flight,) = lay_out(open_flights([path], OPTIONS, opened))
+        (track,) = flight.tracks
+        while not track.prepare(rows[-1].time_us):
+            pass
+    told = {}
+    for at_us in (rows[0].time_us, rows[-1].time_us):
+        answers = VehicleAnswers(flight.answers, 1, 1, lambda at_us=at_us: at_us).parameters()
+        (cutoff,) = (frame for name, frame in answers.items() if "ACC_CUTOFF" in name)
+        told[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
+    assert list(told.values()) == [then.sensing.accel_cutoff_hz, 3.5]
 
 
 def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:

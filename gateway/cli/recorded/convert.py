@@ -30,10 +30,10 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.cli.support.terminal import console_of
 from gateway.flights.reading import ReadOptions
-from gateway.flights.writing import WRITERS, FlightToWrite
+from gateway.flights.writing import LACKS, WRITERS, FlightToWrite
 from gateway.output import write_new
 
-FROM_TLOGS: Final = (".tlog", ".kml", ".gpx")
+FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".mcap")
 """What is made of a recording's tlogs: they hold all its vehicles, and what was said."""
 
 
@@ -63,8 +63,8 @@ def convert(
 ) -> None:
     """Convert, trim and join recordings.
 
-    Tlogs and tables become one another, or a track for a map. A tlog of any autopilot that holds
-    HIGHRES_IMU, RAW_IMU or SCALED_IMU becomes a table that can be fused; a CSV of another program
+    Tlogs and tables become one another, a track for a map, or MCAP for Foxglove. Logs of other
+    autopilots (tlog, ULog, DataFlash) become tables that can be fused; a CSV of another program
     does by its column map.
     """
     write = WRITERS.get(out.suffix)
@@ -91,4 +91,7 @@ def convert(
         inputs = [*files, columns, config]
         size = write_new(out, write(flight), overwrite=force, inputs=inputs)
     tell_remarks(flight.remarks)
+    lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
+    if lacks:
+        tell_remarks([f"{out} does not hold {lacks}"])
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)

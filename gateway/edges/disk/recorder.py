@@ -35,7 +35,7 @@ from gateway.flightlog.session import (
     SessionState,
 )
 from gateway.flightlog.table.part import PENDING_LIMIT, Part
-from gateway.flightlog.table.table import TableHeader, TableMark
+from gateway.flightlog.table.table import REMARK, TableHeader, TableMark
 from gateway.flightlog.tlog.stamps import CivilClock
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 from gateway.status import RecorderStatus
@@ -153,7 +153,7 @@ class Recorder:
         """Put a remark at this moment into the recording."""
         if self._part is not None:
             self._part.add_mark(TableMark(self._clock(), text))
-        self._announce(False, f"Mark: {text}")
+        self._announce(False, REMARK + text)
 
     async def save(self, name: str) -> None:
         """Name the session that runs, or ran last.

@@ -56,6 +56,10 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """The calibration of the aircraft's IMU node."""
 
 
+REMARK: Final = "Mark: "
+"""How a gateway tells its clients a remark that somebody made."""
+
+
 class TableMark(msgspec.Struct, frozen=True):
     """A remark at a moment of the flight."""
 

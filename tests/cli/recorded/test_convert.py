@@ -332,3 +332,9 @@ def test_remarks_stay_in_their_place(table: Path, tmp_path: Path, options: list[
     run("convert", table, "-o", out, *options)
     assert out.read_text().splitlines().index(mark) == lines.index(mark)
     run("convert", table, "-o", tmp_path / "again.tlog")
+    log = mavutil.mavlogfile(str(tmp_path / "again.tlog"))
+    texts = []
+    while (message := log.recv_match(type="STATUSTEXT")) is not None:
+        texts.append(message.text)
+    log.close()
+    assert "Mark: over the wood" in texts
