@@ -1,19 +1,22 @@
 """Frames of a site with the ids that its vehicles have here, and back.
 
-Changed are the sender in the header and the system that a message addresses; the checksum is made
-anew. A signature covers both: with the site's key it is checked first and made anew, with the link
-and the time stamp that it had; without the key a signed frame passes only if nothing changes.
+Changed are the sender in the header, the system that a message addresses and those that it names;
+the checksum is made anew. A signature covers both: with the site's key it is checked first and made
+anew, with the link and the time stamp that it had; without the key a signed frame passes only if
+nothing changes.
 """
 
 import hashlib
 import hmac
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.fleet.id_map import IdMap
+from gateway.fleet.named_systems import changes_of_names
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import (
@@ -104,27 +107,28 @@ class FrameTranslation:
             self.counters.unmapped += 1
             return None
         self._note(frame, origin, now_us)
-        target = target_of(frame)[0]
-        return self._rewritten(frame, own_id, self._ids.known_id(self._site, target) or target)
+        return self._rewritten(frame, own_id, self._id_here)
 
     def to_site(self, frame: bytes) -> tuple[int, bytes] | None:
         """Return the system at the site that a frame is for (0: all) and the frame for it."""
         sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
-        there = self._id_there(target)
-        changed = self._rewritten(frame, sender, there)
-        return None if changed is None else (there, changed)
+        changed = self._rewritten(frame, sender, self._id_there)
+        return None if changed is None else (self._id_there(target), changed)
 
     def id_of(self, system_id: int) -> int | None:
         """Return the id that a system of the site has here, if it has one."""
         return self._ids.known_id(self._site, system_id)
 
+    def _id_here(self, system_id: int) -> int:
+        return self.id_of(system_id) or system_id
+
     def _id_there(self, own_id: int) -> int:
         vehicle = self._ids.vehicle_of(own_id)
         return vehicle[1] if vehicle is not None and vehicle[0] == self._site else own_id
 
-    def _rewritten(self, frame: bytes, sender: int, target: int) -> bytes | None:
+    def _rewritten(self, frame: bytes, sender: int, rename: Callable[[int], int]) -> bytes | None:
         try:
-            return rewrite(frame, sender, target, self._key)
+            return rewrite(frame, sender, rename, self._key)
         except _CannotPassError as error:
             counter = str(error)
             setattr(self.counters, counter, getattr(self.counters, counter) + 1)
@@ -143,15 +147,17 @@ class FrameTranslation:
         self._sequences[origin] = sequence
 
 
-def rewrite(frame: bytes, sender: int, target: int, key: bytes | None) -> bytes:
-    """Return a frame of another sender to another target; the same object if nothing changes.
+def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes | None) -> bytes:
+    """Return a frame in which systems have other ids; the same object if nothing changes.
 
     Parameters
     ----------
     frame : bytes
         A complete frame.
-    sender, target : int
-        System ids; a message that addresses nobody keeps doing so.
+    sender : int
+        Who it is from.
+    rename : callable
+        Turns the id of a system that it addresses or names into the other one; 0 stays 0.
     key : bytes or None
         What signatures are checked and made with.
 
@@ -165,7 +171,9 @@ def rewrite(frame: bytes, sender: int, target: int, key: bytes | None) -> bytes:
         wanted = hashlib.sha256(key + frame[:-HASH_BYTES]).digest()[:HASH_BYTES]
         if not hmac.compare_digest(wanted, frame[-HASH_BYTES:]):
             raise _CannotPassError("forged")
-    if sender == origin_of(frame)[0] and target == target_of(frame)[0]:
+    target = rename(target_of(frame)[0])
+    names = changes_of_names(frame, rename)
+    if sender == origin_of(frame)[0] and target == target_of(frame)[0] and not names:
         return frame
     message_id = message_id_of(frame)
     if message_id not in CRC_EXTRA:
@@ -175,9 +183,12 @@ def rewrite(frame: bytes, sender: int, target: int, key: bytes | None) -> bytes:
     version_2 = frame[0] == START_V2
     changed = bytearray(frame[: -SIGNATURE_SIZE if signed else len(frame)])
     changed[5 if version_2 else 3] = sender
+    head = 10 if version_2 else 6
     offset = TARGET_OFFSETS.get(message_id, (NO_TARGET, NO_TARGET))[0]
     if NO_TARGET < offset < frame[1]:
-        changed[(10 if version_2 else 6) + offset] = target
+        changed[head + offset] = target
+    for at, value in names:
+        changed[head + at : head + at + len(value)] = value
     crc = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(bytes(changed[1:-2])))
     changed[-2:] = crc.to_bytes(2, "little")
     if not signed or key is None:

@@ -15,8 +15,8 @@ DROPPED: Final = {300: ("PROTOCOL_VERSION", 217), 397: ("COMPONENT_METADATA", 18
 NO_TARGET: Final = -1
 
 
-def _offset_of(message: Any, field: str) -> int:
-    """Find where a one-byte field stands in the payload, or `NO_TARGET`."""
+def offset_of(message: Any, field: str) -> int:
+    """Find where a field begins in the payload, or `NO_TARGET`."""
     offset = 0
     for name, code, length in zip(
         message.ordered_fieldnames, message.native_format[1:], message.array_lengths, strict=True
@@ -33,12 +33,12 @@ CRC_EXTRA: Final[dict[int, bytes]] = {
 """The byte that closes each message's checksum, as the checksum function wants it."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
-    message_id: (system, _offset_of(message, "target_component"))
+    message_id: (system, offset_of(message, "target_component"))
     for message_id, message in dialect.mavlink_map.items()
-    if (system := _offset_of(message, "target_system")) != NO_TARGET
+    if (system := offset_of(message, "target_system")) != NO_TARGET
 } | {
     dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: (
-        _offset_of(dialect.MAVLink_manual_control_message, "target"),
+        offset_of(dialect.MAVLink_manual_control_message, "target"),
         NO_TARGET,
     )
 }

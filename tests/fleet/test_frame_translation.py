@@ -65,6 +65,52 @@ def test_to_the_site(v1: bool) -> None:
     assert (got.command, got.param7) == (400, 7)
 
 
+def follow(leader: int, kind: Any) -> Any:
+    command, params = mavlink.MAV_CMD_DO_FOLLOW, (leader, 2, 3, 4)
+    if kind is mavlink.MAVLink_command_long_message:
+        return kind(2, 1, command, 0, *params, 5, 6, 7)
+    if kind is mavlink.MAVLink_command_int_message:
+        return kind(2, 1, 3, command, 0, 0, *params, 5, 6, 7)
+    return kind(2, 1, 0, 3, command, 0, 1, *params, 5, 6, 7)
+
+
+@pytest.mark.parametrize("v1", [False, True])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        mavlink.MAVLink_command_long_message,
+        mavlink.MAVLink_command_int_message,
+        mavlink.MAVLink_mission_item_message,
+        mavlink.MAVLink_mission_item_int_message,
+    ],
+)
+def test_a_system_that_a_command_names(kind: Any, v1: bool) -> None:
+    both = translation()
+    _, frame = both.to_site(packed(follow(2, kind), 255, v1=v1)) or (0, b"")
+    there = read(frame)
+    assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
+    back = read(both.from_site(packed(follow(1, kind), 1, v1=v1), 0) or b"")
+    assert (back.get_srcSystem(), back.param1, back.param2) == (2, 2, 2)
+
+
+@pytest.mark.parametrize("value", [0.0, -2.0, float("nan"), 255.0, 1e30])
+def test_what_names_no_vehicle_stays(value: float) -> None:
+    message = mavlink.MAVLink_command_long_message(
+        2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
+    )
+    _, frame = translation().to_site(packed(message, 255)) or (0, b"")
+    got = read(frame)
+    assert (got.param1, got.param2, got.param4) == (1, 2, 2)
+    assert got.param3 == pytest.approx(value, nan_ok=True)
+
+
+def test_who_steers_a_gimbal() -> None:
+    message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
+    got = read(translation().from_site(packed(message, 1), 0) or b"")
+    assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
+    assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
+
+
 def test_an_answer_keeps_the_ground_station_it_is_for() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190)
     got = read(translation().from_site(packed(ack, 1), 0) or b"")

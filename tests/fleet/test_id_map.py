@@ -31,6 +31,23 @@ def test_ids_of_ground_stations_are_given_to_nobody() -> None:
     assert IdMap().id_of("a", 255) == 1
 
 
+def test_a_vehicle_that_is_left_out_makes_room_for_one_that_waits() -> None:
+    ids = IdMap()
+    for n in range(LAST_ID + 2):
+        ids.id_of(f"site-{n}", 1)
+    assert ids.unmapped == {("site-249", 1), ("site-250", 1)}
+    ids.leave_out("site-7", 1)
+    assert ids.id_of("site-7", 1) is None
+    assert ids.id_of("site-250", 1) == 8
+    assert ids.id_of("site-249", 1) is None
+    again = IdMap(dict(ids.items()))
+    assert again.id_of("site-7", 1) is None
+    assert again.left_out == {("site-7", 1)}
+    again.set_by_hand("site-7", 1, 8)
+    assert again.id_of("site-7", 1) == 8
+    assert not again.left_out
+
+
 def test_more_than_there_are_ids_for() -> None:
     ids = IdMap()
     found = [ids.id_of(f"site-{n}", 1) for n in range(300)]
