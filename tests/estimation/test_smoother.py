@@ -3,12 +3,26 @@
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import NAV_ATTITUDE_STD, NAV_COLUMNS, NAV_FLAGS
+from gateway.estimation.columns import (
+    NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_POS_STD,
+)
 from gateway.estimation.eskf.eskf_state import STATES
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import _backward, smooth
 from tools.flights import Flight, read_flight, simulated_flight
-from tools.score_estimators import attitude_scores, outage_score, run_eskf, run_smoothed
+from tools.score_estimators import (
+    attitude_scores,
+    outage_score,
+    position_errors_m,
+    rms,
+    run_eskf,
+    run_smoothed,
+)
+from tools.spoil_flight import no_mag
 
 
 def test_backward_is_the_joint_estimate() -> None:
@@ -69,8 +83,30 @@ def test_the_estimator_is_left_as_it_was(flight: Flight) -> None:
 
 
 @pytest.mark.slow
+def test_a_place_that_follows_the_fixes_is_left_to_them(flight: Flight) -> None:
+    """On the ground without a compass no heading is known: what comes later moves nothing there."""
+    blind = no_mag(flight).flight
+    live, smoothed = run_eskf(blind), run_smoothed(blind)
+    before = np.isfinite(live[:, NAV_LAT]) & np.isnan(live[:, NAV_POS_STD])
+    assert before.sum() > 500
+    place = slice(NAV_LAT, NAV_LAT + 3)
+    np.testing.assert_allclose(smoothed[before, place], live[before, place], rtol=1e-8)
+
+
+@pytest.mark.slow
 def test_real_fixed_wing(data_dir) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     assert attitude_scores(flight, run_smoothed(flight)[:, :4])["yaw"] < 1.0
     assert outage_score(flight, run_smoothed, 10.0) < 1.7
     assert outage_score(flight, run_smoothed, 30.0) < 10.0
+
+
+@pytest.mark.slow
+def test_real_car(data_dir) -> None:
+    """Long parked without a heading; the smoother is not worse than the filter there."""
+    flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
+    live, smoothed = (
+        rms(position_errors_m(flight, run(flight))) for run in (run_eskf, run_smoothed)
+    )
+    assert smoothed < live + 0.1
+    assert outage_score(flight, run_smoothed, 10.0) < outage_score(flight, run_eskf, 10.0)

@@ -54,14 +54,21 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     """
     write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
     write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
-    row[NAV_VEL : NAV_VEL + 3] = NAN
-    row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
     row[NAV_FLAGS] = float(flags_of(s))
+    row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3] = NAN
+    if s.started == 1:
+        write_std(row, NAV_ATTITUDE_STD, s, TILT)
+    write_place(s, row)
+
+
+@compiled
+def write_place(s: EskfState, row: FloatArray) -> None:
+    """Write place and velocity, and how accurate they are; NaN what is not known."""
+    row[NAV_VEL : NAV_VEL + 3] = NAN
+    row[NAV_VEL_STD : NAV_VEL_STD + 3] = NAN
+    row[NAV_POS_STD : NAV_POS_STD + 3] = NAN
     row[NAV_LAT] = row[NAV_LON] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_known == 1 else NAN
-    if s.started == 0:
-        return
-    write_std(row, NAV_ATTITUDE_STD, s, TILT)
     if s.has_origin == 0:
         return
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])

@@ -15,7 +15,7 @@ from gateway.compiled import compiled
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import apply_transition, propagate
 from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, KERNELS, move, take_imu
-from gateway.estimation.eskf.eskf_output import write_output
+from gateway.estimation.eskf.eskf_output import write_output, write_place
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -143,6 +143,9 @@ def run_forward(
             take_imu(s, p, now, imu[i])
             move_copy(copy, p, now, imu[i], F[k])
             write_output(s if s.restarts != copy.restarts else copy, out[i])
+            if s.aided == 0:
+                # The place is no state then: it is that of the newest fix.
+                write_place(s, out[i])
         propagate(s, p)
         foresee(copy, p, F[k])
         for i in range(STATES):

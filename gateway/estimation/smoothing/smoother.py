@@ -150,14 +150,15 @@ def _correct(
     out[:, NAV_QUAT : NAV_QUAT + 4] = _turned(
         off[:, TILT : TILT + 3], out[:, NAV_QUAT : NAV_QUAT + 4]
     )
-    out[:, NAV_VEL : NAV_VEL + 3] += off[:, VEL : VEL + 3]
-    known = np.flatnonzero(np.isfinite(out[:, NAV_LAT]))
-    if len(known):
-        lat_deg = float(out[known[0], NAV_LAT])
+    # Without a heading, place and velocity are those of the newest fix, and no states.
+    aided = np.isfinite(out[:, NAV_POS_STD])
+    out[aided, NAV_VEL : NAV_VEL + 3] += off[aided, VEL : VEL + 3]
+    if aided.any():
+        lat_deg = float(out[np.argmax(aided), NAV_LAT])
         meridian_m, parallel_m = radii_m(lat_deg, 0.0)
-        out[:, NAV_LAT] += np.degrees(off[:, POS] / meridian_m)
-        out[:, NAV_LON] += np.degrees(off[:, POS + 1] / parallel_m)
-    out[:, NAV_ALT] -= off[:, POS + 2]
+        out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
+        out[aided, NAV_LON] += np.degrees(off[aided, POS + 1] / parallel_m)
+        out[aided, NAV_ALT] -= off[aided, POS + 2]
     variances = np.diagonal(P, axis1=1, axis2=2)
     following = variances[np.minimum(stretch + 1, len(variances) - 1)]
     std = np.sqrt(np.maximum((1.0 - share) * variances[stretch] + share * following, 0.0))
