@@ -192,6 +192,9 @@ class Aircraft:
         """Put what is recorded behind the frames, which it may not delay, but before a change."""
         actions = self.perform(wanted, now_us)
         changed = [action for action in actions if isinstance(action, SettingsChanged)]
+        if not changed:
+            actions.append(record)
+            return actions
         others = [action for action in actions if not isinstance(action, SettingsChanged)]
         return [*others, record, *changed]
 

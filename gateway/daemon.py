@@ -320,6 +320,8 @@ class Daemon:
                     self._sent[action.message_id] += 1
                     self._hub.send(action)
                     self._record_sent(action)
+                case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
+                    self._recorder.flight(action)
                 case ClientInterval():
                     self._hub.set_interval(action)
                 case SaveSettings():
@@ -328,8 +330,6 @@ class Daemon:
                     self._places.save(action.vehicle_id, action.places)
                 case RecordingRequest():
                     (self._recorder.record if action.start else self._recorder.stop)()
-                case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
-                    self._recorder.flight(action)
                 case SettingsChanged():
                     self._recorder.settings_changed(action.vehicle_id)
 

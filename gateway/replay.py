@@ -1,7 +1,6 @@
 """Fuse a recorded flight again: rows of a table through the pipeline, on the recorded clock."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
@@ -194,7 +193,7 @@ class InterpolatedPosition:
         # The short way round, so that a flight over the date line does not go round the earth.
         east_dege7 = (b.lon_dege7 - a.lon_dege7 + HALF_TURN_DEGE7) % (2 * HALF_TURN_DEGE7)
         lon_dege7 = a.lon_dege7 + way * (east_dege7 - HALF_TURN_DEGE7)
-        return replace(
+        return msgspec.structs.replace(
             state,
             lat_deg=(a.lat_dege7 + way * (b.lat_dege7 - a.lat_dege7)) * DEG_PER_DEGE7,
             lon_deg=(lon_dege7 * DEG_PER_DEGE7 + 180.0) % 360.0 - 180.0,

@@ -5,9 +5,10 @@ firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself ch
 """
 
 import json
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+
+import msgspec
 
 from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
 from gateway.wire import payloads
@@ -136,6 +137,10 @@ RECEIVER_STATUS = {
 }
 
 
+def _plain(record: object) -> object:
+    return msgspec.to_builtins(record, builtin_types=(datetime,))
+
+
 def main() -> None:
     """Build every vector and write the table."""
     vectors = []
@@ -150,8 +155,8 @@ def main() -> None:
                 "frame_seq": frame_seq,
                 "pipe": pipe,
                 "receiver_time_us": receiver_time_us,
-                "header": asdict(header),
-                "fields": asdict(payload),
+                "header": _plain(header),
+                "fields": _plain(payload),
                 "payload_hex": packet.hex(),
                 "content_hex": content.hex(),
                 "frame_hex": encode_frame(content).hex(),
@@ -163,7 +168,7 @@ def main() -> None:
             {
                 "name": name,
                 "kind": "ReceiverStatus",
-                "fields": asdict(status),
+                "fields": _plain(status),
                 "content_hex": content.hex(),
                 "frame_hex": encode_frame(content).hex(),
             }

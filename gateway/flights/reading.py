@@ -4,7 +4,7 @@ import codecs
 import heapq
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.resources import files
 from itertools import chain
@@ -256,7 +256,7 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
     elif isinstance(row, TableMark):
         yield TableMark(row.time_us + shift_us, row.text)
     elif isinstance(row, NodeStatus):
-        yield replace(row, time_us=row.time_us + shift_us)
+        yield msgspec.structs.replace(row, time_us=row.time_us + shift_us)
     elif isinstance(row, TableRow):
         yield TableRow(
             row.time_us + shift_us,
@@ -269,7 +269,9 @@ def shifted(row: Line, shift_us: int) -> Iterator[Line]:
 
 
 def _moved(record: Moved | None, shift_us: int) -> Moved | None:
-    return None if record is None else replace(record, time_us=record.time_us + shift_us)
+    if record is None:
+        return None
+    return msgspec.structs.replace(record, time_us=record.time_us + shift_us)
 
 
 def foreign_rows(lines: Iterable[str], options: ReadOptions) -> Iterator[TableRow]:

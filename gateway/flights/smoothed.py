@@ -1,7 +1,6 @@
 """Recorded flights smoothed from both ends, in place of what the estimator told as it flew."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
@@ -86,7 +85,7 @@ class SmoothedStates:
         if at == len(self._time_us) or self._time_us[at] != state.time_us:
             return state
         smoothed = nav_state(state.time_us, self._states[at])
-        return replace(smoothed, flags=state.flags)
+        return msgspec.structs.replace(smoothed, flags=state.flags)
 
 
 def _gathered(

@@ -147,5 +147,6 @@ class Correction:
 
     def apply(self, v: Vec3) -> Vec3:
         """Correct one vector and turn it into body axes."""
-        b = self._bias
-        return transform(self._matrix, (v[0] - b[0], v[1] - b[1], v[2] - b[2]))
+        x, y, z = v
+        bias_x, bias_y, bias_z = self._bias
+        return transform(self._matrix, (x - bias_x, y - bias_y, z - bias_z))

@@ -150,7 +150,7 @@ class SensorChain:
             Calibrated SI values and their filtered twins.
         """
         mag = None
-        if ImuFlags.MAG_NEW in raw.flags and ImuFlags.MAG_ABSENT not in raw.flags:
+        if raw.flags & ImuFlags.MAG_NEW and not raw.flags & ImuFlags.MAG_ABSENT:
             counts = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
             mag = None if counts is None else self._mag.apply(counts)
         return self.imu_si(
@@ -194,9 +194,9 @@ class SensorChain:
         """
         self._track_rate(time_us)
         accel_lowpass, gyro_highpass = accel_b_mps2, gyro_b_radps
-        if ImuFlags.ACCEL_FILTERED not in flags:
+        if not flags & ImuFlags.ACCEL_FILTERED:
             accel_lowpass = _filtered(self._lowpass, accel_b_mps2)
-        if ImuFlags.GYRO_FILTERED not in flags:
+        if not flags & ImuFlags.GYRO_FILTERED:
             gyro_highpass = _filtered(self._highpass, gyro_b_radps)
         return ImuSample(
             time_us=time_us,

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+import msgspec
+
 from gateway.records import ClientInterval, Outgoing, Vec3
 from gateway.settings import Settings
 from gateway.vehicle.stored import StoredPlaces
@@ -77,8 +79,7 @@ Action = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(msgspec.Struct, frozen=True, gc=False):
     """A message before it is encoded: to the one who asked, or to all."""
 
     message: Any

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+import msgspec
 from cobs import cobs
 
 CRC_START: Final = 0xFFFF
@@ -42,8 +43,7 @@ class FaultKind(StrEnum):
     VALUE = "value"
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(msgspec.Struct, frozen=True, gc=False):
     """The checked content of one frame, CRC removed."""
 
     content: bytes

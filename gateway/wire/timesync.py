@@ -20,8 +20,9 @@ References
    measurements", INFOCOM 1999.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+import msgspec
 
 WRAP_US: Final = 1 << 32
 BUCKET_US: Final = 250_000
@@ -39,8 +40,7 @@ AHEAD_US: Final = 50_000
 the next packets say the same, or a single stamp is wrong and must not move all that follow."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Point:
+class _Point(msgspec.Struct, frozen=True, gc=False):
     remote_us: int
     delta_us: int
 
@@ -113,8 +113,9 @@ class ClockTracker:
     def _add(self, point: _Point) -> None:
         buckets = self._buckets
         if buckets:
-            bucket, newest = (p.remote_us // BUCKET_US for p in (point, buckets[-1]))
-            if bucket < newest or (bucket == newest and point.delta_us >= buckets[-1].delta_us):
+            soonest = buckets[-1]
+            bucket, newest = point.remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
+            if bucket < newest or (bucket == newest and point.delta_us >= soonest.delta_us):
                 return
             if bucket == newest:
                 buckets.pop()

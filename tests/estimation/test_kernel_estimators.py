@@ -1,10 +1,10 @@
 """What holds for every compiled estimator: same bits live, offline and in pieces; no nonsense."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gateway.compiled import address_of, record_at
 from gateway.estimation.columns import (

@@ -1,7 +1,7 @@
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.records import GpsFixType

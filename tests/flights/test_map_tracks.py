@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -104,7 +105,9 @@ def test_a_table_tells_the_same(rng: np.random.Generator) -> None:
     settings = GatewaySettings().default_aircraft
     header, rows = read(fly(settings, make_flight(rng, 12))[0])
     rows = [
-        replace(row, gps=replace(row.gps, h_acc_m=1.0, satellites=12)) if row.gps else row
+        replace(row, gps=msgspec.structs.replace(row.gps, h_acc_m=1.0, satellites=12))
+        if row.gps
+        else row
         for row in rows
     ]
     mark = TableMark(rows[-1].time_us, "over the gate")

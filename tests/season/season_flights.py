@@ -1,11 +1,11 @@
 """Short simulated recordings that differ in aircraft, day and noise, made in no time."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.sources import ideal_calibration

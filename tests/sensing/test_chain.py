@@ -1,7 +1,7 @@
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.records import BaroRaw, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration

@@ -1,9 +1,9 @@
 """Records for the vehicle's tests, and an independent decoder of what it sends."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler

@@ -2,12 +2,13 @@
 
 import math
 import xml.etree.ElementTree as ET
-from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import fields, replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
@@ -46,7 +47,7 @@ def scrambled(record: Any, rng: np.random.Generator) -> Any:
             changes[field.name] = FLOATS[rng.integers(len(FLOATS))]
         elif type(value) is int:
             changes[field.name] = INTEGERS[rng.integers(len(INTEGERS))]
-        elif is_dataclass(value):
+        elif isinstance(value, msgspec.Struct):
             changes[field.name] = scrambled(value, rng)
         elif isinstance(value, NavFlags):
             changes[field.name] = NavFlags(int(rng.integers(1 << 14)))

@@ -1,11 +1,11 @@
 """What a ground station changes reaches the stage that it concerns, and only that one."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings

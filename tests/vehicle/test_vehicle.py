@@ -1,8 +1,8 @@
 from collections import Counter
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming, NavFlags, Outgoing

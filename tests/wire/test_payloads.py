@@ -1,9 +1,10 @@
 """Radio payloads and receiver frames: golden bytes both ways, faults for everything else."""
 
 import json
-from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -34,7 +35,8 @@ STATUS = [vector for vector in VECTORS if vector["kind"] == "ReceiverStatus"]
 
 def as_json(record: object) -> dict:
     """Bring a record to what the table holds: lists for tuples, ISO text for times."""
-    return json.loads(json.dumps(asdict(record), default=lambda moment: moment.isoformat()))
+    plain = msgspec.to_builtins(record, builtin_types=(datetime,))
+    return json.loads(json.dumps(plain, default=lambda moment: moment.isoformat()))
 
 
 def test_scales_are_those_of_the_data_sheets() -> None:

@@ -4,9 +4,10 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
+
+import msgspec
 
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import Listener
@@ -132,7 +133,7 @@ class Hub:
     def set_interval(self, wish: ClientInterval) -> None:
         """Send a client one message of one system at the rate that it wishes."""
         for client_id in self._router.group(wish.client_id):
-            self._fanout.set_interval(replace(wish, client_id=client_id))
+            self._fanout.set_interval(msgspec.structs.replace(wish, client_id=client_id))
         self._router.forget_express()
 
     def add(self, url: str) -> None:

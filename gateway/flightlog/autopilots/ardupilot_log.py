@@ -7,8 +7,9 @@ body FRD and NED, in µs since the start. Of several sensors of a kind the first
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Final
+
+from msgspec.structs import replace
 
 from gateway.flightlog.table.autopilot import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US, Imported
 from gateway.geometry.quaternion import from_euler

@@ -50,7 +50,7 @@ LEAST_PA: Final = 2000.0
 NOT_THERE: Final = 0x7FFFFFFF
 """A time relative to the sample's that stands for "no new one"."""
 EXTRAPOLATED: Final = 8
-ORDER: Final = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
+ORDER: Final[dict[type, int]] = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
 """Of records of one time: that of a row."""
 
 _FIX_TYPES: Final = {

@@ -66,11 +66,16 @@ class Stream:
         -------
         bool
         """
-        self._follow_pace(time_us)
+        last_us, self._last_us = self._last_us, time_us
+        period_us = self._period_us
+        if last_us is not None and 0 < (gap_us := time_us - last_us) <= MAX_PERIOD_US:
+            period_us = period_us or gap_us
+            period_us += (gap_us - period_us) // PACE_WEIGHT
+            self._period_us = period_us
         if self.interval_us == OFF:
             return False
         late = 0 if self._due_us is None else time_us - self._due_us
-        if late < -(self._period_us // 2):
+        if late < -(period_us // 2):
             return False
         self._advance(time_us, late, late // LEAN)
         return True
@@ -100,12 +105,3 @@ class Stream:
             self._due_us = time_us + self.interval_us
         else:
             self._due_us += self.interval_us + lean
-
-    def _follow_pace(self, time_us: int) -> None:
-        if self._last_us is not None:
-            gap = time_us - self._last_us
-            if 0 < gap <= MAX_PERIOD_US:
-                if self._period_us == 0:
-                    self._period_us = gap
-                self._period_us += (gap - self._period_us) // PACE_WEIGHT
-        self._last_us = time_us

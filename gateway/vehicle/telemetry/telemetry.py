@@ -132,15 +132,14 @@ class Telemetry:
     def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
         """Take in a navigation state and its IMU sample, and tell what is due."""
         self.state, self._sample = state, sample
-        self._updated |= messages.ACCEL_UPDATED | messages.GYRO_UPDATED
-        self._updated |= messages.TEMPERATURE_UPDATED
+        self._updated |= messages.IMU_UPDATED
         if sample.mag_b_ut is not None:
             self._mag_b_ut = sample.mag_b_ut
             self._updated |= messages.MAG_UPDATED
         if self._reference_alt_m != self._reference_alt_m and messages.has_position(state):
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
-        due = (m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us))
+        due = [m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us)]
         return self._build_all(due, state.time_us)
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
@@ -212,7 +211,7 @@ class Telemetry:
         return builder(now_us) if builder else None
 
     def _build_all(self, ids: Iterable[int], now_us: int) -> list[Any]:
-        built = (self.build(message_id, now_us) for message_id in ids)
+        built = [self.build(message_id, now_us) for message_id in ids]
         return [message for message in built if message is not None]
 
     def _of_state(self, build: Callable[[NavState], Any]) -> Builder:

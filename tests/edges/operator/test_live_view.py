@@ -4,6 +4,7 @@ import logging
 import math
 from dataclasses import replace
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -43,7 +44,9 @@ FLYING = NavState(
     pos_std_m=UNKNOWN_VEC3,
     flags=NavFlags.ATTITUDE_VALID | NavFlags.POSITION_VALID | NavFlags.GPS_REJECTED,
 )
-LOST = replace(FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3)
+LOST = msgspec.structs.replace(
+    FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3
+)
 CLIENT = ClientStats(
     client_id=1,
     name="",
@@ -98,7 +101,9 @@ def test_link_node_aircraft_and_client_are_shown() -> None:
 
 
 def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
-    far = replace(FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6)
+    far = msgspec.structs.replace(
+        FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6
+    )
     long = replace(CLIENT, sent=123_456_789, dropped=1_234_567, received=1_234_567)
     port = ListenerStats("udp-listen:127.0.0.1:14551", "", "open", "", 14551, 0, 0)
     sent = tuple((number, 9) for number in (0, 1, 2, 24, 29, 30, 31, 33, 42, 62, 74, 105, 230))

@@ -1,9 +1,8 @@
 """Rows keep every record, its digits and its place."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gateway.flightlog.table.row import (
     COLUMNS,

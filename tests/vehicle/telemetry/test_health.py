@@ -1,6 +1,5 @@
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from gateway.records import ImuFlags, NavFlags, NodeId, ReceiverStatus
 from gateway.vehicle.telemetry.health import (

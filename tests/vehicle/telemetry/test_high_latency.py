@@ -1,10 +1,10 @@
 """HIGH_LATENCY2: the vehicle in one message, whatever is known of it."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import GpsFix, NavState

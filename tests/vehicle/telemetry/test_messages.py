@@ -1,10 +1,10 @@
 """Each message, decoded by pymavlink, against the units and signs of the definition."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import GpsFixType, NavFlags

@@ -1,7 +1,7 @@
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.records import NavFlags
 from gateway.vehicle.telemetry.motion import IN_AIR, ON_GROUND, UNDEFINED, Motion

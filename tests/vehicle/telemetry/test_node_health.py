@@ -1,9 +1,9 @@
 """How the boards fare: told when it gets worse, and in MAVLink's own fields."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus, PipeCounters, ReceiverStatus
