@@ -107,7 +107,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
         f"<Placemark><name>{escape(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
         "<gx:Track><altitudeMode>absolute</altitudeMode>\n"
     )
-    yield from (f"<when>{_iso(point.time_us)}</when>\n" for point in vehicle.points)
+    yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in vehicle.points)
     yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in vehicle.points)
     if any(point.attitude_deg is not None for point in vehicle.points):
         # Heading, tilt, roll; an empty element stands for "not known here".
@@ -118,7 +118,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
 def _kml_place(place: MapPlace) -> str:
     return (
         f"<Placemark><name>{escape(place.name)}</name><description>{place.kind}</description>"
-        f"<TimeStamp><when>{_iso(place.at.time_us)}</when></TimeStamp>"
+        f"<TimeStamp><when>{iso_time(place.at.time_us)}</when></TimeStamp>"
         "<Point><altitudeMode>absolute</altitudeMode>"
         f"<coordinates>{_kml_coordinates(place.at, ',')}</coordinates></Point></Placemark>\n"
     )
@@ -170,7 +170,7 @@ def _gpx_place(point: TrackPoint) -> str:
 
 
 def _gpx_time(point: TrackPoint) -> str:
-    return f"<time>{_iso(point.time_us)}</time>"
+    return f"<time>{iso_time(point.time_us)}</time>"
 
 
 def _gpx_attitude(point: TrackPoint) -> str:
@@ -183,7 +183,7 @@ def _gpx_attitude(point: TrackPoint) -> str:
     )
 
 
-def _iso(unix_us: int) -> str:
+def iso_time(unix_us: int) -> str:
     """Write a time as ISO 8601; one beyond the calendar as its nearest end."""
     seconds, fraction_us = divmod(min(max(unix_us, FIRST_US), LAST_US), US_PER_S)
     moment = datetime.fromtimestamp(seconds, UTC)

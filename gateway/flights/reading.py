@@ -30,6 +30,7 @@ from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flightlog.table.table import (
     HEAD_LINES,
     MAX_LINE,
+    TableEvent,
     TableFault,
     TableHeader,
     TableMark,
@@ -107,6 +108,7 @@ Read = Callable[[Path, ReadOptions], RecordedTable]
 
 READERS: Final[dict[str, Read]] = {}
 """Of the formats in `OTHER_FORMATS`."""
+PARQUET: Final = "Parquet"
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
@@ -153,6 +155,12 @@ def _add_packaged(name: str, heads: tuple[bytes, ...], module: str) -> None:
         return table
 
     add_reader(name, lambda head: head.startswith(heads), read)
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a file is a table of mavgate's, with its own settings and states."""
+    kind = kind_of(path)
+    return kind is FileKind.TABLE or (kind is FileKind.OTHER and other_format(path) == PARQUET)
 
 
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
@@ -299,7 +307,11 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
 
 def _open_table(path: Path, options: ReadOptions) -> RecordedTable:
     reader = TableReader()
-    events = read_events(path, reader, options.progress)
+    return table_of_events(path, reader, read_events(path, reader, options.progress))
+
+
+def table_of_events(path: Path, reader: TableReader, events: Iterator[TableEvent]) -> RecordedTable:
+    """Begin to read a table; raises FlightError if its head is damaged, or there is no row."""
     head: list[Line] = []
     for event in events:
         if isinstance(event, TableFault) and event.line <= HEAD_LINES:
@@ -380,3 +392,4 @@ def table_of_rows(
 
 _add_packaged("ULog", (b"ULog\x01\x12\x35",), "ulog_file")
 _add_packaged("DataFlash", (b"\xa3\x95", b"FMT,"), "dataflash_file")
+_add_packaged(PARQUET, (b"PAR1",), "parquet_file")

@@ -1,7 +1,8 @@
 """Flights written as files: one writer a format, by the ending of the file's name."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -9,6 +10,7 @@ from typing import Final
 import msgspec
 
 from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.flightlog.geo_json import to_geojson
 from gateway.flightlog.mapshape import VehicleTrack, to_gpx, to_kml
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.table.row import TableRow
@@ -27,6 +29,7 @@ from gateway.flights.reading import (
     RecordedTable,
     aircraft_of,
     import_format,
+    is_table,
     joined_rows,
     open_rows,
     recorded_frames,
@@ -56,6 +59,8 @@ class FlightToWrite:
         Fuse tables again in place of their recorded states.
     smooth : bool
         Fuse them from both ends.
+    message : str, optional
+        Name of the one MAVLink message that is wanted, where the format holds one kind.
 
     Raises
     ------
@@ -72,13 +77,14 @@ class FlightToWrite:
         title: str = "flight",
         fuse: bool = False,
         smooth: bool = False,
+        message: str | None = None,
     ) -> None:
-        self.files, self.options, self.title = files, options, title
+        self.files, self.options, self.title, self.message = files, options, title, message
         self._limits, self._smooth = limits, smooth
         kinds = {kind_of(file) for file in files}
         self.is_mavlink = kinds == {FileKind.TLOG}
         """Whether the frames are those that were recorded, and the rows are read out of them."""
-        self._as_recorded = kinds == {FileKind.TABLE} and not fuse
+        self._as_recorded = not fuse and all(is_table(file) for file in files)
         self._refusion: Refusion | None = None
         self._remarks: list[str] = []
 
@@ -99,6 +105,19 @@ class FlightToWrite:
         else:
             table = self._fused().table()
         return _trimmed(table, self._limits)
+
+    def by_aircraft(self) -> "list[FlightToWrite]":
+        """Split tables by the aircraft that they are of."""
+        files: dict[int, list[Path]] = {}
+        quiet = replace(self.options, progress=None)
+        for file in self.files:
+            files.setdefault(open_rows(file, quiet).header.vehicle_id, []).append(file)
+        parts = []
+        for vehicle_id in sorted(files):
+            part = copy(self)
+            part.files = files[vehicle_id]
+            parts.append(part)
+        return parts
 
     @property
     def remarks(self) -> list[str]:
@@ -178,12 +197,20 @@ def _write_gpx(flight: FlightToWrite) -> Iterator[bytes]:
     return (piece.encode() for piece in to_gpx(flight.title, _vehicles(flight)))
 
 
+def _write_geojson(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_geojson(flight.title, _vehicles(flight)))
+
+
 def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
     if flight.is_mavlink:
         found = tracks_of_frames(flight.frames(), flight.options.system_id)
     else:
-        table = flight.table()
-        found = tracks_of_table(table, aircraft_of(table, flight.options))
+        tables = (one.table() for one in flight.by_aircraft())
+        found = [
+            track
+            for table in tables
+            for track in tracks_of_table(table, aircraft_of(table, flight.options))
+        ]
     if not found:
         raise FlightError(f"{flight.title}: nothing to draw, for the flight tells no position")
     return found
@@ -200,13 +227,16 @@ def _packaged(module: str, name: str) -> Write:
 
 
 NOT_FUSED: Final = "raw samples, settings and the states' digits"
+NOT_IN_TABLE: Final = "what is no sample, fix or state of one vehicle"
 NOT_DRAWN: Final = "samples, velocities and settings", "messages but positions, attitude and texts"
 
 add_writer(".tlog", _write_tlog, Lacks(of_tables=NOT_FUSED))
-add_writer(".csv", _write_table, Lacks(of_tlogs="what is no sample, fix or state of one vehicle"))
+add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))
 add_writer(".kml", _write_kml, Lacks(*NOT_DRAWN))
 add_writer(".gpx", _write_gpx, Lacks(*NOT_DRAWN))
+add_writer(".geojson", _write_geojson, Lacks(*NOT_DRAWN))
 add_writer(".mcap", _packaged("mcap_file", "MCAP"), Lacks(of_tables=NOT_FUSED))
+add_writer(".parquet", _packaged("parquet_file", "Parquet"), Lacks(of_tlogs=NOT_IN_TABLE))
 
 
 def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:

@@ -33,7 +33,8 @@ from gateway.flights.reading import ReadOptions
 from gateway.flights.writing import LACKS, WRITERS, FlightToWrite
 from gateway.output import write_new
 
-FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".mcap")
+ONE_KIND: Final = ".parquet"
+FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 """What is made of a recording's tlogs: they hold all its vehicles, and what was said."""
 
 
@@ -58,14 +59,18 @@ def convert(
     system: Annotated[
         int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to take.")
     ] = None,
+    message: Annotated[
+        str | None,
+        typer.Option("--message", help="For Parquet: this MAVLink message in place of the table."),
+    ] = None,
     config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
     """Convert, trim and join recordings.
 
-    Tlogs and tables become one another, a track for a map, or MCAP for Foxglove. Logs of other
-    autopilots (tlog, ULog, DataFlash) become tables that can be fused; a CSV of another program
-    does by its column map.
+    Tlogs and tables become one another, a track for a map, MCAP for Foxglove, or Parquet. Logs of
+    other autopilots (tlog, ULog, DataFlash) become tables that can be fused; a CSV of another
+    program does by its column map.
     """
     write = WRITERS.get(out.suffix)
     if write is None:
@@ -73,7 +78,10 @@ def convert(
     with refusing():
         if smooth and not fuse:
             refuse("--smooth smooths what --fuse fuses: give both")
-        wanted: Wanted = "tables" if fuse or out.suffix not in FROM_TLOGS else "tlogs"
+        if message and out.suffix != ONE_KIND:
+            refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
+        of_tlogs = not fuse and (out.suffix in FROM_TLOGS or message)
+        wanted: Wanted = "tlogs" if of_tlogs else "tables"
         files = files_of(files, recordings_folder(config), wanted)
     with progress_of(files) as advance, refusing():
         options = ReadOptions(
@@ -86,12 +94,18 @@ def convert(
         )
         limits = (read_moment(begin), read_moment(end))
         flight = FlightToWrite(
-            files, options, limits=limits, title=out.stem, fuse=fuse, smooth=smooth
+            files,
+            options,
+            limits=limits,
+            title=out.stem,
+            fuse=fuse,
+            smooth=smooth,
+            message=message,
         )
         inputs = [*files, columns, config]
         size = write_new(out, write(flight), overwrite=force, inputs=inputs)
     tell_remarks(flight.remarks)
     lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
-    if lacks:
+    if lacks and message is None:
         tell_remarks([f"{out} does not hold {lacks}"])
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)

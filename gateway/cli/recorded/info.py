@@ -39,7 +39,14 @@ from gateway.flightlog.table.table import (
     encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows, shifted
+from gateway.flights.reading import (
+    NO_RECORDING,
+    FlightError,
+    ReadOptions,
+    is_table,
+    open_rows,
+    shifted,
+)
 from gateway.output import write_new
 from gateway.units import US_PER_S
 
@@ -144,11 +151,14 @@ def describe(file: Path, options: ReadOptions) -> FileInfo:
     table, reader = TableSummary(), TableReader()
     if kind in (FileKind.FOREIGN, FileKind.OTHER):
         foreign = open_rows(file, options)
-        zero_us = foreign.header.unix_us_at_zero or 0
-        for row in foreign.plain_rows:
+        own = is_table(file)
+        zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
+        for row in foreign.rows:
             table.add([*shifted(row, zero_us)], foreign.header)
         name = other_format(file) if kind is FileKind.OTHER else kind.value
-        return replace(table.result(size), kind=name, header=None, remarks=tuple(foreign.remarks))
+        header = foreign.header if own else None
+        remarks = tuple(foreign.remarks)
+        return replace(table.result(size), kind=name, header=header, remarks=remarks)
     for event in read_events(file, reader, advance):
         table.add([event], reader.header)
     return table.result(size)

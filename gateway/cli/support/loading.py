@@ -26,6 +26,7 @@ from gateway.flights.reading import (
     ReadOptions,
     SettingsChoice,
     aircraft_of,
+    is_table,
     joined_rows,
     open_rows,
 )
@@ -85,7 +86,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         table = joined_rows([open_rows(part, options) for part in parts])
         aircraft = aircraft_of(table, options)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
-        story = STORIES[kind_of(parts[0])]
+        story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:
             flight = flight_of_rows(
                 table.plain_rows, aircraft.calibration, fusion, name=path.name, story=story

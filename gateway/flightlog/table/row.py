@@ -92,7 +92,13 @@ class TableRow:
 
 def row_to_line(row: TableRow) -> str:
     """Write a row as a line: floats with all their digits, NaN and absent as an empty cell."""
-    cells: tuple[Cell, ...] = (
+    # A cell that differs from itself is NaN.
+    return ",".join(["" if c is None or c != c else repr(c) for c in cells_of(row)]) + "\n"
+
+
+def cells_of(row: TableRow) -> tuple[Cell, ...]:
+    """Lay a row out in the order of `COLUMNS`; what is not there is None."""
+    return (
         row.time_us,
         *_head_cells(row),
         *(_raw_cells(row.raw) if row.raw else _NO_RAW),
@@ -101,8 +107,6 @@ def row_to_line(row: TableRow) -> str:
         *(_gps_cells(row.gps) if row.gps else _NO_GPS),
         *(_nav_cells(row.state) if row.state else _NO_NAV),
     )
-    # A cell that differs from itself is NaN.
-    return ",".join(["" if c is None or c != c else repr(c) for c in cells]) + "\n"
 
 
 def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:

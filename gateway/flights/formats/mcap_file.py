@@ -10,6 +10,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway import __version__
 from gateway.flightlog.foxglove import SCHEMAS, FoxgloveView, fields_of_message, schema_of_message
 from gateway.flightlog.tlog.recorded_commands import is_station
+from gateway.flights.formats.decoded import decoded
+from gateway.flights.formats.pieces import Pieces
 from gateway.flights.writing import FlightToWrite
 from gateway.wire.mavlink_splitter import (
     is_station_heartbeat,
@@ -17,29 +19,6 @@ from gateway.wire.mavlink_splitter import (
     origin_of,
     sequence_of,
 )
-
-
-class _Pieces:
-    """A stream that is emptied as it is written."""
-
-    def __init__(self) -> None:
-        self._written: list[bytes] = []
-        self._size = 0
-
-    def write(self, data: bytes) -> int:
-        self._written.append(data)
-        self._size += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._size
-
-    def flush(self) -> None: ...
-
-    def taken(self) -> bytes:
-        data = b"".join(self._written)
-        self._written.clear()
-        return data
 
 
 class _Topics:
@@ -72,23 +51,17 @@ class _Topics:
 
 def write(flight: FlightToWrite) -> Iterator[bytes]:
     """Write a flight, at its civil times."""
-    pieces = _Pieces()
+    pieces = Pieces()
     writer = Writer(pieces)  # type: ignore[arg-type]
     writer.start(library=f"mavgate {__version__}")
-    topics, view, decoder = _Topics(writer), FoxgloveView(), mavlink.MAVLink(None)
+    topics, view = _Topics(writer), FoxgloveView()
     stations: set[int] = set()
-    unknown = 0
-    for record in flight.frames():
+    for record, message in decoded(flight):
         frame, time_us = record.frame, record.time_us
         system, component = origin_of(frame)
         origin = system << 8 | component
         if message_id_of(frame) == mavlink.MAVLINK_MSG_ID_HEARTBEAT and is_station_heartbeat(frame):
             stations.add(origin)
-        try:
-            message = decoder.decode(bytearray(frame))
-        except mavlink.MAVError:
-            unknown += 1
-            continue
         topic = f"/mavlink/{system}/{component}/{message.msgname}"
         fields = fields_of_message(message)
         topics.add(topic, schema_of_message(message), fields, time_us, sequence_of(frame))
@@ -97,8 +70,6 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
                 topics.add(shown.topic, SCHEMAS[shown.schema], shown.content, time_us)
         if data := pieces.taken():
             yield data
-    if unknown:
-        flight.remark(f"{unknown} messages that no MAVLink dialect here knows were left out")
     if view.origin is not None:
         lat_deg, lon_deg, alt_m = map(str, view.origin)
         origin_facts = {"latitude": lat_deg, "longitude": lon_deg, "altitude_amsl_m": alt_m}

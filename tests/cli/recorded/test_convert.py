@@ -148,6 +148,21 @@ def test_a_track_for_a_map(
     assert tags.count("coord" if ending == "kml" else "trkpt") > 50
 
 
+@pytest.mark.parametrize("ending", ["kml", "gpx", "geojson"])
+def test_tables_of_two_aircraft_are_drawn_as_two(table: Path, tmp_path: Path, ending: str) -> None:
+    other, out = tmp_path / "other.csv", tmp_path / f"track.{ending}"
+    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
+    text = run("convert", other, table, "-o", out)
+    assert "does not hold samples" in " ".join(text.split())
+    drawn = out.read_text()
+    assert drawn.index("aircraft 1") < drawn.index("aircraft 2")
+    if ending == "geojson":
+        features = json.loads(drawn)["features"]
+        lines = [f for f in features if f["geometry"]["type"] == "LineString"]
+        assert [line["properties"]["name"] for line in lines] == ["aircraft 1", "aircraft 2"]
+        assert min(len(line["geometry"]["coordinates"]) for line in lines) > 50
+
+
 def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:
     text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
     assert "tells no position" in " ".join(text.split())

@@ -1,0 +1,21 @@
+"""The MAVLink of a flight, message by message."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.writing import FlightToWrite
+
+
+def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
+    """Yield a flight's frames with what they say; frames that no dialect knows are told of."""
+    decoder, unknown = mavlink.MAVLink(None), 0
+    for record in flight.frames():
+        try:
+            yield record, decoder.decode(bytearray(record.frame))
+        except mavlink.MAVError:
+            unknown += 1
+    if unknown:
+        flight.remark(f"{unknown} messages that no MAVLink dialect here knows were left out")

@@ -1,0 +1,217 @@
+"""Parquet: a table as columns of one type with their units, or one kind of MAVLink message.
+
+What stands between the rows of a table (changed settings, states, marks, the nodes' reports) is in
+the column `comments` of the row that it precedes, written as in a CSV; settings and calibration
+are in the file's metadata. So a CSV can be had back as it was.
+"""
+
+import io
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.edges.disk.recording_streams import GZIP, read_chunks
+from gateway.flightlog.table.row import COLUMNS, HEAD_COLUMNS, RAW_COLUMNS, TableRow, cells_of
+from gateway.flightlog.table.table import (
+    FORMAT_LINE,
+    HEADER_PREFIX,
+    TableEvent,
+    TableReader,
+    encode_header,
+    encode_line,
+)
+from gateway.flights.formats.decoded import decoded
+from gateway.flights.formats.pieces import Pieces
+from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_events
+from gateway.flights.writing import FlightToWrite
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import origin_of
+
+ROWS: Final = 16_384
+"""Of a row group, all that is in the memory at a time: some 40 MB."""
+COMMENTS: Final = "comments"
+TIME: Final = "time"
+"""Civil time, where it is known."""
+HEADER: Final = b"mavgate.header"
+END: Final = "mavgate.end"
+"""Comments behind the last row."""
+
+UNITS: Final = {
+    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
+    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
+    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
+}  # fmt: skip
+"""By the ending of a column's name."""
+WHOLE: Final = {*HEAD_COLUMNS, *RAW_COLUMNS, "gps_fix_type", "gps_satellites", "nav_flags"}
+WHOLE_ENDINGS: Final = ("_us", "_node_id", "_dege7", "_itow_ms")
+TRUTHS: Final = {"gps_fix_ok"}
+
+_TYPES: Final = {
+    **{f"{sign}int{bits}_t": getattr(pa, f"{sign}int{bits}")() for sign in ("", "u")
+       for bits in (8, 16, 32, 64)},
+    "float": pa.float32(), "double": pa.float64(), "char": pa.string(),
+    "uint8_t_mavlink_version": pa.uint8(),
+}  # fmt: skip
+
+
+def write(flight: FlightToWrite) -> Iterator[bytes]:
+    """Write a flight's table, or its messages of the one kind that is asked for."""
+    if flight.message is None:
+        return _write_table(flight.table())
+    return _write_messages(flight, flight.message)
+
+
+def read(path: Path, options: ReadOptions) -> RecordedTable:
+    """Open a table that was written here; raises FlightError if it is none."""
+    reader = TableReader()
+
+    def events() -> Iterator[TableEvent]:
+        try:
+            for text in _lines(path, options):
+                yield from reader.feed(text.encode())
+        except (pa.ArrowException, OSError) as error:
+            # What the disk did not like has a number, what the library did not has none.
+            if getattr(error, "errno", None) is not None:
+                raise
+            raise FlightError(f"{path}: cannot be read as Parquet: {error}") from error
+
+    return table_of_events(path, reader, events())
+
+
+def _write_table(table: RecordedTable) -> Iterator[bytes]:
+    zero_us = table.header.unix_us_at_zero
+    fields = [_column(name) for name in COLUMNS]
+    if zero_us is not None:
+        fields = [pa.field(TIME, pa.timestamp("us", "UTC")), *fields]
+    fields.append(pa.field(COMMENTS, pa.string()))
+    header = encode_header(table.header).removeprefix(HEADER_PREFIX).strip().encode()
+    schema = pa.schema(fields, metadata={HEADER: header})
+    pieces = Pieces()
+    with _writer(pieces, schema) as writer:
+        rows: list[tuple[Any, ...]] = []
+        comments = ""
+        for line in table.rows:
+            if not isinstance(line, TableRow):
+                comments += encode_line(line)
+                continue
+            civil = () if zero_us is None else (zero_us + line.time_us,)
+            rows.append((*civil, *cells_of(line), comments or None))
+            comments = ""
+            if len(rows) == ROWS:
+                writer.write_table(_batch(rows, schema))
+                yield pieces.taken()
+                rows.clear()
+        writer.write_table(_batch(rows, schema))
+        if comments:
+            writer.add_key_value_metadata({END: comments})
+    yield pieces.taken()
+
+
+def _writer(pieces: Pieces, schema: pa.Schema) -> pq.ParquetWriter:
+    file = pa.PythonFile(pieces, "w")
+    return pq.ParquetWriter(file, schema, compression="zstd", write_page_checksum=True)
+
+
+def _column(name: str) -> pa.Field:
+    if name in TRUTHS:
+        kind = pa.bool_()
+    elif name in WHOLE or name.endswith(WHOLE_ENDINGS):
+        kind = pa.int64()
+    else:
+        kind = pa.float64()
+    unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), None)
+    return pa.field(name, kind, metadata={"unit": unit} if unit else None)
+
+
+def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
+    columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
+    arrays = [
+        # NaN is "not known", as an empty cell is.
+        pa.array(column, field.type, from_pandas=pa.types.is_floating(field.type))
+        if not pa.types.is_boolean(field.type)
+        else pa.array([None if value is None else bool(value) for value in column])
+        for column, field in zip(columns, schema, strict=True)
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _lines(path: Path, options: ReadOptions) -> Iterator[str]:
+    """Yield the lines of the CSV that the file was made of."""
+    packed = io.BytesIO(b"".join(read_chunks(path))) if path.suffix == GZIP else path
+    with pq.ParquetFile(packed, page_checksum_verification=True) as file:
+        known = file.schema_arrow.metadata or {}
+        names = [name for name in COLUMNS if name in file.schema_arrow.names]
+        if "time_us" not in names:
+            raise FlightError(f"{path}: has no column time_us, so it is no table of mavgate's")
+        if HEADER in known:
+            yield f"{FORMAT_LINE}\n{HEADER_PREFIX}{known[HEADER].decode()}\n"
+        yield ",".join(names) + "\n"
+        wanted = [*names, *({COMMENTS} & set(file.schema_arrow.names))]
+        total, size = max(file.metadata.num_rows, 1), path.stat().st_size
+        for batch in file.iter_batches(ROWS // 4, columns=wanted):
+            columns = [column.to_pylist() for column in batch.columns]
+            comments: Iterable[str | None] = [None] * batch.num_rows
+            if len(columns) > len(names):
+                comments = columns.pop()
+            for comment, cells in zip(comments, zip(*columns, strict=True), strict=True):
+                yield (comment or "") + ",".join(map(_text, cells)) + "\n"
+            if options.progress is not None:
+                options.progress(size * batch.num_rows // total)
+        yield (file.metadata.metadata or {}).get(END.encode(), b"").decode()
+
+
+def _text(cell: Any) -> str:
+    if cell is None:
+        return ""
+    return repr(int(cell)) if isinstance(cell, bool) else repr(cell)
+
+
+def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
+    """Write every message of one kind, whoever sent it; raises FlightError if there is none."""
+    kind = mavlink.mavlink_map.get(MESSAGE_IDS.get(name))
+    if kind is None:
+        raise FlightError(f"no MAVLink message is called {name}")
+    schema = pa.schema(
+        [
+            pa.field(TIME, pa.timestamp("us", "UTC")),
+            pa.field("system_id", pa.uint8()),
+            pa.field("component_id", pa.uint8()),
+            *(_message_field(kind, field) for field in kind.fieldnames),
+        ],
+        metadata={"mavlink.message": name},
+    )
+    met: set[str] = set()
+    pieces, rows = Pieces(), []
+    with _writer(pieces, schema) as writer:
+        for record, message in decoded(flight):
+            met.add(message.msgname)
+            if message.msgname == name:
+                fields = (_value(getattr(message, field)) for field in kind.fieldnames)
+                rows.append((record.time_us, *origin_of(record.frame), *fields))
+            if len(rows) == ROWS:
+                writer.write_table(_batch(rows, schema))
+                yield pieces.taken()
+                rows.clear()
+        if name not in met:
+            raise FlightError(f"the flight holds no {name}, but {', '.join(sorted(met))}")
+        writer.write_table(_batch(rows, schema))
+    yield pieces.taken()
+
+
+def _message_field(kind: Any, name: str) -> pa.Field:
+    written = kind.fieldtypes[kind.fieldnames.index(name)]
+    length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
+    one = _TYPES[written]
+    facts = {"unit": kind.fieldunits_by_name.get(name), "enum": kind.fieldenums_by_name.get(name)}
+    told = {key: value for key, value in facts.items() if value}
+    return pa.field(name, pa.list_(one) if length and written != "char" else one, metadata=told)
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode("ascii", "replace")
+    return value
