@@ -63,6 +63,13 @@ def run_copies(
             while_waiting()
 
 
+def begin_copy(work: Callable[[Any], None], argument: Any) -> None:
+    """Do a work in a process that nobody waits for; it ends with this one at the latest."""
+    process = multiprocessing.Process(target=work, args=(argument,), daemon=True)
+    with no_warning_of_threads():
+        process.start()
+
+
 @contextmanager
 def no_warning_of_threads() -> Iterator[None]:
     """Let processes fork: the threads that Python warns of, the linear algebra's, are idle."""

@@ -2,48 +2,76 @@
 
 import io
 import sys
+from collections.abc import Callable, Iterable
 
 import pytest
 from rich.console import Console
 
 from gateway.cli.app import app
 from gateway.cli.support import warm_up
-from gateway.cli.support.warm_up import OWN_ESTIMATORS, STEPS, make_ready
+from gateway.cli.support.warm_up import STEPS, make_ready
 
 pytestmark = pytest.mark.io
 
 
+class Compiler:
+    """A compiler that takes no time, and what it was asked for: where, and of which estimator."""
+
+    def __init__(self, kept: set[str]) -> None:
+        self.kept = kept
+        self.asked: list[tuple[str, str]] = []
+
+    def is_kept(self, step: object) -> bool:
+        return next(name for name, known in STEPS.items() if known is step) in self.kept
+
+    def apart(self, _work: object, names: Iterable[str], while_waiting: Callable[[], None]) -> None:
+        while_waiting()
+        for name in names:
+            self.asked.append(("apart", name))
+            self.kept.add(name)
+
+    def behind(self, _work: object, names: Iterable[str]) -> None:
+        self.asked += [("behind", name) for name in names]
+
+    def here(self, name: str) -> None:
+        assert name in self.kept, "telemetry would wait for the compiler in this process"
+        self.asked.append(("here", name))
+
+
 @pytest.fixture
-def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Estimators that were compiled, by a compiler that takes no time."""
-    found: list[str] = []
-    monkeypatch.setattr(warm_up, "cores", lambda: 1)
-    monkeypatch.setattr(warm_up, "is_kept", lambda step: STEPS.index(step) < len(set(found)))
-    monkeypatch.setattr(warm_up, "_rehearse", found.append)
+def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
+    found = Compiler(set())
+    monkeypatch.setattr(warm_up, "is_kept", found.is_kept)
+    monkeypatch.setattr(warm_up, "run_copies", found.apart)
+    monkeypatch.setattr(warm_up, "begin_copy", found.behind)
+    monkeypatch.setattr(warm_up, "_rehearse", found.here)
     return found
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
-def test_the_first_start_shows_how_far_it_is(
-    done: list[str], monkeypatch: pytest.MonkeyPatch, is_terminal: bool
+def test_the_first_start_waits_for_the_chosen_estimator_alone(
+    compiler: Compiler, monkeypatch: pytest.MonkeyPatch, is_terminal: bool
 ) -> None:
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=is_terminal, width=100)
     monkeypatch.setattr(warm_up, "console_of", lambda **_: console)
     make_ready("eskf")
-    assert set(done) == set(OWN_ESTIMATORS)
-    assert done[-1] == "eskf", "its machine code is the one that this process has"
-    text = shown.getvalue()
-    assert ("compiling the estimators" in text) == is_terminal
-    for count in range(len(STEPS) + 1):
-        assert (f"{count}/{len(STEPS)}" in text) == is_terminal
+    others = [("behind", name) for name in STEPS if name != "eskf"]
+    assert compiler.asked == [("apart", "eskf"), ("here", "eskf"), *others]
+    assert ("compiling the estimator" in shown.getvalue()) == is_terminal
 
 
-def test_a_later_start_shows_nothing(done: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warm_up, "is_kept", lambda _: True)
-    monkeypatch.setattr(warm_up, "console_of", lambda **_: pytest.fail("a bar"))
+def test_others_that_are_missing_are_not_waited_for(compiler: Compiler) -> None:
+    compiler.kept.update({"complementary", "paper"})
+    make_ready("complementary")
+    assert compiler.asked == [("here", "complementary"), ("behind", "eskf")]
+
+
+def test_a_later_start_shows_nothing(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler.kept.update(STEPS)
+    monkeypatch.setattr(warm_up, "console_of", lambda **_: pytest.fail("a clock"))
     make_ready("paper")
-    assert done == ["paper"]
+    assert compiler.asked == [("here", "paper")]
 
 
 @pytest.mark.parametrize(

@@ -123,10 +123,10 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
 
 def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Look whether compiled estimators are kept, and can be."""
-    if all(is_kept(step) for step in STEPS):
+    if all(is_kept(step) for step in STEPS.values()):
         yield Diagnosis(Grade.GOOD, "estimators", "compiled")
         return
-    text = "the next start compiles the estimators, up to a minute and on a small computer some"
+    text = "the next start compiles the estimators: telemetry waits for the chosen one alone"
     yield Diagnosis(Grade.NOTE, "estimators", text)
 
 

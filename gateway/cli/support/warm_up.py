@@ -1,22 +1,23 @@
 """Compiled code, made ready before samples wait for it."""
 
 import logging
+import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from gateway.aircraft import AircraftSettings
-from gateway.analysis.processes import cores, run_copies
+from gateway.analysis.processes import begin_copy, run_copies
 from gateway.cli.support.terminal import console_of
 from gateway.compiled import is_kept
 from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper import paper_kernels
-from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
+from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 
@@ -24,14 +25,22 @@ log = logging.getLogger(__name__)
 
 REHEARSAL_US: Final = 100_000
 SAMPLE_US: Final = 10_000
-STEPS: Final = (paper_kernels.step_live, COMPLEMENTARY.imu, ESKF.imu)
+STEPS: Final[dict[str, Callable[..., object]]] = {
+    "paper": paper_kernels.step_live,
+    "complementary": COMPLEMENTARY.imu,
+    "eskf": ESKF.imu,
+}
+"""What each estimator does with a sample: where its machine code is kept, so is all of it."""
+BEHIND: Final = 10
+"""How nice the process is that compiles while telemetry flows."""
 
 
 def make_ready(estimator: str) -> None:
-    """Have the machine code of an estimator in this process, and that of all others on the disk.
+    """Have the machine code of an estimator in this process, and see to that of all others.
 
-    It is kept beside the source, so only the first start after an upgrade compiles. The others are
-    compiled too, since a ground station may choose one in flight, when the compiler would cost the
+    It is kept beside the source, so only the first start after an upgrade compiles: the estimator
+    that is chosen, before anything else, and then the others in a process of their own, behind the
+    telemetry, since a ground station may choose one in flight, when the compiler would cost the
     horizon seconds; to read one from the disk takes some hundredths of one.
 
     Parameters
@@ -39,44 +48,44 @@ def make_ready(estimator: str) -> None:
     estimator : str
         The one that the settings name.
     """
-    if all(is_kept(step) for step in STEPS):
-        _rehearse(estimator)
-        return
-    log.info("compiling the estimators, up to a minute; later starts take a second")
-    begin = time.monotonic()
-    with _bar() as show:
-        if cores() > 1:
-            # A process each; this one then finds the code that they have kept, or makes it itself.
-            run_copies(_rehearse_apart, OWN_ESTIMATORS, show)
-        for name in (*OWN_ESTIMATORS, estimator):
-            _rehearse(name)
-            show()
-    log.info("compiled in %.0f s", time.monotonic() - begin)
+    missing = [name for name, step in STEPS.items() if not is_kept(step)]
+    if estimator in missing:
+        log.info("compiling the estimator %s, this once; later starts take a second", estimator)
+        begin = time.monotonic()
+        with _clock() as show:
+            # Apart, for a compiler's memory is not given back; this process reads what it kept.
+            run_copies(_compile, [estimator], show)
+        log.info("compiled in %.0f s", time.monotonic() - begin)
+        missing.remove(estimator)
+    _rehearse(estimator)
+    if missing:
+        log.info("compiling %s for a later choice, behind the telemetry", " and ".join(missing))
+        begin_copy(_compile_behind, missing)
 
 
 @contextmanager
-def _bar() -> Iterator[Callable[[], None]]:
-    """Show on a terminal how many estimators are done, and that the others are worked at."""
+def _clock() -> Iterator[Callable[[], None]]:
+    """Show on a terminal that it is worked at, and for how long."""
     console = console_of(stderr=True)
-    # No thread of its own: the processes that compile are forked from this one.
+    # No thread of its own: the process that compiles is forked from this one.
     with Progress(
-        TextColumn("compiling the estimators, this once"), BarColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), console=console, transient=True, auto_refresh=False,
-        disable=not console.is_terminal,
+        SpinnerColumn(), TextColumn("compiling the estimator, this once"), TimeElapsedColumn(),
+        console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
-        task = progress.add_task("", total=len(STEPS))
-
-        def show() -> None:
-            progress.update(task, completed=sum(is_kept(step) for step in STEPS), refresh=True)
-
-        show()
-        yield show
+        progress.add_task("", total=None)
+        yield progress.refresh
 
 
-def _rehearse_apart(name: str) -> None:
+def _compile(name: str) -> None:
     # It is the parent that tells of an interrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _rehearse(name)
+
+
+def _compile_behind(names: Iterable[str]) -> None:
+    os.nice(BEHIND)
+    for name in names:
+        _compile(name)
 
 
 def _rehearse(name: str) -> None:

@@ -8,6 +8,7 @@
 """
 
 import asyncio
+import contextlib
 import logging
 import os
 from collections.abc import Callable
@@ -202,6 +203,9 @@ class SerialPort:
             self._complain(f"receiver {device}: {reason_of(error)}")
             self._try_later()
             return
+        with contextlib.suppress(OSError, ValueError):
+            # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
+            self._port.set_low_latency_mode(True)
         log.info("receiver on %s at %d baud", device, self._settings.baud)
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""

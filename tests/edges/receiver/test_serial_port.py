@@ -172,3 +172,29 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
     assert delays == [0.25, 0.5, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0]
     assert delays[-1] == LONGEST_RETRY_S
     link.close()
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("can", [True, False])
+async def test_the_adapter_is_asked_to_hold_no_bytes_back(
+    bench: Bench,
+    listener: Listener,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    can: bool,
+) -> None:
+    asked: list[bool] = []
+
+    def ask(_: object, wanted: bool) -> None:
+        asked.append(wanted)
+        if not can:
+            raise ValueError("Failed to update ASYNC_LOW_LATENCY flag")
+
+    monkeypatch.setattr("serial.Serial.set_low_latency_mode", ask)
+    bench.plug()
+    settings = SerialSettings(port=str(bench.link))
+    link = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    link.start()
+    assert (asked, link.connected) == ([True], True)
+    assert not caplog.records, "an adapter that cannot is used as it is, without a word"
+    link.close()
