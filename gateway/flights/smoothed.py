@@ -20,7 +20,6 @@ from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.smoothing.smoother import smooth
 from gateway.flights.reading import FlightError
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, NavState
-from gateway.sensing.chain import SensorChain
 
 SMOOTHED_ESTIMATOR: Final = "eskf"
 """The filter that the smoother goes over."""
@@ -56,10 +55,7 @@ def smooth_records(
     FlightError
         If the clock went back: there is no order to smooth in.
     """
-    chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
-    if not isinstance(estimator, KernelEstimator):
-        raise TypeError(f"{SMOOTHED_ESTIMATOR} is {type(estimator)}, which cannot be smoothed")
-    log = _gathered(records, chain, estimator)
+    log, estimator = gather_samples(records, aircraft)
     if np.any(np.diff(log.imu_time_us) < 0):
         raise FlightError("its clock goes back, so it cannot be smoothed; cut it there")
     return log.imu_time_us, smooth(estimator, log)
@@ -88,11 +84,13 @@ class SmoothedStates:
         return msgspec.structs.replace(smoothed, flags=state.flags)
 
 
-def _gathered(
-    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated],
-    chain: SensorChain,
-    estimator: KernelEstimator[Any, Any],
-) -> SampleLog:
+def gather_samples(
+    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated], aircraft: AircraftSettings
+) -> tuple[SampleLog, KernelEstimator[Any, Any]]:
+    """Lay a flight's records out as arrays, calibrated, for the Kalman filter, which is fresh."""
+    chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
+    if not isinstance(estimator, KernelEstimator):
+        raise TypeError(f"{SMOOTHED_ESTIMATOR} is {type(estimator)}, which cannot be smoothed")
     imu_us: list[int] = []
     imu: list[ImuRow] = []
     baro_us: list[int] = []
@@ -121,7 +119,7 @@ def _gathered(
                     record.flags,
                 )
                 imu.append(imu_row(sample))
-    return SampleLog(
+    log = SampleLog(
         imu_time_us=np.array(imu_us, np.int64),
         imu=np.array(imu, np.float64).reshape(-1, IMU_COLUMNS),
         baro_time_us=np.array(baro_us, np.int64),
@@ -129,3 +127,4 @@ def _gathered(
         gps_time_us=np.array(gps_us, np.int64),
         gps=np.array(gps, np.float64).reshape(-1, GPS_COLUMNS),
     )
+    return log, estimator

@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -30,6 +31,7 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
+from gateway.estimation.alignment.gps_latency import estimate_latency
 from gateway.estimation.columns import NAV_COLUMNS
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
@@ -47,7 +49,7 @@ from gateway.flights.reading import (
     open_rows,
 )
 from gateway.flights.refusion import SETTLES
-from gateway.flights.smoothed import smooth_records, with_smoothed_estimator
+from gateway.flights.smoothed import gather_samples, smooth_records, with_smoothed_estimator
 from gateway.output import check_output, write_new
 from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
 from gateway.replay import header_for, records_of
@@ -98,7 +100,8 @@ def fuse_log(
     The columns are those of a recording's table, so every command takes the file as one.
     Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
     ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
-    Without --config, the words gps_latency_s and declination_deg of such a file's # line count.
+    Without --config, the words gps_latency_s and declination_deg of such a file's # line count; a
+    latency that it does not tell is estimated from its manoeuvres, or assumed, which is said.
     """
     current = read_settings(config)
     with refusing():
@@ -113,7 +116,8 @@ def fuse_log(
             columns=read_column_map(columns),
             progress=advance,
         )
-        _remark_latency(files[0], facts, gps_latency_s, options)
+        if kind_of(files[0]) is FileKind.FOREIGN and "gps_latency_s" not in facts and not config:
+            gps_latency_s = _found_latency_s(files[0], gps_latency_s, options)
         table = joined_rows([open_rows(part, options) for part in files])
         aircraft = _adjusted(
             aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
@@ -138,17 +142,23 @@ def fuse_log(
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 
 
-def _remark_latency(
-    file: Path, facts: dict[str, float], told_s: float | None, options: ReadOptions
-) -> None:
-    """Say which latency is assumed where neither the file nor the user tells one."""
-    foreign = kind_of(file) is FileKind.FOREIGN
-    if foreign and told_s is None and "gps_latency_s" not in facts:
-        assumed_s = options.current.default.estimation.reference.gps_latency_s
-        console_of(stderr=True).print(
-            f"{file}: tells no GPS latency; {assumed_s:.2f} s is assumed, --gps-latency sets it",
-            markup=False,
-        )
+def _found_latency_s(file: Path, told_s: float | None, options: ReadOptions) -> float:
+    """Estimate the latency that neither a log nor the user tells, or assume the usual; say so."""
+    if told_s is not None:
+        return told_s
+    table = open_rows(file, replace(options, progress=None))
+    aircraft = aircraft_of(table, options)
+    found = estimate_latency(gather_samples(_records(table), aircraft)[0])
+    latency_s = aircraft.estimation.reference.gps_latency_s if found is None else found.latency_s
+    how = (
+        f"{latency_s:.2f} s is assumed, for no manoeuvre tells it"
+        if found is None
+        else f"its manoeuvres tell {latency_s:.3f} s +- {found.std_s:.3f} s, which is taken"
+    )
+    console_of(stderr=True).print(
+        f"{file}: tells no GPS latency; {how}; --gps-latency sets it", markup=False
+    )
+    return latency_s
 
 
 def _records(table: RecordedTable) -> Iterator[Record]:

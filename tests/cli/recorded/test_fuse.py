@@ -1,7 +1,9 @@
 """`mavgate fuse` on small logs."""
 
 import csv
+import gzip
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from gateway.cli.app import app
 from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import TableReader, encode_head, encode_state
 from gateway.replay import header_for
+from tests.estimation.test_golden import GOLDEN
 from tests.test_replay import fly_from_the_middle
 
 HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
@@ -121,3 +124,28 @@ def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
     assert result.exit_code == 2
     assert "--force overwrites it" in result.output
     assert out.read_text() == "precious"
+
+
+@pytest.mark.io
+@pytest.mark.slow
+def test_a_latency_that_a_log_does_not_tell_is_estimated(tmp_path: Path) -> None:
+    log, out = tmp_path / "log.csv", tmp_path / "out.csv"
+    flight = gzip.decompress((GOLDEN / "take_off.csv.gz").read_bytes()).decode()
+    log.write_text(flight.replace("gps_latency_s=0.16", ""))
+    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out)])
+    assert result.exit_code == 0, result.output
+    words = " ".join(result.output.split())
+    told = re.search(r"its manoeuvres tell (0\.\d+) s", words)
+    assert told is not None, words
+    assert float(told[1]) == pytest.approx(0.16, abs=0.02)
+    assert f'"gps_latency_s":{told[1][:4]}' in out.read_text().replace(" ", "")
+
+
+@pytest.mark.io
+def test_a_latency_that_no_manoeuvre_tells_is_assumed(log: Path) -> None:
+    log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
+    arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
+    words = " ".join(CliRunner().invoke(app, arguments).output.split())
+    assert "0.15 s is assumed, for no manoeuvre tells it" in words
+    told = CliRunner().invoke(app, [*arguments, "--gps-latency", "0.2"])
+    assert "tells no GPS latency" not in told.output
