@@ -51,6 +51,10 @@ class FieldHistory:
             columns = kinds[name] = _Columns(message)
         columns.add(message, now_us)
 
+    def forget(self, system_id: int) -> None:
+        """Let go what an aircraft told."""
+        self._vehicles.pop(system_id, None)
+
     def fields(self, system_id: int) -> dict[str, tuple[str, ...]]:
         """Return which fields each message of an aircraft has, in alphabetical order."""
         kinds = self._vehicles.get(system_id, {})
@@ -91,7 +95,7 @@ class FieldHistory:
 
 
 class _Columns:
-    """A ring of rows, which grows up to `MAX_ROWS`."""
+    """A ring of rows, which grows to hold `SPAN_US`, and never beyond `MAX_ROWS`."""
 
     def __init__(self, message: Any) -> None:
         self._readers = _readers_of(message)
@@ -101,20 +105,25 @@ class _Columns:
         self._time_us = np.zeros(FIRST_ROWS, np.int64)
         self._values = np.zeros((FIRST_ROWS, len(self._readers)))
         self._count = 0
-        """Rows ever written; the newest is at `(count - 1) % capacity`."""
+        """The newest row is at `(count - 1) % capacity`, the oldest of a full ring behind it."""
 
     def unit(self, field: str) -> str:
         return self._units.get(field.partition("[")[0], "")
 
+    @property
+    def capacity(self) -> int:
+        return len(self._time_us)
+
     def add(self, message: Any, now_us: int) -> None:
-        capacity = len(self._time_us)
         if self._count:
-            last_us = int(self._time_us[(self._count - 1) % capacity])
+            last_us = int(self._time_us[(self._count - 1) % self.capacity])
             if now_us - last_us < LEAST_GAP_US:
                 return
-        if self._count == capacity and capacity < MAX_ROWS:
-            self._grow(min(2 * capacity, MAX_ROWS))
-        row = self._count % len(self._time_us)
+        oldest_us = int(self._time_us[self._count % self.capacity])
+        is_full = self._count >= self.capacity
+        if is_full and self.capacity < MAX_ROWS and now_us - oldest_us <= SPAN_US:
+            self._grow(min(2 * self.capacity, MAX_ROWS))
+        row = self._count % self.capacity
         self._time_us[row] = now_us
         self._values[row] = [read(message) for _, _, read in self._readers]
         self._count += 1
@@ -131,19 +140,18 @@ class _Columns:
         return time_us[begin:end], values
 
     def _order(self) -> IntArray:
-        capacity = len(self._time_us)
+        capacity = self.capacity
         if self._count <= capacity:
             return np.arange(self._count)
         return np.arange(self._count - capacity, self._count) % capacity
 
     def _grow(self, capacity: int) -> None:
-        # Called only while nothing was overwritten yet, so rows are in order.
-        self._time_us = np.concatenate(
-            [self._time_us, np.zeros(capacity - len(self._time_us), np.int64)]
-        )
+        order, more = self._order(), capacity - self.capacity
+        self._time_us = np.concatenate([self._time_us[order], np.zeros(more, np.int64)])
         self._values = np.concatenate(
-            [self._values, np.zeros((capacity - len(self._values), self._values.shape[1]))]
+            [self._values[order], np.zeros((more, self._values.shape[1]))]
         )
+        self._count = len(order)
 
 
 _Reader = tuple[str, str, Callable[[Any], float]]

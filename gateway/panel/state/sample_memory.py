@@ -40,6 +40,10 @@ class SampleMemory:
         while frames[0][0] < now_us - SPAN_US:
             frames.popleft()
 
+    def forget(self, system_id: int) -> None:
+        """Let go what an aircraft told."""
+        self._frames.pop(system_id, None)
+
     def frames(self, system_id: int) -> TimedFrames:
         """Return what is kept of an aircraft, the oldest first."""
         return list(self._frames.get(system_id, ()))

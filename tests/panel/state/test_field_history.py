@@ -78,3 +78,24 @@ def test_thinned_out_peaks_stay() -> None:
 def test_thinned_out_gaps_stay() -> None:
     values = np.full(1000, np.nan)
     assert np.isnan(thin_out(np.arange(1000), values, 10)[1]).all()
+
+
+def test_seldom_message_takes_no_more_than_its_minutes() -> None:
+    history = FieldHistory()
+    for second in range(3600):
+        history.take(1, attitude(float(second)), second * US_PER_S)
+    (columns,) = history._vehicles[1].values()
+    assert columns.capacity < 1000
+    time_us, values = history.series(1, "ATTITUDE.roll")
+    assert np.array_equal(time_us, np.arange(3300, 3600) * US_PER_S)
+    assert values.tolist() == list(range(3300, 3600))
+
+
+def test_message_that_comes_faster_later_keeps_its_minutes() -> None:
+    history, now_us = FieldHistory(), 0
+    for step in range(9000):
+        now_us += US_PER_S if step < 1000 else US_PER_S // 25
+        history.take(1, attitude(float(step)), now_us)
+    time_us, values = history.series(1, "ATTITUDE.roll")
+    assert len(time_us) == 7500
+    assert values.tolist() == list(range(1500, 9000))
