@@ -8,10 +8,12 @@ from nicegui import ui
 
 from gateway.edges.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
+from gateway.panel.state.gateway_alerts import with_status
 from gateway.panel.state.status_texts import TimedText
 from gateway.panel.view_context import ViewContext
 
 REFRESH_S: Final = 0.5
+LIVE: Final = "live"
 SEVERITIES: Final = (
     "Emergency", "Alert", "Critical", "Error", "Warning", "Notice", "Info", "Debug",
 )  # fmt: skip
@@ -36,6 +38,8 @@ def build_banner(context: ViewContext) -> None:
         nonlocal shown
         vehicle = context.vehicle
         alerts = [] if vehicle is None else alerts_of(vehicle, context.now_us)
+        if vehicle is not None and vehicle.origin == LIVE:
+            alerts = with_status(alerts, context.parts.watch.status, vehicle.system_id)
         if alerts == shown:
             return
         shown = alerts

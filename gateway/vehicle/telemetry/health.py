@@ -96,7 +96,7 @@ class Health:
             if status.sensors_failed & status.sensors_present & bit:
                 failed |= sensors
         self._faulty[status.node.node_id] = failed
-        self._roles[status.node.node_id] = _role(status.sensors_present)
+        self._roles[status.node.node_id] = node_role(status.sensors_present)
         if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
@@ -222,7 +222,8 @@ class Health:
         return frozenset(link.node.node_id for link in self._nodes if link.received)
 
 
-def _role(sensors_present: int) -> str:
+def node_role(sensors_present: int) -> str:
+    """Name what a node is by the sensors that it carries."""
     if sensors_present & NODE_IMU:
         return "IMU node"
     return "GPS node" if sensors_present & NODE_GPS else "Node"
