@@ -85,7 +85,7 @@ class LiveTable:
                 with ui.element("td"):
                     self._cells[key].append(ui.label(text).classes(kind))
             if self._buttons:
-                with ui.element("td"):
+                with ui.element("td").classes("acts"):
                     for entry in self._buttons:
                         button = ui.button(icon=entry.icon, on_click=partial(entry.act, key))
                         button.props(f'{BUTTON_PROPS} aria-label="{entry.title}"')

@@ -24,6 +24,7 @@ REFRESH_S: Final = 0.2
 STORE: Final = 1.0
 """PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 MIN_CELLS: Final = 60
+LIVE: Final = "live"
 
 TITLES: Final = {
     CalibrationStep.GYRO: ("Gyroscope", "360", "leave it at rest, 3 s"),
@@ -139,8 +140,11 @@ class _CalibrationView:
                 self._build_residuals(run)
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
-        if self._context.vehicle is None:
+        vehicle = self._context.vehicle
+        if vehicle is None:
             return "No aircraft is heard."
+        if vehicle.origin != LIVE:
+            return "This aircraft is played from a recording. Choose a live one to calibrate it."
         if run is None or run.state is RunState.ASKED:
             waits = "" if ready else " Reading the parameters first, so that it can be undone …"
             return WHAT_TO_DO[self._step] + waits
@@ -169,7 +173,8 @@ class _CalibrationView:
             self._figures = ui.html("", sanitize=False)
 
     def _build_buttons(self, run: CalibrationRun | None, *, ready: bool) -> None:
-        may = self._context.may_change and self._context.vehicle is not None
+        vehicle = self._context.vehicle
+        may = self._context.may_change and vehicle is not None and vehicle.origin == LIVE
         with ui.element("div").classes("buttons"):
             if run is not None and not run.state.is_over:
                 ui.button("Cancel", on_click=self._cancel).props("no-caps unelevated").classes(

@@ -39,7 +39,7 @@ class LinkView:
                     ("Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age"),
                     "No node was heard.",
                 )
-            with ui.element("div").classes("card padded"):
+            with ui.element("div").classes("card padded wide"):
                 ui.label("Clients").classes("title")
                 self._build_clients()
             with ui.element("div").classes("card padded"):

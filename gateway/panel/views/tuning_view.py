@@ -66,6 +66,7 @@ class _TuningView:
                 self._build_effect()
         self._context.on_select(self._on_select)
         self._context.every(REFRESH_S, self._refresh)
+        self._draw()
         self._refresh()
 
     @property
@@ -87,6 +88,7 @@ class _TuningView:
     def _on_select(self) -> None:
         self._drawn = None
         self._group.set_value(ALL)
+        self._draw()
         self._chart.reload()
         self._refresh()
 
@@ -132,8 +134,10 @@ class _TuningView:
                 self._rows[name] = ParameterRow(self._context, dialogue, meta)
             if len(names) > MAX_ROWS:
                 ui.label(f"{len(names) - MAX_ROWS} more; search for them").classes("empty")
-            if not names and dialogue.parameters.entries:
-                ui.label("No parameter is called or described so.").classes("empty")
+            if not names:
+                known = dialogue.parameters.entries
+                text = "No parameter is called or described so." if known else "No parameters yet."
+                ui.label(text).classes("empty")
 
     def _wanted(self, dialogue: Dialogue) -> list[str]:
         words = (self._search.value or "").casefold().split()

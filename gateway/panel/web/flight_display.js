@@ -343,7 +343,7 @@ export default {
       g.textAlign = "center";
       g.textBaseline = "middle";
       const digits = left && shown < 99.95 ? 1 : 0;
-      g.fillText(known(shown) ? shown.toFixed(digits) : "––", x + width / 2, middle + 0.2 * u);
+      g.fillText(known(shown) ? plain(shown, digits) : "––", x + width / 2, middle + 0.2 * u);
     },
     climb({ g, u, w, h, font }, value, [factor, unit]) {
       const width = 5 * u;
@@ -469,14 +469,17 @@ export default {
         this.spoken = this.goal ? "Flight display: no attitude" : "Flight display: no aircraft";
         return;
       }
-      const in_ = (v, [factor, name]) => (known(v) ? `${(v * factor).toFixed(1)} ${name}` : "unknown");
+      const in_ = (v, [factor, name]) => (known(v) ? `${plain(v * factor, 1)} ${name}` : "unknown");
       this.spoken =
-        `Roll ${angles.roll.toFixed(1)}°, pitch ${angles.pitch.toFixed(1)}°, ` +
+        `Roll ${plain(angles.roll, 1)}°, pitch ${plain(angles.pitch, 1)}°, ` +
         `heading ${angles.yaw.toFixed(1)}°, speed ${in_(speed, unit.speed)}, ` +
         `altitude ${in_(height, unit.height)}, climb ${in_(climb, unit.climb)}`;
     },
   },
 };
+
+// Without the sign of a zero.
+const plain = (value, digits) => value.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
 
 function triangle(g, x, y, half, height) {
   g.beginPath();

@@ -98,12 +98,13 @@ export default {
       </div>
       <div class="map-legend" v-if="full">
         <span class="key track">fused</span><span class="key fix">GPS</span>
+        <span v-for="origin in played" :key="origin" class="key" :class="origin">{{ origin }}</span>
         <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
       </div>
     </div>`,
   props: { styles: Array, full: Boolean },
-  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "" }),
+  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "", played: [] }),
 
   mounted() {
     const map = (this.map = L.map(this.$refs.map, {
@@ -207,6 +208,7 @@ export default {
         if (arrow) {
           arrow.style.transform = `rotate(${state.heading_deg ?? 0}deg)`;
           arrow.dataset.selected = id === mavgate.selected;
+          arrow.dataset.origin = state.origin;
         }
         const last = one.track.getLatLngs().at(-1);
         if (!last || this.map.distance(last, at(state)) > 1) {
@@ -223,6 +225,8 @@ export default {
         for (const layer of [one.marker, one.track, one.fixes]) layer.remove();
         delete this.craft[id];
       }
+      const played = Object.keys(COLOURS).filter((origin) => Object.values(mavgate.vehicles).some((v) => v.origin === origin));
+      if (String(played) !== String(this.played)) this.played = played;
       this.draw_selected(mavgate.state);
     },
     draw_selected(state) {
