@@ -114,7 +114,8 @@ def lay_out(
     flights : sequence of OpenFlight
         At least one.
     wished : sequence of int
-        System ids for the first vehicles of the recordings, as far as they reach.
+        System ids for the first vehicles of the recordings, as far as they reach; the other
+        vehicles of a recording get those that follow.
     with_commands : bool
         Play too what stations said and what else asks something of a vehicle.
     """
@@ -126,8 +127,8 @@ def lay_out(
         shift_us = 0 if together else begin_us - flight.first_us
         system_ids: dict[int, int] = {}
         for place, system_id in enumerate(flight.vehicles):
-            wanted = wished[number] if place == 0 and number < len(wished) else system_id
-            while wanted in used:
+            wanted = wished[number] + place if number < len(wished) else system_id
+            while wanted in used or wanted >= FIRST_GROUND_STATION:
                 wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
             used.add(wanted)
             system_ids[system_id] = wanted

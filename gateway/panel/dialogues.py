@@ -129,6 +129,7 @@ class Dialogues:
         self._clock = clock
         self._task: asyncio.Task[None] | None = None
         fleet.listen(self._take)
+        fleet.on_forget(self._forget)
 
     def start(self) -> None:
         """Begin to ask again for what does not come; needs a running event loop."""
@@ -167,6 +168,9 @@ class Dialogues:
         if run is not None:
             self._send(run.cancel_message())
 
+    def _forget(self, system_id: int) -> None:
+        self._all.pop(system_id, None)
+
     def _take(self, system_id: int, message: Any, now_us: int) -> None:
         dialogue = self._all.get(system_id)
         if dialogue is not None:
@@ -175,7 +179,7 @@ class Dialogues:
     async def _poll(self) -> None:
         while True:
             await asyncio.sleep(POLL_S)
-            for dialogue in self._all.values():
+            for dialogue in tuple(self._all.values()):
                 self._send_all(dialogue.poll(self._clock()))
 
     def _send_all(self, messages: list[Any]) -> None:

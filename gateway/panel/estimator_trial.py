@@ -117,10 +117,13 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
 
 async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
     """Do `compare` in a process of its own."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
+    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    try:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(pool, compare, frames, dict(parameters))
+    finally:
+        # The page does not stand still until the process has ended.
+        pool.shutdown(wait=False)
 
 
 def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:

@@ -6,9 +6,11 @@ import hashlib
 import inspect
 import logging
 import os
+import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -47,6 +49,8 @@ log = logging.getLogger(__name__)
 NICENESS: Final = 5
 """The gateway goes before its picture."""
 MAX_CONNECTIONS: Final = 256
+RECONNECT_S: Final = 30.0
+"""A browser that was away for less finds its page as it left it."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
 """The style sheet of the map library that NiceGUI brings along."""
 
@@ -120,6 +124,8 @@ def make_parts(
     history, samples = FieldHistory(), SampleMemory()
     fleet.listen(history.take)
     fleet.listen(samples.take)
+    fleet.on_forget(history.forget)
+    fleet.on_forget(samples.forget)
     dialogues = Dialogues(fleet, uplink.send, clock)
     watch = GatewayWatch(control, fleet)
     return PanelParts(
@@ -166,7 +172,7 @@ def make_app(parts: PanelParts) -> FastAPI:
         favicon=WEB / "icon.svg",
         show_welcome_message=False,
         binding_refresh_interval=None,
-        reconnect_timeout=5.0,
+        reconnect_timeout=RECONNECT_S,
         tailwind=False,
     )
     return app
@@ -180,7 +186,8 @@ async def _serve(
     *,
     attached: bool,
 ) -> None:
-    server = uvicorn.Server(config)
+    server = _Server(config)
+    _end_with_signals(server)
     if attached:
         _end_with_input(server)
     parts.uplink.start()
@@ -199,6 +206,23 @@ async def _serve(
         parts.playback.close()
         parts.watch.close()
         parts.uplink.close()
+
+
+class _Server(uvicorn.Server):
+    """Leaves signals alone: raised anew at its end, they would end the process before its parts."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+
+def _end_with_signals(server: uvicorn.Server) -> None:
+    def end() -> None:
+        server.should_exit = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, end)
 
 
 def _end_with_input(server: uvicorn.Server) -> None:

@@ -1,7 +1,7 @@
 """A recording played beside the live aircraft: a `mavgate play` of the panel's own.
 
 It is a process with a control socket of its own, sends its frames to a loopback port of the panel
-and to nobody else, and its aircraft have system ids that no gateway gives out.
+and to nobody else, and its aircraft get system ids that no live one has.
 """
 
 import asyncio
@@ -11,44 +11,29 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.edges.operator.control_socket import ControlError
-from gateway.flightlog.mapshape import thin_out
-from gateway.flights.map_tracks import points_of_frames
-from gateway.flights.reading import FlightError, recorded_frames
 from gateway.panel.control_client import ControlClient
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.recorded_aircraft import TWIN, RecordedAircraft, free_ids, look_into
+from gateway.panel.state.fleet_picture import FleetPicture, Origin
 from gateway.panel.uplink import Uplink
-from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
 
-RECORDED_ID: Final = 201
-TWIN_ID: Final = 202
-"""Beyond the 31 of a gateway's aircraft, below the ground stations'."""
 READY_S: Final = 120.0
 """A table of hours is opened in some seconds; a first start compiles."""
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
-PROFILE_POINTS: Final = 400
+LEAP_S: Final = 0.5
+"""So far back is no jitter of the player's clock, but the begin of another round."""
 SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
 class PlaybackError(Exception):
     """A recording cannot be played; the text says why."""
-
-
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """The height over the time of a recording."""
-
-    time_s: tuple[float, ...]
-    """Since its begin."""
-    alt_amsl_m: tuple[float, ...]
 
 
 class Playback:
@@ -65,8 +50,8 @@ class Playback:
     def __init__(self, uplink: Uplink, fleet: FleetPicture) -> None:
         self.name = ""
         """Of the recording; empty while none is open."""
-        self.has_twin = False
-        self.profile = Profile((), ())
+        self.aircraft: dict[int, RecordedAircraft] = {}
+        """What is played, by the system ids that it is played as."""
         self.status: dict[str, Any] | None = None
         """As `play.status` answers."""
         self._uplink = uplink
@@ -75,6 +60,11 @@ class Playback:
         self._child: asyncio.subprocess.Process | None = None
         self._control: ControlClient | None = None
         self._watching: asyncio.Task[None] | None = None
+
+    @property
+    def has_twin(self) -> bool:
+        """Whether some of it is fused again."""
+        return any(one.origin == TWIN for one in self.aircraft.values())
 
     async def open(self, folder: Path, name: str, *, twin: bool) -> None:
         """Open a recording, in place of the one that is open.
@@ -101,11 +91,13 @@ class Playback:
         tlogs = [file for file in files if file.suffix == ".tlog"]
         tables = [file for file in files if file.suffix == ".csv"]
         played = [*tlogs, *(tables if twin or not tlogs else [])]
-        ids = [RECORDED_ID] * bool(tlogs) + [TWIN_ID] * (len(played) > len(tlogs))
-        self.name, self.has_twin = name, len(ids) > 1
-        self._name_aircraft(ids)
-        self.profile = await asyncio.to_thread(_profile_of, tlogs or tables)
-        await self._start(played, ids)
+        try:
+            flights = await asyncio.to_thread(look_into, played)
+            firsts = self._number(flights)
+        except (OSError, ValueError) as error:
+            raise PlaybackError(f"{name}: {error}") from error
+        self.name = name
+        await self._start(played, firsts)
 
     def close(self) -> None:
         """End the playback; its aircraft go."""
@@ -117,9 +109,10 @@ class Playback:
         if self._folder is not None:
             self._folder.cleanup()
         self._child = self._folder = self._control = self._watching = self.status = None
-        self.name, self.profile = "", Profile((), ())
-        for system_id in (RECORDED_ID, TWIN_ID):
+        self.name = ""
+        for system_id in self.aircraft:
             self._fleet.forget(system_id)
+        self.aircraft = {}
 
     async def order(self, verb: str, **params: Any) -> None:
         """Give the player an order; see docs/control.md.
@@ -131,15 +124,24 @@ class Playback:
         """
         if self._control is None:
             raise PlaybackError("no recording is open")
+        before = self.status
         try:
             self.status = await self._control.ask(verb, **params)
         except ControlError as error:
             raise PlaybackError(str(error)) from error
-        if verb == "seek":
+        went_back = before is not None and (
+            self.status["position_s"] < before["position_s"] - LEAP_S
+        )
+        if verb == "seek" or went_back:
             # The way to another moment was never flown.
-            for system_id in (RECORDED_ID, TWIN_ID):
+            for system_id in self.aircraft:
                 if vehicle := self._fleet.vehicles.get(system_id):
                     vehicle.begin_anew()
+
+    async def toggle(self) -> None:
+        """Pause, or go on; raises as `order`."""
+        playing = (self.status or {}).get("state") == "playing"
+        await self.order("play.pause" if playing else "play.resume")
 
     async def refresh(self) -> None:
         """Ask the player where it is; a player that has ended is closed."""
@@ -149,16 +151,24 @@ class Playback:
             with suppress(PlaybackError):
                 await self.order("play.status")
 
-    def _name_aircraft(self, ids: Sequence[int]) -> None:
-        origins = {RECORDED_ID: "recorded", TWIN_ID: "re-fused"}
-        self._fleet.origins.update({key: origins[key] for key in ids})
+    def _number(self, flights: Sequence[Sequence[RecordedAircraft]]) -> list[int]:
+        """Give the aircraft system ids that nobody has; returns the first of each flight."""
+        firsts = []
+        for flight in flights:
+            ids = free_ids(len(flight), {*self._fleet.vehicles, *self.aircraft})
+            firsts.append(ids.start)
+            self.aircraft.update(zip(ids, flight, strict=True))
+        self._fleet.origins.update(
+            {key: Origin(one.origin, one.recorded_id) for key, one in self.aircraft.items()}
+        )
+        return firsts
 
-    async def _start(self, files: Sequence[Path], ids: Sequence[int]) -> None:
+    async def _start(self, files: Sequence[Path], firsts: Sequence[int]) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="mavgate-playback-")
         socket = Path(self._folder.name) / "mavgate" / "play.sock"
         arguments = ["play", *map(str, files), "--loop"]
         arguments += ["--endpoint", f"udp:127.0.0.1:{self._uplink.playback_port}"]
-        for system_id in ids:
+        for system_id in firsts:
             arguments += ["--as", str(system_id)]
         self._child = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -194,25 +204,3 @@ class Playback:
             return "the player does not begin"
         text = (await self._child.stderr.read()).decode(errors="replace").strip()
         return text.splitlines()[-1] if text else "the player ended"
-
-
-def _profile_of(files: Sequence[Path]) -> Profile:
-    """Read the heights of a recording; none where it has no positions."""
-    if not files or files[0].suffix != ".tlog":
-        return Profile((), ())
-    try:
-        first_us, points = None, []
-        for record in recorded_frames(files[:1], None):
-            first_us = record.time_us
-            break
-        points = list(thin_out(points_of_frames(recorded_frames(files, None), None)))
-    except (OSError, FlightError):
-        return Profile((), ())
-    if first_us is None or not points:
-        return Profile((), ())
-    every = max(1, len(points) // PROFILE_POINTS)
-    kept = points[::every]
-    return Profile(
-        tuple((point.time_us - first_us) / US_PER_S for point in kept),
-        tuple(point.alt_amsl_m for point in kept),
-    )

@@ -12,6 +12,7 @@ from typing import Any, Final
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
+from gateway.panel.page_prompts import notify_failure
 from gateway.panel.state.shown_units import ShownUnits
 from gateway.panel.view_context import PanelParts, Role, ViewContext
 from gateway.panel.views import (
@@ -142,14 +143,15 @@ class _Page:
             self._theme.props('flat round dense aria-label="Light or dark"')
 
     def _build_button(self, view: View, number: int) -> None:
-        button = ui.button(on_click=partial(self.show, view.key)).props("flat no-caps stack")
+        button = ui.button(on_click=partial(self.show, view.key), color=None)
+        button.props("flat no-caps stack")
         button.props(f'aria-label="{view.title}" aria-keyshortcuts="{number}" data-view={view.key}')
         with button:
             ui.icon(view.icon)
             ui.label(view.title)
         self._buttons[view.key] = button
 
-    def _on_key(self, event: KeyEventArguments) -> None:
+    async def _on_key(self, event: KeyEventArguments) -> None:
         if not event.action.keydown or event.action.repeat or event.modifiers.ctrl:
             return
         key = event.key.name
@@ -157,6 +159,13 @@ class _Page:
             self.show(VIEWS[int(key) - 1].key)
         elif key == "t":
             self._next_theme()
+        elif event.key.space and self._context.parts.playback.name:
+            await self._toggle_playback()
+
+    async def _toggle_playback(self) -> None:
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            await self._context.parts.playback.toggle()
 
     def _next_theme(self) -> None:
         order = list(THEMES)

@@ -3,7 +3,8 @@
 It stands on the hub, which knows every transport and opens again what breaks. With a URL it
 connects there. Without one it asks the gateway on this machine, over the control socket, for a
 listening port of the panel's own on loopback, and again whenever that falls silent: so a gateway
-that was started anew is found anew.
+that was started anew is found anew. A second hub takes the frames of a player that the panel
+starts: what is played reaches nobody but the panel, and orders to a played aircraft its player.
 """
 
 import asyncio
@@ -22,7 +23,7 @@ from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.records import Incoming, Outgoing
 from gateway.routing.hub_settings import HubSettings
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ class Uplink:
     def __init__(
         self, url: str | None, fleet: FleetPicture, control: ControlClient, clock: GatewayClock
     ) -> None:
-        endpoints = (PLAYBACK_URL,) if url is None else (_trusting(url), PLAYBACK_URL)
+        endpoints = () if url is None else (_trusting(url),)
         self.is_local = url is None
         self._fleet = fleet
         self._control = control
@@ -74,9 +75,8 @@ class Uplink:
         self._mav: Any = mavlink.MAVLink(
             None, SYSTEM_ID, FIRST_COMPONENT + os.getpid() % USER_COMPONENTS
         )
-        self._hub = Hub(
-            HubSettings(endpoints=endpoints), self._on_frame, clock, on_foreign=self._on_foreign
-        )
+        self._hub = self._make_hub(endpoints, played=False)
+        self._player_hub = self._make_hub((PLAYBACK_URL,), played=True)
         self._senders: dict[tuple[int, int], Any] = {}
         self._listeners: list[Callable[[Any], None]] = []
         self._heard: bytes | None = None
@@ -88,6 +88,7 @@ class Uplink:
     def start(self) -> None:
         """Connect; needs a running event loop. What is not there yet is tried again."""
         self._hub.start()
+        self._player_hub.start()
         self._task = asyncio.get_running_loop().create_task(self._keep_alive())
 
     def close(self) -> None:
@@ -95,11 +96,12 @@ class Uplink:
         if self._task is not None:
             self._task.cancel()
         self._hub.close()
+        self._player_hub.close()
 
     @property
     def playback_port(self) -> int:
         """Loopback port that takes the frames of a player; 0 while it is not open."""
-        return self._hub.listening_ports()[-1] if self._hub.listening_ports() else 0
+        return next(iter(self._player_hub.listening_ports()), 0)
 
     @property
     def is_alive(self) -> bool:
@@ -193,7 +195,9 @@ class Uplink:
     def _send(self, message: Any, mav: Any) -> int:
         frame = message.pack(mav)
         mav.seq = (mav.seq + 1) % 256
-        self._hub.send(Outgoing(frame, message.get_msgId()))
+        is_played = target_of(frame)[0] in self._fleet.origins
+        hub = self._player_hub if is_played else self._hub
+        hub.send(Outgoing(frame, message.get_msgId()))
         return len(frame)
 
     def _sender(self, system_id: int, component_id: int) -> Any:
@@ -207,23 +211,29 @@ class Uplink:
             self._senders[key] = mavlink.MAVLink(None, *key)
         return self._senders[key]
 
-    def _on_foreign(self, frame: bytes) -> None:
-        # A broadcast comes both to us and past us.
-        if frame is not self._heard:
-            self._take(frame)
+    def _make_hub(self, endpoints: tuple[str, ...], *, played: bool) -> Hub:
+        def on_frame(incoming: Incoming) -> None:
+            self._heard = incoming.frame
+            self._take(incoming.frame, played=played)
 
-    def _on_frame(self, incoming: Incoming) -> None:
-        self._heard = incoming.frame
-        self._take(incoming.frame)
+        def on_foreign(frame: bytes) -> None:
+            # A broadcast comes both to us and past us.
+            if frame is not self._heard:
+                self._take(frame, played=played)
 
-    def _take(self, frame: bytes) -> None:
+        return Hub(HubSettings(endpoints=endpoints), on_frame, self._clock, on_foreign=on_foreign)
+
+    def _take(self, frame: bytes, *, played: bool) -> None:
+        if (origin_of(frame)[0] in self._fleet.origins) is not played:
+            # Of two with the same number, the page knows the one that it has given it to.
+            return
         try:
             message = self._mav.decode(bytearray(frame))
         except mavlink.MAVError:
             log.debug("message %d cannot be decoded", message_id_of(frame))
             return
         now_us = self._clock()
-        if message.get_srcSystem() != SYSTEM_ID:
+        if not played and message.get_srcSystem() != SYSTEM_ID:
             self._heard_us = now_us
         if message.get_type() == "COMMAND_ACK":
             self._note_ack(message)

@@ -116,3 +116,12 @@ def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:
 def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FlightError, match=r"empty.tlog: is no recording"):
         laid_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])
+
+
+def test_vehicles_of_a_recording_follow_the_id_of_its_first(tmp_path: Path) -> None:
+    both = write(tmp_path, "both.tlog", [*RECORDS[:50], *make_records(50, system_id=7)])
+    assert [flight.system_ids for flight in laid_out([both, both], 200)] == [
+        {1: 200, 7: 201},
+        {1: 1, 7: 7},
+    ]
+    assert laid_out([both], 249)[0].system_ids[7] < 249, "ground stations begin at 250"

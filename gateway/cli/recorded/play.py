@@ -87,7 +87,12 @@ def play(
     ] = None,
     system: Annotated[
         list[int] | None,
-        typer.Option("--as", min=1, max=249, help="System id for the vehicle of each recording."),
+        typer.Option(
+            "--as",
+            min=1,
+            max=249,
+            help="System id for each recording's vehicle; its others follow.",
+        ),
     ] = None,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",

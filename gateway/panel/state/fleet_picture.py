@@ -1,6 +1,7 @@
 """All aircraft that were heard, and who listens to their messages."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 from gateway.panel.state.vehicle_picture import VehiclePicture
@@ -15,16 +16,27 @@ Listener = Callable[[int, Any, int], None]
 """Given system id, decoded message and time in µs on the panel's clock."""
 
 
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where an aircraft is from that is not live."""
+
+    word: str
+    """`recorded` or `re-fused`."""
+    recorded_id: int
+    """Its system on the day that it flew."""
+
+
 class FleetPicture:
     """What came over MAVLink, by system id."""
 
     def __init__(self) -> None:
         self.vehicles: dict[int, VehiclePicture] = {}
-        self.origins: dict[int, str] = {}
-        """Where aircraft are from that are not live: `recorded`, or `re-fused` while played."""
+        self.origins: dict[int, Origin] = {}
+        """Of aircraft that are not live but played, by the system ids that they are played as."""
         self.version = 0
         """Counts the messages, so that a reader knows whether there is anything new."""
         self._listeners: list[Listener] = []
+        self._on_forget: list[Callable[[int], None]] = []
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Have every message of every aircraft handed on, until the returned function is called."""
@@ -36,11 +48,17 @@ class FleetPicture:
 
         return leave
 
+    def on_forget(self, callback: Callable[[int], None]) -> None:
+        """Have somebody told the system id of every aircraft that is let go."""
+        self._on_forget.append(callback)
+
     def forget(self, system_id: int) -> None:
         """Let an aircraft go."""
         self.vehicles.pop(system_id, None)
         self.origins.pop(system_id, None)
         self.version += 1
+        for callback in self._on_forget:
+            callback(system_id)
 
     def take(self, message: Any, now_us: int) -> None:
         """Take in one decoded message of anybody.
@@ -60,8 +78,10 @@ class FleetPicture:
         if vehicle is None:
             if len(self.vehicles) >= MAX_VEHICLES:
                 return
-            origin = self.origins.get(system_id, "live")
-            vehicle = self.vehicles[system_id] = VehiclePicture(system_id, origin)
+            vehicle = VehiclePicture(system_id)
+            if origin := self.origins.get(system_id):
+                vehicle = VehiclePicture(system_id, origin.word, origin.recorded_id)
+            self.vehicles[system_id] = vehicle
         vehicle.take(message, now_us)
         self.version += 1
         for listener in self._listeners:

@@ -51,11 +51,14 @@ class VehiclePicture:
         MAVLink system.
     origin : str
         `live`, `recorded` or `re-fused`.
+    number : int, optional
+        What people call it by, where that is not its system id.
     """
 
-    def __init__(self, system_id: int, origin: str = "live") -> None:
+    def __init__(self, system_id: int, origin: str = "live", number: int | None = None) -> None:
         self.system_id = system_id
         self.origin = origin
+        self.number = system_id if number is None else number
         self.generation = 0
         """How often the path began anew."""
         self.newest: dict[str, Any] = {}
@@ -99,7 +102,8 @@ class VehiclePicture:
     def title(self) -> str:
         """What people call it."""
         kind = "Aircraft" if self.model == "none" else self.model.capitalize()
-        return f"{kind} {self.system_id}" if self.origin == "live" else f"{kind}, {self.origin}"
+        name = f"{kind} {self.number}"
+        return name if self.origin == "live" else f"{name}, {self.origin}"
 
     def begin_anew(self) -> None:
         """Begin the path anew, as after a leap through a recording."""

@@ -13,7 +13,8 @@ from nicegui.events import GenericEventArguments
 from gateway.edges.disk.recordings import delete_recording, list_recordings
 from gateway.panel.live_table import Cells, LiveTable, RowButton
 from gateway.panel.page_prompts import confirm, notify_failure
-from gateway.panel.recording_player import SPEEDS
+from gateway.panel.recorded_aircraft import Profile
+from gateway.panel.recording_player import SPEEDS, Playback
 from gateway.panel.view_context import WEB, ViewContext
 
 REFRESH_S: Final = 1.0
@@ -103,7 +104,8 @@ class RecordingsView:
             self._speed = ui.select(
                 {speed: f"{speed:g}×" for speed in SPEEDS}, value=1, on_change=self._on_speed
             )
-            self._speed.props('dense borderless options-dense aria-label="Speed"')
+            self._speed.props('dense borderless options-dense aria-label="Speed"').classes("short")
+            ui.label("space plays and pauses").classes("soft hint")
         self._player.set_visibility(False)
 
     async def refresh(self) -> None:
@@ -130,8 +132,7 @@ class RecordingsView:
         playing = status["state"] == "playing"
         self._toggle.props(f"icon={'pause' if playing else 'play_arrow'}")
         new = {
-            "times": playback.profile.time_s,
-            "heights": playback.profile.alt_amsl_m,
+            "curves": _curves_of(playback, self._context.system_id),
             "duration": status["duration_s"],
             "position": round(status["position_s"], 2),
             "playing": playing,
@@ -208,9 +209,10 @@ class RecordingsView:
         await self._play("seek", to=f"{float(event.args):.2f}")
 
     async def _on_toggle(self) -> None:
-        status = self._context.parts.playback.status or {}
-        playing = status.get("state") == "playing"
-        await self._play("play.pause" if playing else "play.resume")
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            await self._context.parts.playback.toggle()
+            self._show_place()
 
     async def _on_speed(self, event: Any) -> None:
         await self._play("play.speed", speed=float(event.value))
@@ -219,6 +221,12 @@ class RecordingsView:
 def build(context: ViewContext) -> None:
     """Build the view."""
     RecordingsView(context)
+
+
+def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
+    """Return the heights of all that is played, those of the chosen aircraft first."""
+    order = sorted(playback.aircraft, key=lambda key: (key != system_id, key))
+    return [playback.aircraft[key].profile for key in order]
 
 
 def _detail_of(recorder: dict[str, Any]) -> str:

@@ -1,4 +1,5 @@
-// A slider through a recording, with the flight's altitude drawn in it.
+// A slider through a recording, with the altitudes of its aircraft drawn in it: that of the chosen
+// one filled, those of the others as lines.
 export default {
   template: `
     <div class="time-slider" role="slider" tabindex="0" aria-label="Moment of the recording"
@@ -7,13 +8,13 @@ export default {
       <canvas ref="canvas"></canvas>
       <span class="time-slider-text figure">{{ text(shown) }} / {{ text(duration) }}</span>
     </div>`,
-  props: { times: Array, heights: Array, duration: Number, position: Number, playing: Boolean, speed: Number },
+  props: { curves: Array, duration: Number, position: Number, playing: Boolean, speed: Number },
   data: () => ({ held: null, shown: 0 }),
   mounted() {
     this.told_ms = performance.now();
     this.size = new ResizeObserver(() => this.draw());
     this.size.observe(this.$el);
-    for (const name of ["times", "heights", "duration"]) this.$watch(name, () => this.draw());
+    for (const name of ["curves", "duration"]) this.$watch(name, () => this.draw());
     this.$watch("position", () => (this.told_ms = performance.now()));
     const turn = () => {
       this.handle = requestAnimationFrame(turn);
@@ -51,14 +52,20 @@ export default {
       pen.setTransform(ratio, 0, 0, ratio, 0, 0);
       pen.clearRect(0, 0, width, height);
       const x = (s) => (this.duration ? (s / this.duration) * width : 0);
-      const low = Math.min(...this.heights);
-      const high = Math.max(...this.heights, low + 1);
+      const [chosen, ...others] = this.curves;
+      const heights = this.curves.flatMap((curve) => curve.alt_amsl_m);
+      const low = Math.min(...heights);
+      const high = Math.max(...heights, low + 1);
       const y = (h) => height - 8 - ((h - low) / (high - low)) * (height - 30);
-      if (this.heights.length) {
+      const line = ({ time_s, alt_amsl_m }) => {
         const path = new Path2D();
-        path.moveTo(x(this.times[0]), height);
-        this.times.forEach((t, i) => path.lineTo(x(t), y(this.heights[i])));
-        path.lineTo(x(this.times.at(-1)), height);
+        time_s.forEach((t, i) => path.lineTo(x(t), y(alt_amsl_m[i])));
+        return path;
+      };
+      if (chosen?.time_s.length) {
+        const path = line(chosen);
+        path.lineTo(x(chosen.time_s.at(-1)), height);
+        path.lineTo(x(chosen.time_s[0]), height);
         pen.fillStyle = mavgate.colour("line");
         pen.fill(path);
         pen.save();
@@ -69,6 +76,10 @@ export default {
         pen.globalAlpha = 0.45;
         pen.fill(path);
         pen.restore();
+      }
+      if (heights.length) {
+        pen.strokeStyle = mavgate.colour("soft");
+        for (const other of others) pen.stroke(line(other));
         pen.fillStyle = mavgate.colour("soft");
         pen.font = "11px system-ui";
         pen.textAlign = "right";
@@ -79,7 +90,8 @@ export default {
       pen.beginPath();
       pen.arc(Math.min(Math.max(x(this.shown), 6), width - 6), height - 7, 6, 0, 7);
       pen.fill();
-      this.$el.dataset.points = this.heights.length;
+      this.$el.dataset.points = chosen?.time_s.length ?? 0;
+      this.$el.dataset.curves = this.curves.length;
     },
     at(event) {
       const box = this.$el.getBoundingClientRect();
@@ -98,6 +110,7 @@ export default {
       setTimeout(() => (this.held = null), 600);
     },
     key(event) {
+      if (event.key === " ") event.preventDefault(); // the page scrolls no further; the shell plays
       const step = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60 }[event.key];
       if (step === undefined) return;
       event.preventDefault();

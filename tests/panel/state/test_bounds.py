@@ -1,0 +1,70 @@
+"""What the panel remembers of an aircraft stops growing, however long it flies."""
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.field_history import FieldHistory
+from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.sample_memory import SPAN_US, SampleMemory
+from gateway.panel.state.vehicle_picture import MAX_TRACK
+from gateway.units import US_PER_S
+from tests.panel.messages import decoded, heartbeat, position
+
+RATE_HZ = 10
+HOUR_S = 3600
+
+
+class Memory:
+    """All that is kept by aircraft, fed on a manual clock."""
+
+    def __init__(self) -> None:
+        self.fleet, self.history, self.samples = FleetPicture(), FieldHistory(), SampleMemory()
+        for listener in (self.history.take, self.samples.take):
+            self.fleet.listen(listener)
+        for forget in (self.history.forget, self.samples.forget):
+            self.fleet.on_forget(forget)
+
+    def fly(self, begin_s: int, end_s: int) -> None:
+        imu = decoded(mavlink.MAVLink_highres_imu_message(0, *[0.0] * 13, 63))
+        text = decoded(mavlink.MAVLink_statustext_message(6, b"all is well"))
+        attitude = decoded(mavlink.MAVLink_attitude_message(0, *[0.1] * 6))
+        place = position(47.0, 8.0)
+        for step in range(begin_s * RATE_HZ, end_s * RATE_HZ):
+            now_us = step * US_PER_S // RATE_HZ
+            slow: list[Any] = [heartbeat(), text] if step % RATE_HZ == 0 else []
+            for message in (imu, attitude, place, *slow):
+                self.fleet.take(message, now_us)
+
+    @property
+    def size(self) -> dict[str, int]:
+        (vehicle,) = self.fleet.vehicles.values()
+        return {
+            "track": len(vehicle.track),
+            "texts": len(vehicle.texts.all),
+            "newest": len(vehicle.newest),
+            "frames": len(self.samples.frames(1)),
+            "rows": sum(columns.capacity for columns in self.history._vehicles[1].values()),
+        }
+
+
+def test_second_hour_takes_nothing_more() -> None:
+    memory = Memory()
+    memory.fly(0, HOUR_S)
+    first = memory.size
+    memory.fly(HOUR_S, 2 * HOUR_S)
+    second = memory.size
+    assert first["track"] < second.pop("track") == MAX_TRACK
+    del first["track"]
+    assert first == second
+    assert second["frames"] == pytest.approx(SPAN_US // US_PER_S * RATE_HZ, abs=1)
+
+
+def test_aircraft_that_is_let_go_leaves_nothing() -> None:
+    memory = Memory()
+    memory.fly(0, 5)
+    memory.fleet.forget(1)
+    assert memory.fleet.vehicles == {}
+    assert memory.history.fields(1) == {}
+    assert memory.samples.frames(1) == []

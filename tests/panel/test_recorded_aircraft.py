@@ -1,0 +1,63 @@
+"""What is known of a recording before it is played."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.flightlog.table.row import row_to_line
+from gateway.flightlog.table.table import encode_head
+from gateway.flightlog.tlog.tlog import encode_record
+from gateway.panel.recorded_aircraft import RECORDED, TWIN, free_ids, look_into
+from gateway.units import US_PER_S
+from tests.test_replay import fly, make_flight, read
+
+pytestmark = pytest.mark.io
+
+
+def packed(message: Any, system_id: int) -> bytes:
+    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)))
+
+
+def flown(system_id: int, second: int, alt_m: int) -> bytes:
+    position = mavlink.MAVLink_global_position_int_message(
+        0, 470_000_000, 80_000_000, alt_m * 1000, 0, 0, 0, 0, 0
+    )
+    return encode_record((1000 + second) * US_PER_S, packed(position, system_id))
+
+
+def test_every_aircraft_of_a_tlog_has_its_heights(tmp_path: Path) -> None:
+    station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    tlog = tmp_path / "two_01.tlog"
+    tlog.write_bytes(
+        encode_record(1000 * US_PER_S, packed(station, 42))
+        + b"".join(flown(1, n, 100 + n) + flown(7, n, 300) for n in range(5))
+    )
+    ((first, second),) = look_into([tlog])
+    assert (first.recorded_id, second.recorded_id) == (1, 7)
+    assert {first.origin, second.origin} == {RECORDED}
+    assert first.profile.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
+    assert first.profile.alt_amsl_m == (100.0, 101.0, 102.0, 103.0, 104.0)
+    assert second.profile.alt_amsl_m == (300.0,) * 5
+
+
+def test_table_tells_of_its_twin(tmp_path: Path, rng: np.random.Generator) -> None:
+    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
+    table = tmp_path / "a_01_v1.csv"
+    table.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
+    ((twin,),) = look_into([table])
+    assert (twin.recorded_id, twin.origin) == (header.vehicle_id, TWIN)
+    assert twin.profile.time_s[-1] == pytest.approx(10.0, abs=0.5)
+    heights = [row.state.alt_amsl_m for row in rows if row.state is not None]
+    assert set(twin.profile.alt_amsl_m) <= set(heights)
+    assert 40 < len(twin.profile.alt_amsl_m) <= 50
+
+
+def test_played_aircraft_get_ids_that_nobody_has() -> None:
+    assert free_ids(2, {1, 2}) == range(248, 250)
+    assert free_ids(2, {1, 249, 247}) == range(245, 247)
+    with pytest.raises(ValueError, match="3 more aircraft"):
+        free_ids(3, range(2, 250, 2))

@@ -1,0 +1,100 @@
+"""The panel's connection, with a gateway and a player that are plain sockets."""
+
+import asyncio
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.edges.clock import GatewayClock
+from gateway.panel.control_client import ControlClient
+from gateway.panel.state.fleet_picture import FleetPicture, Origin
+from gateway.panel.uplink import SYSTEM_ID, Uplink
+
+pytestmark = pytest.mark.io
+LIMIT_S = 10.0
+PLAYED = 249
+
+
+def beat(system_id: int) -> bytes:
+    message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 0, 0, 0, 4, 3)
+    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)))
+
+
+@pytest.fixture
+def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as player,
+    ):
+        for sock in (gateway, player):
+            sock.bind(("127.0.0.1", 0))
+            sock.setblocking(False)
+        yield gateway, player
+
+
+async def until(holds: Callable[[], bool], send: Callable[[], object]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not holds():
+            send()
+            await asyncio.sleep(0.01)
+
+
+def heard(sock: socket.socket) -> list[mavlink.MAVLink_message]:
+    found = []
+    while True:
+        try:
+            data = sock.recv(2048)
+        except BlockingIOError:
+            return found
+        found.append(mavlink.MAVLink(None).decode(bytearray(data)))
+
+
+async def test_what_is_played_stays_in_the_panel(
+    tmp_path: Path, sockets: tuple[socket.socket, socket.socket]
+) -> None:
+    gateway, player = sockets
+    fleet = FleetPicture()
+    url = f"udp:127.0.0.1:{gateway.getsockname()[1]}"
+    uplink = Uplink(url, fleet, ControlClient(tmp_path / "none.sock"), GatewayClock())
+    uplink.start()
+    await asyncio.sleep(0)
+    try:
+        fleet.origins[PLAYED] = Origin("recorded", 1)
+        await until(lambda: bool(uplink.playback_port), lambda: None)
+        here = ("127.0.0.1", uplink.playback_port)
+        await until(lambda: PLAYED in fleet.vehicles, lambda: player.sendto(beat(PLAYED), here))
+        assert fleet.vehicles[PLAYED].title == "Plane 1, recorded"
+        assert not uplink.is_alive
+        there: list[tuple[str, int]] = []
+
+        def answer() -> None:
+            try:
+                there.append(gateway.recvfrom(2048)[1])
+            except BlockingIOError:
+                return
+            # A live one of the same number is another aircraft, and is not taken for the played.
+            gateway.sendto(beat(PLAYED), there[0])
+            gateway.sendto(beat(3), there[0])
+            player.sendto(beat(4), here)
+
+        await until(lambda: 3 in fleet.vehicles, answer)
+        assert sorted(fleet.vehicles) == [3, PLAYED]
+        heard(gateway)
+        heard(player)
+        for system_id in (PLAYED, 3):
+            uplink.send(mavlink.MAVLink_param_request_list_message(system_id, 1))
+        seen: list[mavlink.MAVLink_message] = []
+        await until(
+            lambda: any(m.get_type() == "PARAM_REQUEST_LIST" for m in seen),
+            lambda: seen.extend(heard(gateway)),
+        )
+        assert {m.get_srcSystem() for m in seen} == {SYSTEM_ID}
+        asked = [m.target_system for m in seen if m.get_type() == "PARAM_REQUEST_LIST"]
+        assert asked == [3]
+        answered = [m.target_system for m in heard(player) if m.get_type() == "PARAM_REQUEST_LIST"]
+        assert answered == [PLAYED]
+    finally:
+        uplink.close()
