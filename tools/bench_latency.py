@@ -3,7 +3,8 @@
 A frame with one IMU sample is written to a pseudo-terminal and the ATTITUDE_QUATERNION that it
 becomes is awaited on a UDP port, at several frame rates. The baseline, measured in the same run, is
 a program that reads the same line and sends a datagram of the same size for every delimiter,
-without decoding, fusing or encoding anything.
+without decoding, fusing or encoding anything. The greatest latency at the highest rate is the
+longest pause, the machine's own included: the baseline tells those.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import time
 import tty
 from collections import deque
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -220,7 +222,15 @@ def show(results: list[dict]) -> None:
             *(f"{row[key]:.0f}" for key in ("p50_us", "p99_us", "max_us")),
             f"{row['cpu_percent']:.1f}",
         )
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    for program in dict.fromkeys(row["program"] for row in results):
+        # Where frames come fastest, a pause of the program meets one just as it begins.
+        worst = max((r for r in results if r["program"] == program), key=itemgetter("rate_hz"))
+        console.print(
+            f"longest pause of the {program}: {worst['max_us'] / 1e3:.1f} ms in "
+            f"{worst['samples'] / worst['rate_hz']:.0f} s at {worst['rate_hz']} frames/s"
+        )
 
 
 if __name__ == "__main__":

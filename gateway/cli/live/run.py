@@ -6,11 +6,10 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
-from rich.live import Live
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.panel_process import PanelProcess
@@ -24,7 +23,10 @@ from gateway.cli.support.warm_up import make_ready
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.operator.keyboard import Keyboard
-from gateway.edges.operator.live_view import LiveView, summary_line
+from gateway.edges.operator.log_line import summary_line
+
+if TYPE_CHECKING:
+    from gateway.edges.operator.live_view import LiveView
 
 log = logging.getLogger(__name__)
 
@@ -100,9 +102,7 @@ async def serve(
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    view = None if plain or not sys.stdout.isatty() else LiveView()
-    if view is not None:
-        logging.getLogger().handlers[:] = [view.log]
+    view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
     # What is here by now stays: a full collection that walks all of it stops telemetry for 0.1 s.
     gc.collect()
@@ -122,6 +122,15 @@ async def serve(
         daemon.close()
 
 
+def _open_view() -> "LiveView":
+    # Not above: a service draws nothing.
+    from gateway.edges.operator.live_view import LiveView
+
+    view = LiveView()
+    logging.getLogger().handlers[:] = [view.log]
+    return view
+
+
 def _reload(daemon: Daemon) -> None:
     try:
         daemon.reload()
@@ -130,8 +139,10 @@ def _reload(daemon: Daemon) -> None:
 
 
 async def _live_view(
-    daemon: Daemon, view: LiveView, stopped: asyncio.Event, panel: PanelProcess | None
+    daemon: Daemon, view: "LiveView", stopped: asyncio.Event, panel: PanelProcess | None
 ) -> None:
+    from rich.live import Live
+
     held = False
 
     def on_key(key: str) -> None:

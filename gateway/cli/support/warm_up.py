@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy, run_copies
 from gateway.cli.support.terminal import console_of
@@ -66,6 +64,9 @@ def make_ready(estimator: str) -> None:
 @contextmanager
 def _clock() -> Iterator[Callable[[], None]]:
     """Show on a terminal that it is worked at, and for how long."""
+    # Not above: most starts compile nothing.
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     console = console_of(stderr=True)
     # No thread of its own: the process that compiles is forked from this one.
     with Progress(

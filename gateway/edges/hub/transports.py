@@ -11,26 +11,39 @@ from gateway.edges.hub.radio import RadioClient
 from gateway.edges.hub.tcp import TcpClient, TcpListener
 from gateway.edges.hub.udp import UdpClient
 from gateway.edges.hub.udp_listen import UdpListener
-from gateway.edges.hub.web.websocket import WsClient, WsListener
 from gateway.routing.endpoint import ADDED_KINDS, Endpoint, EndpointKind
 
 ClientMaker = Callable[[HubContext, int, Endpoint], Client]
+
+
+def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
+    # Not above, nor below: most gateways have no WebSocket, and its library takes its time.
+    from gateway.edges.hub.web.websocket import WsClient
+
+    return WsClient(context, client_id, endpoint)
+
+
+def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
+    from gateway.edges.hub.web.websocket import WsListener
+
+    return WsListener(context, endpoint)
+
 
 CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,
     EndpointKind.UDP_MULTICAST: GroupClient,
     EndpointKind.TCP: TcpClient,
-    EndpointKind.WS: WsClient,
-    EndpointKind.WSS: WsClient,
+    EndpointKind.WS: _ws_client,
+    EndpointKind.WSS: _ws_client,
     EndpointKind.ZENOH: ZenohClient,
     EndpointKind.SERIAL: RadioClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
-    EndpointKind.WS_LISTEN: WsListener,
-    EndpointKind.WSS_LISTEN: WsListener,
+    EndpointKind.WS_LISTEN: _ws_listener,
+    EndpointKind.WSS_LISTEN: _ws_listener,
 }
 
 

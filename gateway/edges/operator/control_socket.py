@@ -5,7 +5,8 @@ JSON asks, one line answers; docs/control.md describes every verb. Whoever offer
 handler and the shape of its parameters, which are checked before the handler sees them.
 """
 
-import asyncio
+from __future__ import annotations
+
 import logging
 import os
 import pwd
@@ -13,9 +14,12 @@ import socket
 import struct
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
+
+if TYPE_CHECKING:
+    import asyncio
 
 log = logging.getLogger(__name__)
 
@@ -113,6 +117,9 @@ class ControlServer:
         ControlError
             If the socket cannot be made, or as many gateways as can be told apart run already.
         """
+        # Not above: those who only ask need none of it, and it is half of what a command costs.
+        import asyncio
+
         check_length(self.path)
         try:
             self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)

@@ -19,6 +19,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderR
 from rich.table import Table
 from rich.text import Text
 
+from gateway.edges.operator.log_line import UNKNOWN, figure_of
 from gateway.geometry.quaternion import to_euler
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, ListenerStats
@@ -26,7 +27,6 @@ from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
 from gateway.units import US_PER_S
 
 SILENT_US: Final = 2 * US_PER_S
-UNKNOWN: Final = "—"
 LOG_LINES: Final = 5
 RATE_SNAPSHOTS: Final = 11
 """Rates are told over so many views: a message of 1 Hz must not flicker between 0 and 2."""
@@ -168,25 +168,6 @@ class _Grid:
         return table
 
 
-def summary_line(snapshot: Snapshot) -> str:
-    """Sum up a moment in one line for a log."""
-    report = snapshot.report
-    parts = [f"receiver {report.port} {'connected' if report.connected else 'not connected'}"]
-    parts += [
-        f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
-        for node in report.nodes
-    ]
-    for vehicle_id, state in snapshot.states:
-        roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
-        place = f"{_figure(state.lat_deg, '.6f')} {_figure(state.lon_deg, '.6f')}"
-        parts.append(
-            f"aircraft {vehicle_id} at {place} {_figure(state.alt_amsl_m, '.1f')} m, "
-            f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
-        )
-    parts.append(f"{len(snapshot.clients)} clients")
-    return "; ".join(parts)
-
-
 def _link_line(snapshot: Snapshot) -> Text:
     report = snapshot.report
     up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
@@ -260,14 +241,14 @@ def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) ->
     grid = _Grid("aircraft", *heads, *fixes, "home m", "home at°", "mark m", "mark at°")
     grid.add_row(
         str(vehicle_id),
-        _figure(roll, "+.1f"),
-        _figure(pitch, "+.1f"),
-        _figure(yaw % 360.0, ".1f"),
-        _figure(state.lat_deg, ".6f"),
-        _figure(state.lon_deg, ".6f"),
-        _figure(state.alt_amsl_m, ".1f"),
-        _figure(math.hypot(north, east), ".1f"),
-        _figure(-down, "+.1f"),
+        figure_of(roll, "+.1f"),
+        figure_of(pitch, "+.1f"),
+        figure_of(yaw % 360.0, ".1f"),
+        figure_of(state.lat_deg, ".6f"),
+        figure_of(state.lon_deg, ".6f"),
+        figure_of(state.alt_amsl_m, ".1f"),
+        figure_of(math.hypot(north, east), ".1f"),
+        figure_of(-down, "+.1f"),
         *_fix_cells(known.fix if known else None),
         *_way_cells(known.home if known else None),
         *_way_cells(known.mark if known else None),
@@ -282,24 +263,20 @@ def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
     return (
         Text(name, style="" if fix.fix_ok else "red"),
         str(fix.satellites),
-        _figure(fix.h_acc_m, ".1f"),
-        _figure(fix.v_acc_m, ".1f"),
+        figure_of(fix.h_acc_m, ".1f"),
+        figure_of(fix.v_acc_m, ".1f"),
     )
 
 
 def _way_cells(way: Way | None) -> tuple[str, str]:
     if way is None or way.distance_m is None or way.bearing_deg is None:
         return UNKNOWN, UNKNOWN
-    return _figure(way.distance_m, ".0f"), _figure(way.bearing_deg, ".0f")
+    return figure_of(way.distance_m, ".0f"), figure_of(way.bearing_deg, ".0f")
 
 
 def _flags(state: NavState) -> Text:
     words = [Text(word, style=style) for flag, word, style in FLAG_WORDS if flag in state.flags]
     return Text("  ").join(words)
-
-
-def _figure(value: float, spec: str) -> str:
-    return format(value, spec) if math.isfinite(value) else UNKNOWN
 
 
 def _rates(snapshot: Snapshot, previous: Snapshot) -> Columns:

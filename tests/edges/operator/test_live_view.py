@@ -8,7 +8,8 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from gateway.edges.operator.live_view import LiveView, summary_line
+from gateway.edges.operator.live_view import LiveView
+from gateway.edges.operator.log_line import summary_line
 from gateway.geometry.quaternion import from_euler
 from gateway.records import (
     NAN,

@@ -1,0 +1,45 @@
+"""What a command may import: to list, to ask and to run must not cost what others need."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.io
+
+NEVER = {"IPython", "bokeh", "dask", "fsspec", "matplotlib", "mcap", "nicegui", "pandas", "pyarrow"}
+HEAVY = {"asyncio", "numba", "numpy", "pymavlink", "scipy"}
+"""What no small command needs; the gateway itself is made of some of it."""
+RUN_MAY_NOT = {
+    "gateway.fleet.fleet_server",
+    "gateway.panel.panel_server",
+    "prometheus_client",
+    "rich.live",
+    "rich.progress",
+    "scipy.signal",
+    "scipy.spatial",
+    "wsproto",
+    "zenoh",
+}
+
+
+def imported_by(*modules: str) -> set[str]:
+    code = f"import json, sys, {', '.join(modules)}; print(json.dumps([*sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    return set(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("module", ["gateway.cli.app", "gateway.cli.live.clients"])
+def test_small_commands_import_little(module: str) -> None:
+    assert imported_by(module) & (NEVER | HEAVY) == set()
+
+
+def test_the_gateway_imports_nothing_that_it_may_not_need() -> None:
+    found = imported_by("gateway.cli.app", "gateway.cli.live.run")
+    assert found & (NEVER | RUN_MAY_NOT) == set()
+    assert {name for name in found if name.startswith("gateway.simulator")} <= {
+        "gateway.simulator",
+        "gateway.simulator.simulator_settings",
+        "gateway.simulator.timed_frame",
+    }
