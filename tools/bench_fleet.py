@@ -3,8 +3,8 @@
 For each number of sites: frames lost, latency from the load generator's clock before it publishes
 to this process's clock when the ground station reads (p50 and p99), CPU of router and fleet in per
 cent of a core, their memory. The sites are load generators, several in each of a few processes:
-they publish ATTITUDE frames that carry the time; no gateway runs behind them. What the plain hub
-does for one source is measured by bench_hub.py.
+they publish ATTITUDE frames that carry the time; no gateway runs behind them. `--plain` measures
+one site that comes to a plain hub over TCP, without Zenoh, beside them.
 
 `--unsubscribed N` adds sites whose names no pattern matches: what they publish must cost the fleet
 nothing. `--fleets 2` splits the sites between two fleets on one router.
@@ -28,62 +28,93 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, split_datagram
+from gateway.edges.operator.control_socket import request
+from gateway.wire.mavlink_splitter import message_id_of
 from tools.bench_hub import cpu_ns, resident_kib, udp_socket
 
 SITES = (1, 10, 50, 200)
 RATE_HZ = 60
 GENERATORS = 2
 START_S = 60.0
+MOST = 0.98
+"""Of what was sent: when nothing more comes then, the rest is lost."""
 SETTLE_S = 3.0
 ATTITUDE = 30
 
 ROUTER = """
-import json, sys, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"router"')
-config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-session = zenoh.open(config)
+import sys
+from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+session = open_session(session_config(sys.argv[1], "", "router"))
 print("open", flush=True)
 sys.stdin.read()
 """
 
-GENERATOR = """
-import json, sys, time, zenoh
+LOAD = """
+import sys, time
+from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import common as mavlink
-place, names = sys.argv[1], sys.argv[2].split(",")
-rate, seconds = int(sys.argv[3]), float(sys.argv[4])
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([place]))
-config.insert_json5("scouting/multicast/enabled", "false")
-session = zenoh.open(config)
-drop = zenoh.CongestionControl.DROP
-sites = []
-for name in names:
+EXTRA = bytes((mavlink.MAVLink_attitude_message.crc_extra,))
+def load(ways, rate, seconds):
     link = mavlink.MAVLink(None, 1, 1)
-    key = f"mavlink/{name}/1/out"
-    outlet = session.declare_publisher(key, congestion_control=drop, express=True)
-    token = session.liveliness().declare_token(f"mavlink/{name}/site/{session.zid()}")
-    sites.append((link, outlet, token))
-def publish(link, outlet, message):
-    outlet.put(bytes(message.pack(link)))
-    link.seq = (link.seq + 1) % 256
-for link, outlet, _ in sites:
-    publish(link, outlet, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3))
-time.sleep(2)
-begin = time.monotonic()
-count = round(rate * seconds)
-for number in range(count * len(sites)):
-    due = begin + number / (rate * len(sites))
-    if (wait := due - time.monotonic()) > 0:
-        time.sleep(wait)
-    link, outlet, _ = sites[number % len(sites)]
-    now = time.time_ns() // 1000 % (1 << 32)
-    publish(link, outlet, mavlink.MAVLink_attitude_message(now, 0, 0, 0, 0, 0, 1))
-print(count * len(sites), flush=True)
-time.sleep(2)
+    for way in ways:
+        way(bytes(mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(link)))
+    frame = bytearray(mavlink.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 1).pack(link))
+    time.sleep(2)
+    begin = time.monotonic()
+    for number in range(round(rate * seconds) * len(ways)):
+        wait = begin + number / (rate * len(ways)) - time.monotonic()
+        # What is due within half a millisecond leaves together: to sleep costs more than to send.
+        if wait > 0.0005:
+            time.sleep(wait)
+        frame[4] = (1 + number // len(ways)) % 256
+        frame[10:14] = (time.time_ns() // 1000 % (1 << 32)).to_bytes(4, "little")
+        body = bytes(frame[1:-2])
+        frame[-2:] = mcrf4xx(EXTRA, mcrf4xx(body)).to_bytes(2, "little")
+        ways[number % len(ways)](bytes(frame))
+    time.sleep(2)
+"""
+
+GENERATOR = (
+    LOAD
+    + """
+from gateway.edges.hub.fleet_link.site_keys import out_key, presence_key
+from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+import zenoh
+session = open_session(session_config(sys.argv[1], ""))
+ways, tokens = [], []
+for name in sys.argv[2].split(","):
+    drop = zenoh.CongestionControl.DROP
+    outlet = session.declare_publisher(out_key(name, 1), congestion_control=drop)
+    tokens.append(session.liveliness().declare_token(presence_key(name, session.zid())))
+    ways.append(outlet.put)
+load(ways, int(sys.argv[3]), float(sys.argv[4]))
+"""
+)
+
+TCP_GENERATOR = (
+    LOAD
+    + """
+import socket
+with socket.create_connection(("127.0.0.1", int(sys.argv[1]))) as link:
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    load([link.sendall], int(sys.argv[2]), float(sys.argv[3]))
+"""
+)
+
+HUB = """
+import asyncio, sys
+from gateway.edges.clock import GatewayClock
+from gateway.edges.hub.hub import Hub
+from gateway.routing.hub_settings import HubSettings
+
+async def main():
+    endpoints = ("tcp-listen:127.0.0.1:0", f"udp:127.0.0.1:{sys.argv[1]}")
+    hub = Hub(HubSettings(endpoints=endpoints), lambda incoming: None, GatewayClock())
+    hub.start()
+    print(hub.listening_ports()[0], flush=True)
+    await asyncio.Event().wait()
+
+asyncio.run(main())
 """
 
 
@@ -92,14 +123,28 @@ class FleetRun:
     """One run."""
 
     sites: int
+    way: str
     sent: int
     lost: int
+    lost_before: int
+    """Of these, those that the fleet itself has missed by their numbers."""
     p50_us: float
     p99_us: float
     router_cpu_percent: float
     fleet_cpu_percent: float
     router_kib: int
     fleet_kib: int
+
+
+@dataclass(frozen=True)
+class Processes:
+    """What runs: what is measured, and what makes the load."""
+
+    watched: "list[subprocess.Popen[str]]"
+    """The router, if there is one, and the fleets or the hub."""
+    loads: "list[subprocess.Popen[str]]"
+    sockets: list[Path]
+    """Where the fleets can be asked."""
 
 
 class GroundStation:
@@ -109,20 +154,19 @@ class GroundStation:
         self._sock = udp_socket()
         self.port: int = self._sock.getsockname()[1]
         self.late_us: list[int] = []
-        self.systems: set[int] = set()
 
     def read(self, wait_s: float) -> bool:
         """Take what comes within some time; return whether anything came."""
         if not select.select([self._sock], [], [], wait_s)[0]:
             return False
-        now_us = time.time_ns() // 1000
         try:
             while True:
-                for frame in split_datagram(self._sock.recv(2048)):
-                    if isinstance(frame, bytes) and message_id_of(frame) == ATTITUDE:
-                        sent_us = int.from_bytes(frame[10:14], "little")
-                        self.late_us.append((now_us - sent_us) % (1 << 32))
-                        self.systems.add(origin_of(frame)[0])
+                # A frame a datagram, so that the reader costs little beside what is measured.
+                frame = self._sock.recv(2048)
+                now_us = time.time_ns() // 1000
+                if message_id_of(frame) == ATTITUDE:
+                    sent_us = int.from_bytes(frame[10:14], "little")
+                    self.late_us.append((now_us - sent_us) % (1 << 32))
         except BlockingIOError:
             return True
 
@@ -178,78 +222,109 @@ def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float
         router = start("-c", ROUTER, place)
         assert router.stdout is not None
         router.stdout.readline()
-        started = [router]
+        watched, sockets = [router], []
         for number in range(fleets):
             home = Path(folder) / str(number)
             home.mkdir()
             end = f"udp:127.0.0.1:{station.port}"
             words = ("fleet", "--connect", place, "--site", f"{number}-*", "--endpoint", end)
-            started.append(start("-m", "gateway.cli", *words, home=home))
-            wait_for(home / "mavgate" / "fleet.sock")
-        watched = list(started)
+            watched.append(start("-m", "gateway.cli", *words, home=home))
+            sockets.append(home / "mavgate" / "fleet.sock")
+            wait_for(sockets[-1])
         time.sleep(SETTLE_S)
         names = [f"{number % fleets}-{number}" for number in range(sites)]
         others = [f"other-{number}" for number in range(unsubscribed)]
-        started += generators(place, names + others, rate_hz, seconds)
+        loads = generators(place, names + others, rate_hz, seconds)
+        processes = Processes(watched, loads, sockets)
+        way = "Zenoh" if fleets == 1 else f"Zenoh, {fleets} fleets"
         try:
-            return _measure(sites, station, watched, started[1 + fleets :], rate_hz * seconds)
+            return _measure(sites, way, station, processes, sites * rate_hz * seconds)
         finally:
-            for each in started:
-                each.kill()
-                each.communicate()
-            station.close()
+            end_all(processes, station)
+
+
+def run_plain(rate_hz: int, seconds: float) -> FleetRun:
+    """Measure one site that comes to a plain hub over TCP."""
+    station = GroundStation()
+    hub = start("-c", HUB, str(station.port))
+    assert hub.stdout is not None
+    port = hub.stdout.readline().strip()
+    load = start("-c", TCP_GENERATOR, port, str(rate_hz), str(seconds))
+    processes = Processes([hub], [load], [])
+    try:
+        return _measure(1, "plain hub, TCP", station, processes, rate_hz * seconds)
+    finally:
+        end_all(processes, station)
+
+
+def end_all(processes: Processes, station: GroundStation) -> None:
+    """End what was started."""
+    for each in (*processes.watched, *processes.loads):
+        each.kill()
+        each.communicate()
+    station.close()
 
 
 def _measure(
-    sites: int,
-    station: GroundStation,
-    watched: list["subprocess.Popen[str]"],
-    loads: list["subprocess.Popen[str]"],
-    each: float,
+    sites: int, way: str, station: GroundStation, processes: Processes, expected: float
 ) -> FleetRun:
     limit = time.monotonic() + START_S
     while not station.late_us:
         station.read(0.1)
         if time.monotonic() > limit:
-            raise RuntimeError("nothing comes from the fleet")
+            raise RuntimeError("nothing comes")
+    watched = processes.watched
     begin_ns, before = time.monotonic_ns(), [cpu_ns(process.pid) for process in watched]
-    while any(load.poll() is None for load in loads):
-        moved = station.read(0.2)
-        if not moved and all(load.poll() is not None for load in loads):
-            break
-        if not moved and len(station.late_us) >= sites * each:
+    while station.read(0.2) or len(station.late_us) < expected * MOST:
+        if all(load.poll() is not None for load in processes.loads):
             break
     elapsed_ns = time.monotonic_ns() - begin_ns
     used = [cpu_ns(p.pid) - was for p, was in zip(watched, before, strict=True)]
     while station.read(0.3):
         pass
-    sent = round(sites * each)
+    sent = round(expected)
+    shares = [100 * ns / elapsed_ns for ns in used]
+    memory = [resident_kib(process.pid) for process in watched]
+    if not processes.sockets:
+        shares, memory = [0.0, *shares], [0, *memory]
     return FleetRun(
         sites=sites,
+        way=way,
         sent=sent,
         lost=sent - len(station.late_us),
+        lost_before=sum(missed(socket) for socket in processes.sockets),
         p50_us=float(np.percentile(station.late_us, 50)),
         p99_us=float(np.percentile(station.late_us, 99)),
-        router_cpu_percent=100 * used[0] / elapsed_ns,
-        fleet_cpu_percent=100 * max(used[1:]) / elapsed_ns,
-        router_kib=resident_kib(watched[0].pid),
-        fleet_kib=max(resident_kib(process.pid) for process in watched[1:]),
+        router_cpu_percent=shares[0],
+        fleet_cpu_percent=max(shares[1:]),
+        router_kib=memory[0],
+        fleet_kib=max(memory[1:]),
     )
+
+
+def missed(path: Path) -> int:
+    """Ask a fleet what it has not got, or got and could not take."""
+    status = request(path, "fleet.status")
+    lost = [vehicle["lost"] for site in status["sites"] for vehicle in site["vehicles"]]
+    return sum(lost)
 
 
 def show(runs: list[FleetRun], rate_hz: int) -> None:
     """Print the figures."""
     table = Table(title=f"Sites at {rate_hz} messages/s each, loopback", box=box.SIMPLE_HEAD)
     for column in (
-        "sites", "sent", "lost", "p50 µs", "p99 µs", "router CPU %", "fleet CPU %",
+        "sites", "way", "sent", "lost", "before", "p50 µs", "p99 µs", "router CPU %",
+        "fleet CPU %",
         "router MiB", "fleet MiB",
     ):  # fmt: skip
         table.add_column(column, justify="right")
     for each in runs:
         table.add_row(
             str(each.sites),
+            each.way,
             f"{each.sent:,}",
             str(each.lost),
+            str(each.lost_before),
             f"{each.p50_us:,.0f}",
             f"{each.p99_us:,.0f}",
             f"{each.router_cpu_percent:.1f}",
@@ -266,11 +341,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument("--sites", type=int, nargs="+", default=SITES)
     parser.add_argument("--unsubscribed", type=int, default=0)
+    parser.add_argument("--plain", action="store_true", help="one site over TCP before")
     parser.add_argument("--fleets", type=int, default=1)
     parser.add_argument("--rate", type=int, default=RATE_HZ, help="messages/s of each site")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each run")
     options = parser.parse_args()
-    runs = [
+    runs = [run_plain(options.rate, options.seconds)] if options.plain else []
+    runs += [
         run(sites, options.unsubscribed, options.fleets, options.rate, options.seconds)
         for sites in options.sites
     ]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HOW_TO_ADD: Final = "the fleet is an extra: pip install 'mavgate[fleet]'"
-MAX_WAITING: Final = 4096
+MAX_WAITING: Final = 8192
 """What has come and was not taken yet: more than a second of a hundred aircraft."""
 AT_ONCE: Final = 64
 """Taken in one turn of the loop, so that a flood cannot starve the others."""
