@@ -38,6 +38,7 @@ endpoints = ["udp-listen:127.0.0.1:0?name=clients"]
 folder = "{folder}/recordings"
 mode = "manual"
 [simulator]
+vehicles = 2
 gps_first_fix_s = 0.5
 [panel]
 port = 0
@@ -79,7 +80,7 @@ class Process:
 
     def link(self) -> str:
         """Wait for the page's address."""
-        return self.until(r"panel: (http://\S+)")[1]
+        return self.until(r"panel: (https?://\S+)")[1]
 
     def end(self, how: signal.Signals = signal.SIGTERM) -> None:
         if self.process.poll() is None:
@@ -105,7 +106,10 @@ def open_page(browser: Browser, link: str, view: str = "flight", **options: obje
     page = browser.new_page(viewport=DESKTOP, **options)  # type: ignore[arg-type]
     page.set_default_timeout(WAIT_MS)
     page.goto(link)
-    page.wait_for_function("window.mavgate && mavgate.state && mavgate.state.lat_deg !== null")
+    # A click before the handshake waits for it, and may come after a later one.
+    page.wait_for_function(
+        "window.did_handshake && mavgate.state && mavgate.state.lat_deg !== null"
+    )
     show(page, view)
     return page
 

@@ -9,10 +9,12 @@ from zipfile import ZipFile
 
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.operator.control_socket import request
 from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.told_vehicle import ToldVehicle
 
 pytestmark = [
     pytest.mark.io,
@@ -23,8 +25,9 @@ pytestmark = [
 expect.set_options(timeout=WAIT_MS)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(browser: Browser, demo: Process) -> Iterator[Page]:
+    """The one page that all tests of the demo look at."""
     opened = open_page(browser, demo.link())
     troubles: list[str] = []
     opened.on("pageerror", lambda error: troubles.append(str(error)))
@@ -33,7 +36,139 @@ def page(browser: Browser, demo: Process) -> Iterator[Page]:
     assert troubles == []
 
 
+LISTEN = """
+window.drawn = [];
+const write = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+  if (this.canvas.closest(".flight-display")) {
+    window.drawn.push(String(text));
+    window.drawn.splice(0, window.drawn.length - 200);
+  }
+  return write.call(this, text, ...rest);
+};
+"""
+"""Notes the words and figures that the flight display draws, the newest last."""
+
+
+@pytest.fixture(scope="class")
+def told(
+    browser: Browser, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[ToldVehicle, Page]]:
+    """An aircraft whose figures are set by the test, and the page of a panel of its own."""
+    vehicle = ToldVehicle()
+    vehicle.start()
+    folder = tmp_path_factory.mktemp("told")
+    panel = Process(folder, "panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}")
+    page = browser.new_page(viewport={"width": 1000, "height": 700})
+    page.set_default_timeout(WAIT_MS)
+    page.add_init_script(LISTEN)
+    page.goto(panel.link())
+    page.wait_for_function(
+        "window.did_handshake && mavgate.state && mavgate.state.lat_deg !== null"
+    )
+    yield vehicle, page
+    page.close()
+    panel.end()
+    vehicle.end()
+
+
+def until_drawn(page: Page, *texts: str) -> None:
+    """Wait until the flight display has drawn all of these since now."""
+    page.evaluate("window.drawn.length = 0")
+    page.wait_for_function(
+        "(texts) => texts.every((text) => window.drawn.includes(text))", arg=list(texts)
+    )
+
+
+def display_of(page: Page) -> Locator:
+    return page.locator(".flight-display")
+
+
+def colour_at(page: Page, right: float, down: float) -> str:
+    """Return whether sky or ground is drawn at a place of the flight display, by its shares."""
+    box = display_of(page).bounding_box()
+    assert box is not None
+    x, y = box["x"] + right * box["width"], box["y"] + down * box["height"]
+    clip = {"x": x - 2, "y": y - 2, "width": 4, "height": 4}
+    picture = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
+    red, _, blue = picture.resize((1, 1)).getpixel((0, 0))  # type: ignore[misc]
+    return "sky" if blue > red else "ground"
+
+
+class TestFlightDisplay:
+    """On an aircraft whose figures are exactly known; its page is closed before others are open."""
+
+    def test_row_horizon(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        left, right, low = (0.25, 0.5), (0.72, 0.5), (0.25, 0.62)
+        for roll, pitch, expected in (
+            (30, 0, ("sky", "ground", "sky")),
+            (-30, 0, ("ground", "sky", "ground")),
+            (0, 15, ("sky", "sky", "sky")),
+            (0, -15, ("ground", "ground", "ground")),
+        ):
+            vehicle.roll_deg, vehicle.pitch_deg = roll, pitch
+            spoken = re.compile(f"^Roll {roll}.0°, pitch {pitch}.0°,")
+            expect(display_of(page)).to_have_attribute("aria-label", spoken)
+            assert tuple(colour_at(page, *place) for place in (left, right, low)) == expected
+        vehicle.roll_deg = vehicle.pitch_deg = 0.0
+
+    def test_row_compass(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        vehicle.heading_deg = 272.0
+        until_drawn(page, "272°", "W", "300")
+        expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"heading 272.0°"))
+        vehicle.heading_deg = 3.0
+        until_drawn(page, "003°", "N", "030")
+        assert "W" not in page.evaluate("window.drawn.slice(-40)")
+
+    def test_row_altitude(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        vehicle.alt_home_m, vehicle.climb_mps = 123.0, -2.5
+        until_drawn(page, "HOME  m", "123", "AMSL 554", "-2.5")
+        expect(display_of(page)).to_have_attribute(
+            "aria-label", re.compile(r"altitude 123.0 m, climb -2.5 m/s$")
+        )
+
+    def test_row_speed(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.25
+        until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
+        vehicle.airspeed_mps = 0.0
+        until_drawn(page, "GS  m/s", "19.3")
+        expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"speed 19.3 m/s"))
+
+    def test_row_roll_pitch_and_yaw(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = -17.5, 8.3, 123.4
+        spoken = re.compile(r"^Roll -17.5°, pitch 8.3°, heading 123.4°,")
+        expect(display_of(page)).to_have_attribute("aria-label", spoken)
+        state = page.evaluate("mavgate.state")
+        shown = [state[name] * 57.29578 for name in ("roll_rad", "pitch_rad", "yaw_rad")]
+        assert shown == pytest.approx([-17.5, 8.3, 123.4], abs=0.01)
+
+    def test_model_in_3d_is_that_of_the_vehicle_type(self, told: tuple[ToldVehicle, Page]) -> None:
+        vehicle, page = told
+        scene = page.locator(".scene")
+        expect(scene).to_have_attribute("data-model", "plane")
+        vehicle.kind = mavlink.MAV_TYPE_QUADROTOR
+        expect(scene).to_have_attribute("data-model", "copter")
+        expect(page.get_by_label("Aircraft", exact=True)).to_have_value("Copter 1")
+        expect(page.locator(".chips").get_by_text("MAVLink")).to_be_visible()
+
+
+def test_several_aircraft_are_told_apart_and_chosen(page: Page) -> None:
+    show(page, "map")
+    page.wait_for_function("Object.keys(mavgate.vehicles).length === 2")
+    expect(page.locator("section[data-view='map'] .craft")).to_have_count(2)
+    for number in (2, 1):
+        page.get_by_label("Aircraft", exact=True).click()
+        page.get_by_role("option", name=f"Plane {number}", exact=True).click()
+        page.wait_for_function(f"mavgate.state.system_id === {number}")
+
+
 def test_row_3d_from_two_viewpoints(page: Page) -> None:
+    show(page, "flight")
     scene = page.locator(".scene")
     expect(scene).to_have_attribute("data-model", "plane")
     choices = scene.locator("select")
@@ -77,8 +212,8 @@ def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
     expect(view.locator(".pin.home")).to_be_visible()
 
 
-def test_row_latitude_and_longitude_to_copy(browser: Browser, demo: Process) -> None:
-    page = open_page(browser, demo.link(), "map")
+def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
+    show(page, "map")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     view = page.locator("section[data-view='map']")
     expect(view.locator("[data-role='place']")).to_have_text(re.compile(r"-7\.7\d{5}, 110\.3\d{5}"))
@@ -86,7 +221,6 @@ def test_row_latitude_and_longitude_to_copy(browser: Browser, demo: Process) -> 
     expect(view.get_by_text("Copied")).to_be_visible()
     copied = page.evaluate("navigator.clipboard.readText()")
     assert re.fullmatch(r"-7\.7\d{5}, 110\.3\d{5}", copied)
-    page.close()
 
 
 def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
@@ -101,7 +235,7 @@ def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
     )
     expect(view.locator(".pin.mark")).to_be_visible()
     socket = demo.log.parent / "mavgate" / "run.sock"
-    (aircraft,) = request(socket, "status")["aircraft"]
+    aircraft, _ = request(socket, "status")["aircraft"]
     told = json.loads(page.evaluate("JSON.stringify(mavgate.state.mark)"))
     where = (aircraft["mark"]["lat_deg"], aircraft["mark"]["lon_deg"])
     assert (told["lat_deg"], told["lon_deg"]) == pytest.approx(where, abs=2e-7)
@@ -141,7 +275,7 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
         names = packed.namelist()
         tlog = next(name for name in names if name.endswith(".tlog"))
         (tmp_path / "evening_01.tlog").write_bytes(packed.read(tlog))
-    assert "morning flight_01_v1.csv" in names
+    assert {"morning flight_01_v1.csv", "morning flight_01_v2.csv"} <= set(names)
     view.get_by_label("Bring a recording").set_input_files(tmp_path / "evening_01.tlog")
     brought = view.locator("tr[data-key='evening']")
     expect(brought).to_be_visible()
@@ -161,6 +295,14 @@ def _move_in_time(page: Page, row: object) -> None:
     slider = view.get_by_role("slider")
     expect(slider).to_be_visible()
     page.wait_for_function("document.querySelector('.time-slider').dataset.points > 10")
+    # Both aircraft of the recording fly, under numbers that no live one has.
+    expect(slider).to_have_attribute("data-curves", "2")
+    flown = "Object.values(mavgate.vehicles).filter((v) => v.origin === 'recorded')"
+    page.wait_for_function(f"{flown}.length === 2 && {flown}.every((v) => v.system_id > 200)")
+    page.get_by_label("Aircraft", exact=True).click()
+    page.get_by_role("option", name="Plane 2, recorded").click()
+    page.wait_for_function("mavgate.state.origin === 'recorded'")
+    expect(page.locator(".chips").get_by_text("recording", exact=True)).to_be_visible()
     view.get_by_label("Play or pause").click()
     length_s = float(slider.get_attribute("aria-valuemax") or 0)
     assert length_s > 3
@@ -169,11 +311,13 @@ def _move_in_time(page: Page, row: object) -> None:
     slider.click(position={"x": box["width"] * 0.5, "y": 50})
     half = re.compile(f"^[{int(length_s / 2) - 1}-{int(length_s / 2) + 1}]$")
     expect(slider).to_have_attribute("aria-valuenow", half)
-    page.wait_for_function("Object.values(mavgate.vehicles).some((v) => v.origin === 'recorded')")
+    for icon in ("pause", "play_arrow"):
+        page.keyboard.press("Space")
+        expect(view.get_by_label("Play or pause")).to_have_text(icon)
     view.get_by_text("re-fused twin").click()
     # The table is fused by a process that may have to compile first.
     page.wait_for_function(
-        "Object.values(mavgate.vehicles).some((v) => v.origin === 're-fused')",
+        "Object.values(mavgate.vehicles).filter((v) => v.origin === 're-fused').length === 2",
         timeout=START_LIMIT_MS,
     )
     expect(slider).to_be_visible()

@@ -150,8 +150,10 @@ export default {
       this.horizon(box, angles);
       this.rollArc(box, angles);
       const unit = UNITS[this.units] || UNITS.metric;
-      const speed = known(s.airspeed_mps) && s.airspeed_mps > 0 ? s.airspeed_mps : s.groundspeed_mps;
-      const speedName = speed === s.airspeed_mps && known(speed) ? "AS" : "GS";
+      // What glides to zero never is it.
+      const has_airspeed = known(s.airspeed_mps) && this.goal?.airspeed_mps > 0;
+      const speed = has_airspeed ? s.airspeed_mps : s.groundspeed_mps;
+      const speedName = has_airspeed ? "AS" : "GS";
       this.tape(box, true, speed, unit.speed, speedName, s.groundspeed_mps);
       const height = known(s.alt_home_m) ? s.alt_home_m : s.alt_amsl_m;
       const heightName = known(s.alt_home_m) ? "HOME" : "AMSL";

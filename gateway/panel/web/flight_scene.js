@@ -9,12 +9,21 @@ const TAIL = 6000; // points of a path
 const STEP_M = 1.5; // between them
 const AHEAD_S = 0.25; // no pose is foretold further
 const FRAME_MS = 30;
-const SLOWEST_MS = 300;
+const SLOWEST_MS = 400;
 const LATE_MS = 45; // between two turns of the browser's own
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "Beside" };
 const SPAN_M = 2; // of the models
 const COLOURS = { recorded: "recorded", "re-fused": "twin" };
 const rad = Math.PI / 180;
+
+// Whether the machine's processor draws, which has instruments to draw and perhaps a gateway to run.
+function in_software() {
+  const gl = document.createElement("canvas").getContext("webgl");
+  const told = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
 
 function material(colour, extra = {}) {
   return new THREE.MeshStandardMaterial({ color: colour, roughness: 0.55, metalness: 0.05, ...extra });
@@ -181,12 +190,12 @@ export default {
   mounted() {
     this.canvas = this.$el.querySelector("canvas");
     try {
-      this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true });
+      this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: !in_software() });
     } catch {
       this.trouble = "This browser draws no 3D (WebGL is off).";
       return;
     }
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 1.5));
+    this.renderer.setPixelRatio(in_software() ? 0.5 : Math.min(window.devicePixelRatio, 1.5));
     this.renderer.setScissorTest(true);
     this.aircraft = {};
     this.origin = null;

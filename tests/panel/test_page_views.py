@@ -1,0 +1,249 @@
+"""The views of a page beside a gateway that the test feeds: what each does, seen on the page."""
+
+import csv
+import re
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from gateway.edges.operator.control_socket import request
+from gateway.estimation.select import ESTIMATORS
+from tests.panel.bench_receiver import BenchReceiver
+from tests.panel.browsing import CONFIG, DESKTOP, WAIT_MS, Process, needs_chromium, open_page, show
+
+pytestmark = [
+    pytest.mark.io,
+    pytest.mark.slow,
+    needs_chromium,
+    pytest.mark.xdist_group("panel"),
+]
+expect.set_options(timeout=WAIT_MS)
+VIEWS = (
+    "flight", "map", "link", "recordings", "calibration", "tuning", "plots", "events",
+)  # fmt: skip
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass
+class Desk:
+    """A gateway on a receiver of the test's, and the one page that all tests look at."""
+
+    folder: Path
+    receiver: BenchReceiver
+    page: Page
+
+    def view(self, key: str) -> Locator:
+        show(self.page, key)
+        return self.page.locator(f"section[data-view='{key}']")
+
+    @property
+    def status(self) -> dict[str, Any]:
+        return request(self.folder / "mavgate" / "run.sock", "status")
+
+    @property
+    def home(self) -> tuple[float, float]:
+        """As the gateway has it."""
+        home = self.status["aircraft"][0]["home"]
+        return home["lat_deg"], home["lon_deg"]
+
+    @property
+    def kept(self) -> str:
+        """What is stored of the aircraft's settings."""
+        files = sorted((self.folder / "aircraft").glob("*.toml"))
+        return "".join(file.read_text() for file in files)
+
+
+@pytest.fixture(scope="module")
+def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    folder, receiver = tmp_path_factory.mktemp("desk"), BenchReceiver()
+    receiver.start()
+    config = CONFIG.partition("map_styles")[0] + "enabled = true\nmap_styles = []\n"
+    gateway = Process(folder, "run", "--plain", "--port", receiver.port, config=config)
+    page = open_page(browser, gateway.link())
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    yield Desk(folder, receiver, page)
+    page.close()
+    gateway.end()
+    receiver.end()
+    assert troubles == []
+
+
+def test_row_serial_mode_of_a_panel_that_the_settings_enable(desk: Desk) -> None:
+    expect(desk.page.locator(".chips").get_by_text("serial", exact=True)).to_be_visible()
+    expect(desk.page.locator(".chips").get_by_text("GPS 11 sats")).to_be_visible()
+
+
+def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None:
+    view = desk.view("calibration")
+    expect(view.locator(".now")).to_contain_text("do not touch it until this is done")
+    view.get_by_role("button", name="Start").click()
+    expect(view.locator(".now")).to_contain_text("Keep it for good?")
+    rate = view.locator("table.residuals tr", has_text="Rate at rest")
+    before, after = (float(cell) for cell in rate.locator("td").all_inner_texts()[1:])
+    assert before == pytest.approx(1.26, abs=0.1)
+    assert after < 0.05
+    expect(view.locator("table.residuals")).to_contain_text("CAL_GYRO_BIAS_X")
+    assert desk.kept == ""
+    view.get_by_role("button", name="Store it").click()
+    expect(view.locator(".step", has_text="Gyroscope")).to_contain_text("stored")
+    assert "gyro_bias" in desk.kept
+
+
+def test_magnetometer_is_seen_as_a_cloud_and_undone_without_a_trace(desk: Desk) -> None:
+    view, kept = desk.view("calibration"), desk.kept
+    view.locator(".step", has_text="Magnetometer").click()
+    desk.receiver.is_turned = True
+    view.get_by_role("button", name="Start").click()
+    sphere = view.locator("canvas.field-sphere")
+    expect(sphere).to_have_attribute("aria-label", re.compile(r"\d{2,} samples"))
+    expect(view.locator(".figures")).to_contain_text("directions uncovered")
+    few = int(sphere.get_attribute("data-seen") or 0)
+    desk.page.wait_for_function(
+        f"document.querySelector('canvas.field-sphere').dataset.seen > {few + 5}"
+    )
+    view.get_by_role("button", name="Cancel").click()
+    expect(view.locator(".now")).to_contain_text("Nothing has changed")
+    desk.receiver.is_turned = False
+    assert desk.kept == kept
+
+
+def test_parameter_is_found_changed_live_and_shown_against_its_default(desk: Desk) -> None:
+    view = desk.view("tuning")
+    view.get_by_label("Search", exact=True).fill("gyroscope bias sensor")
+    rows = view.locator(".parameter")
+    expect(rows).to_have_count(3)
+    row = view.locator(".parameter[data-name='CAL_GYRO_BIAS_Z']")
+    expect(row).to_contain_text("-10 to 10 rad/s · default 0")
+    field = row.get_by_label("CAL_GYRO_BIAS_Z")
+    field.fill("0.8")
+    field.press("Enter")
+    desk.page.wait_for_function("Math.abs(mavgate.state.rate_b_radps[2]) > 0.3")
+    expect(row).to_have_class(re.compile(r"\bchanged\b"))
+    field.fill("0")
+    field.press("Enter")
+    expect(row).not_to_have_class(re.compile(r"\bchanged\b"))
+    field.fill("4000")
+    field.press("Enter")
+    expect(row.get_by_role("alert")).to_be_visible()
+
+
+def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
+    view = desk.view("tuning")
+    card = view.locator("[data-card=comparison]")
+    rows = card.locator("table.residuals tr")
+
+    def is_compared() -> bool:
+        card.get_by_role("button", name="Compare").click()
+        told = card.get_by_text(re.compile("what the aircraft itself told|try again in a moment"))
+        expect(told).to_be_visible()
+        return rows.count() > 0
+
+    for _ in range(60):
+        if is_compared():
+            break
+        desk.page.wait_for_timeout(500)
+    names = rows.locator("td:first-child").all_inner_texts()
+    assert names == list(ESTIMATORS)
+    figures = rows.locator("td:nth-child(2)").all_inner_texts()
+    assert all(re.fullmatch(r"\d+\.\d+ deg", figure) for figure in figures)
+
+
+def test_field_is_plotted_paused_and_saved(desk: Desk, tmp_path: Path) -> None:
+    view = desk.view("plots")
+    card = view.locator(".strip-card").first
+    chart = card.locator(".strip-chart")
+    expect(chart).to_have_attribute("aria-label", re.compile(r"ATTITUDE.roll -?\d"))
+    desk.page.wait_for_function("document.querySelector('.strip-chart').dataset.points > 20")
+    view.get_by_role("button", name="Pause").click()
+    expect(chart).to_have_attribute("data-paused", "true")
+    points = chart.get_attribute("data-points")
+    saved = []
+    for label in ("Save as CSV", "Save as PNG"):
+        with desk.page.expect_download() as waiting:
+            card.get_by_label(label).click()
+        saved.append(tmp_path / waiting.value.suggested_filename)
+        waiting.value.save_as(saved[-1])
+    table, picture = saved
+    head, *rows = csv.reader(table.read_text().splitlines())
+    assert any("ATTITUDE.roll" in name for name in head)
+    assert len(rows) > 10
+    assert picture.read_bytes().startswith(PNG)
+    assert chart.get_attribute("data-points") == points
+    view.get_by_role("button", name="Go on").click()
+    expect(chart).to_have_attribute("data-paused", "false")
+
+
+def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
+    view = desk.view("map")
+    expect(view.locator(".pin.home")).to_be_visible()
+    before = desk.home
+    view.locator(".map-canvas").click(position={"x": 300, "y": 250})
+    asks = desk.page.locator(".asks")
+    place = asks.locator(".title").inner_text()
+    assert desk.home == before
+    asks.get_by_role("button", name="Set home here").click()
+    lat_deg, lon_deg = (float(part) for part in place.split(","))
+    desk.page.wait_for_function(f"Math.abs(mavgate.state.home.lat_deg - {lat_deg}) < 1e-6")
+    assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)
+
+
+def test_client_is_added_and_removed(desk: Desk) -> None:
+    view = desk.view("link")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.settimeout(WAIT_MS / 1000)
+        name = f"udp:127.0.0.1:{sock.getsockname()[1]}"
+        view.get_by_label("Endpoint of a new client").fill(name)
+        view.get_by_role("button", name="Add", exact=True).click()
+        row = view.locator(f"tr[data-key='{name}']")
+        expect(row).to_contain_text("open")
+        assert sock.recv(2048)
+        row.get_by_label("Remove this client").click()
+        assert name in [client["name"] for client in desk.status["clients"]]
+        desk.page.locator(".asks").get_by_role("button", name="Remove").click()
+        expect(row).to_have_count(0)
+    assert name not in [client["name"] for client in desk.status["clients"]]
+
+
+def test_silent_node_is_a_banner_over_every_view_and_an_event(desk: Desk) -> None:
+    banner = desk.page.locator(".banner", has_text="GPS node 1 silent")
+    expect(banner).to_have_count(0)
+    desk.receiver.has_gps = False
+    expect(banner).to_be_visible()
+    view = desk.view("events")
+    row = view.locator("tr", has_text="GPS node 1 silent")
+    expect(row).to_contain_text("Critical")
+    expect(row.locator("td").first).to_have_text(re.compile(r"\d\d:\d\d:\d\d"))
+    desk.receiver.has_gps = True
+    expect(view.locator("tr", has_text="GPS node 1 is back")).to_be_visible()
+    expect(banner).to_have_count(0)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_view_fits_every_width(desk: Desk, scheme: Literal["light", "dark"]) -> None:
+    page = desk.page
+    page.emulate_media(color_scheme=scheme)
+    expect(page.locator("body")).to_have_class(re.compile(f"body--{scheme}"))
+    for width in (1440, 1024, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        for number, key in enumerate(VIEWS, 1):
+            page.keyboard.press(str(number))
+            panel = page.locator(f"section[data-view='{key}']")
+            expect(panel).to_be_visible()
+            assert panel.evaluate("(element) => element.scrollWidth") <= width, (key, width)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, (key, width)
+    page.set_viewport_size(DESKTOP)
+
+
+def test_units_are_those_that_were_chosen(desk: Desk) -> None:
+    page, view = desk.page, desk.view("map")
+    page.get_by_label("Units").click()
+    page.get_by_role("option", name="aviation").click()
+    page.wait_for_function("mavgate.show('speed', 100)[1] === 'kt'")
+    expect(view.locator(".key.circle")).to_contain_text("ft")
