@@ -1,5 +1,6 @@
 """Flights written as files: one writer a format, by the ending of the file's name."""
 
+import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from gateway.flightlog.table.table import (
     encode_head,
     encode_line,
 )
+from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
 from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import (
@@ -85,13 +87,13 @@ class FlightToWrite:
         self.is_mavlink = kinds == {FileKind.TLOG}
         """Whether the frames are those that were recorded, and the rows are read out of them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
-        self._refusion: Refusion | None = None
+        self._refusions: list[Refusion] = []
         self._remarks: list[str] = []
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink: as recorded, or what the gateway would send for the rows."""
         if not self.is_mavlink:
-            return _within(self._fused().frames(), self._limits)
+            return _within(self._sent(), self._limits)
         recorded = recorded_frames(self.files, self.options.progress)
         first = next(recorded, None)
         if first is None:
@@ -103,11 +105,13 @@ class FlightToWrite:
         if self._as_recorded:
             table = joined_rows([open_rows(file, self.options) for file in self.files])
         else:
-            table = self._fused().table()
+            table = self.fused().table()
         return _trimmed(table, self._limits)
 
     def by_aircraft(self) -> "list[FlightToWrite]":
         """Split tables by the aircraft that they are of."""
+        if len(self.files) == 1:
+            return [self]
         files: dict[int, list[Path]] = {}
         quiet = replace(self.options, progress=None)
         for file in self.files:
@@ -122,15 +126,24 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """What the user should know, once all is written."""
-        return [*self._remarks, *(self._refusion.remarks if self._refusion else ())]
+        fused = (remark for refusion in self._refusions for remark in refusion.remarks)
+        return [*self._remarks, *fused]
 
     def remark(self, text: str) -> None:
         """Let the user know something of what was written."""
         self._remarks.append(text)
 
-    def _fused(self) -> Refusion:
-        self._refusion = Refusion(self.files, self.options, smooth=self._smooth)
-        return self._refusion
+    def fused(self) -> Refusion:
+        """Begin to fuse these files again."""
+        self._refusions.append(Refusion(self.files, self.options, smooth=self._smooth))
+        return self._refusions[-1]
+
+    def _sent(self) -> Iterator[TlogRecord]:
+        """Yield what the gateway would send for all aircraft, stamped as in one file."""
+        streams = [part.fused().frames() for part in self.by_aircraft()]
+        stamper = Stamper(0)
+        for record in heapq.merge(*streams, key=lambda record: record.time_us):
+            yield TlogRecord(stamper.stamp(record.time_us), record.frame)
 
 
 Write = Callable[[FlightToWrite], Iterable[bytes]]

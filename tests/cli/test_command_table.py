@@ -12,7 +12,10 @@ from gateway.cli.app import app
 from gateway.cli.command_table import COMMANDS, load_command
 
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
-LARGE = ("numba", "numpy", "scipy", "pandas", "pymavlink", "matplotlib", "nicegui")
+LARGE = (
+    *("numba", "numpy", "scipy", "pandas", "pymavlink", "matplotlib", "nicegui"),
+    *("mcap", "pyarrow", "pyulog"),
+)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

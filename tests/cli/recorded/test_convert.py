@@ -18,6 +18,7 @@ from gateway.config import GatewaySettings
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableFault, TableHeader, TableReader
 from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
+from gateway.wire.mavlink_splitter import origin_of
 from tests.flightlog.frames import START_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight
 
@@ -161,6 +162,17 @@ def test_tables_of_two_aircraft_are_drawn_as_two(table: Path, tmp_path: Path, en
         lines = [f for f in features if f["geometry"]["type"] == "LineString"]
         assert [line["properties"]["name"] for line in lines] == ["aircraft 1", "aircraft 2"]
         assert min(len(line["geometry"]["coordinates"]) for line in lines) > 50
+
+
+def test_tables_of_two_aircraft_become_one_tlog(table: Path, tmp_path: Path) -> None:
+    other, out = tmp_path / "other.csv", tmp_path / "both.tlog"
+    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
+    run("convert", other, table, "-o", out)
+    records = read_tlog(out)
+    senders = [origin_of(record.frame)[0] for record in records]
+    assert senders.count(1) == senders.count(2) > 500
+    stamps = [record.time_us for record in records]
+    assert stamps == sorted(set(stamps))
 
 
 def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:

@@ -2,21 +2,27 @@
 
 import gzip
 import json
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from gateway.analysis.flight_arrays import Flight
 from gateway.cli.app import app
+from gateway.cli.live.demo import recorded_line
+from gateway.cli.recorded import play
 from gateway.cli.support.named_recordings import files_of
-from gateway.config import GatewaySettings
+from gateway.config import GatewaySettings, load
 from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.glance import END_BYTES, glance
 from gateway.flights.reading import FlightError
+from gateway.player import PlayerDaemon
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight, read
 
@@ -77,6 +83,57 @@ def test_every_command_takes_the_name(config: Path, tmp_path: Path, name: str) -
     joined = tmp_path / "again.tlog"
     run("convert", name, "-o", joined, "--config", config)
     assert joined.stat().st_size == len(make_tlog(make_records(COUNT)))
+
+
+def test_play_takes_the_name(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[str] = []
+
+    async def serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
+        daemon = daemon_of()
+        played.extend(daemon.edge.status().files)
+        daemon.close()
+
+    monkeypatch.setattr(play, "_serve", serve)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    run("play", "alps", "--config", config)
+    run("play", "last", "--config", config)
+    assert played[0] == "alps_01.tlog"
+    assert len(played) == 2
+
+
+def test_report_takes_the_name(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fusing it in every way and drawing it is tested elsewhere, and takes long."""
+    reported: list[Flight] = []
+
+    def note(flight: Flight, **_: object) -> SimpleNamespace:
+        reported.append(flight)
+        return SimpleNamespace(sections=[])
+
+    monkeypatch.setattr("gateway.analysis.case.make_case", note)
+    monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda case, _: case)
+    monkeypatch.setattr(
+        "gateway.analysis.reporting.page.write_report", lambda _, folder, __: folder / "index.html"
+    )
+    assert "index.html" in run("report", "alps", "-o", tmp_path / "out", "--config", config)
+    (flight,) = reported
+    # Both parts of its table.
+    assert flight.name == "alps"
+    assert flight.duration_s == pytest.approx(12, abs=0.1)
+
+
+def test_sweep_takes_the_name(config: Path, tmp_path: Path) -> None:
+    best = tmp_path / "best.toml"
+    words = ("--beta", "0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
+    run("sweep", "alps", *words, "--config", config)
+    assert "beta_velocity" in best.read_text()
+
+
+def test_the_demo_flies_what_the_name_says(config: Path) -> None:
+    frames, aircraft = recorded_line(load(config), Path("alps"))
+    assert list(aircraft) == [1]
+    assert next(frames).data
 
 
 def test_a_name_that_is_none_is_refused(config: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from typer.testing import CliRunner
 
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
 from gateway.cli.app import app
+from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableReader
 from gateway.flights.flown import open_flown
+from gateway.flights.opening import open_flights
 from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, open_rows
 from gateway.pipeline import PipelineSettings
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
@@ -154,6 +157,13 @@ def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
     packed = flown.write(tmp_path / "a.bin.gz", gzip.compress((folder / "flight.bin").read_bytes()))
     run("convert", packed, "-o", tmp_path / "a.kml")
     assert (tmp_path / "a.kml").read_text().count("<gx:coord>") > 100
+    # What `report` and `sweep` make of it: the autopilot's own attitude is one more row.
+    loaded = load_flight(folder / "flight.bin", Loading(GatewaySettings()))
+    assert loaded.recorded is not None
+    assert np.isfinite(loaded.recorded.q_nb).all(axis=1).mean() > 0.9
+    with ExitStack() as opened:
+        (played,) = open_flights([folder / "new.ulg"], OPTIONS, opened)
+        assert played.vehicles == [7]
     flight = open_flown([folder / "new.ulg"], OPTIONS)
     assert flight.duration_s == pytest.approx(flown.DURATION_S, abs=1.0)
 
