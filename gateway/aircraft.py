@@ -4,7 +4,7 @@ Pure: time is an argument, and what should happen outside comes back as a list o
 """
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from typing import Final
 
@@ -12,6 +12,7 @@ import msgspec
 
 from gateway import __version__
 from gateway.estimation.interface import Estimator
+from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import (
     BaroRaw,
@@ -166,6 +167,44 @@ class Aircraft:
                 return self._recorded(record, self.vehicle.on_gps(record, now_us), now_us)
             case NodeStatus():
                 return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
+
+    def fuse(self, records: Sequence[ImuRaw | ImuCalibrated]) -> list[FusedSample]:
+        """Let IMU samples run through sensing and estimation alone: the vehicle hears nothing.
+
+        Parameters
+        ----------
+        records : sequence of ImuRaw or ImuCalibrated
+            Between which neither a height nor a fix came.
+
+        Returns
+        -------
+        list of FusedSample
+            What `take` records of each.
+        """
+        samples = [
+            self._chain.imu(record) if isinstance(record, ImuRaw) else self._filter(record)
+            for record in records
+        ]
+        if isinstance(self._estimator, KernelEstimator):
+            states = self._estimator.update_imus(samples)
+        else:
+            states = [self._estimator.update_imu(sample) for sample in samples]
+        return [
+            FusedSample(
+                self.vehicle_id,
+                record if isinstance(record, ImuRaw) else None,
+                sample,
+                state if self._correct is None else self._correct(state),
+            )
+            for record, sample, state in zip(records, samples, states, strict=True)
+        ]
+
+    def hear(self, record: BaroRaw | GpsFix) -> None:
+        """Let estimation alone take a height or a fix."""
+        if isinstance(record, BaroRaw):
+            self._estimator.update_baro(self._chain.baro(record))
+        else:
+            self._estimator.update_gps(record)
 
     def _filter(self, imu: ImuCalibrated) -> ImuSample:
         return self._chain.imu_si(

@@ -12,6 +12,7 @@ import contextlib
 import json
 import math
 import os
+import resource
 import select
 import socket
 import subprocess
@@ -84,6 +85,78 @@ def write_tlog(path: Path, count: int) -> None:
                 for i in range(begin, min(begin + 1024, count))
             )
             file.write(b"".join(piece))
+
+
+def flight_frames(second: int) -> list[bytes]:
+    """Pack what the gateway sends in one second at its default rates, in 50 steps."""
+    mav = mavlink.MAVLink(None, 1, 1)
+    frames = []
+    for step in range(50):
+        ms, x = 1000 * second + 20 * step, math.sin(second + step / 50)
+        q = (1.0, 0.1 * x, 0.2, 0.3)
+        messages = [
+            mavlink.MAVLink_attitude_quaternion_message(ms, *q, 0.4, 0.5, x),
+            mavlink.MAVLink_attitude_message(ms, 0.1, x, 0.3, 0.4, 0.5, 0.6),
+        ]
+        if step % 5 == 0:
+            place = (471_000_000 + ms, 85_000_000 - ms, 500_000, 60_000)
+            accel, gyro, mag = (0.1, x, -9.81), (0.01 * x, 0.02, 0.03), (0.2, 0.01, 0.4)
+            air = (950.0 + x, 0.0, 500.0, 21.5)
+            messages += [
+                mavlink.MAVLink_global_position_int_message(ms, *place, 100, 50, 10, 9000),
+                mavlink.MAVLink_vfr_hud_message(20.0, 20.0, 90, 50, 500.0, x),
+                mavlink.MAVLink_highres_imu_message(1000 * ms, *accel, *gyro, *mag, *air, 511),
+                mavlink.MAVLink_scaled_pressure_message(ms, 950.0 + x, 0.0, 2150),
+            ]
+        if step % 10 == 0:
+            fix = (3, 471_000_000 + ms, 85_000_000 - ms, 500_000, 80, 120, 2000, 9000, 12)
+            messages.append(mavlink.MAVLink_gps_raw_int_message(1000 * ms, *fix))
+        if step == 0:
+            messages.append(mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3))
+        frames += [bytes(message.pack(mav)) for message in messages]
+    return frames
+
+
+def write_flight(path: Path, count: int) -> None:
+    """Write the tlog of a flight, of at least so many messages."""
+    written, second = 0, 0
+    with path.open("wb") as file:
+        while written < count:
+            frames = flight_frames(second)
+            begin_us, step_us = START_US + second * 1_000_000, 1_000_000 // len(frames)
+            file.writelines(encode_record(begin_us + i * step_us, f) for i, f in enumerate(frames))
+            written, second = written + len(frames), second + 1
+
+
+def cpu_of(*command: str) -> float:
+    """Run a program and return how long it was on a processor."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def measure_files(folder: Path, count: int) -> dict[str, float]:
+    """Convert and sum up a flight, beside mavlogdump, which writes out one of its messages."""
+    path, table = folder / "flight.tlog", folder / "flight.csv"
+    write_flight(path, count)
+    mavgate = (sys.executable, "-m", "gateway.cli")
+    dump = str(Path(sys.executable).with_name("mavlogdump.py"))
+    # What is compiled is kept: the first run is another thing.
+    write_flight(folder / "tiny.tlog", 1000)
+    cpu_of(*mavgate, "convert", str(folder / "tiny.tlog"), "--out", str(folder / "tiny.csv"))
+    found = {
+        "messages": count,
+        "convert_to_csv_cpu_s": cpu_of(*mavgate, "convert", str(path), "--out", str(table)),
+        "info_cpu_s": cpu_of(*mavgate, "info", str(path)),
+        "help_cpu_s": cpu_of(*mavgate, "--help"),
+        "mavlogdump_to_csv_cpu_s": cpu_of(
+            *(sys.executable, dump, "--format", "csv", "--types", "HIGHRES_IMU", str(path))
+        ),
+    }
+    with table.open() as lines:
+        found["rows"] = sum(not line.startswith("#") for line in lines) - 1
+    return found
 
 
 def timed(job: Callable[[], Any]) -> tuple[float, Any]:
@@ -319,10 +392,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--messages", type=int, default=1_000_000)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--files", action="store_true", help="only convert and sum up")
     args = parser.parse_args()
     results: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory(prefix="mavgate-bench-") as name:
         folder = Path(name)
+        results["files"] = measure_files(folder, args.messages)
+        show("Files: processor time of each command", results["files"])
+        if args.files:
+            return
         short = folder / "short.tlog"
         write_tlog(short, REPLAYED)
         results["replay"] = measure_replay(short)

@@ -1,6 +1,6 @@
 """What a compiled estimator looks like from outside: one sample live, or a whole log."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -150,6 +150,21 @@ class KernelEstimator(Generic[State, Gains]):
         self._row[:] = imu_row(sample)
         self._kernels.imu(self._at, self._gains_at, sample.time_us, self._row, self._output)
         return nav_state(sample.time_us, self._output)
+
+    def update_imus(self, samples: Sequence[ImuSample]) -> list[NavState]:
+        """Advance by IMU samples between which nothing else came, as `update_imu` by each."""
+        rows = np.array([imu_row(sample) for sample in samples]).reshape(-1, IMU_COLUMNS)
+        times_us = [sample.time_us for sample in samples]
+        nothing, no_times = np.empty(0), np.empty(0, np.int64)
+        log = SampleLog(
+            imu_time_us=np.array(times_us, np.int64),
+            imu=rows,
+            baro_time_us=no_times,
+            baro_alt_m=nothing,
+            gps_time_us=no_times,
+            gps=nothing.reshape(0, GPS_COLUMNS),
+        )
+        return [nav_state(t, row) for t, row in zip(times_us, self.run(log), strict=True)]
 
     def update_baro(self, sample: BaroSample) -> None:
         """Take in one barometer sample.

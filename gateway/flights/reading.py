@@ -340,11 +340,10 @@ def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     reader, builder = AutopilotReader(options.system_id), RowBuilder()
-    records = recorded_frames([path], options.progress)
 
     def rows() -> Iterator[TableRow]:
-        for record in records:
-            for imported in reader.feed(record.frame, record.time_us):
+        for batch in read_batches(path, options.progress, strict=True):
+            for imported in reader.feed_batch(batch):
                 yield from builder.add(imported)
         yield from builder.flush()
 

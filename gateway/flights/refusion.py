@@ -11,12 +11,11 @@ import msgspec
 from gateway import __version__
 from gateway.aircraft import Aircraft
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_ends
-from gateway.flightlog.table.row import RowBuilder, TableRow
-from gateway.flightlog.table.table import TableHeader, TableMark, TableReader
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.reading import (
-    Line,
     ReadOptions,
     RecordedTable,
     aircraft_of,
@@ -24,6 +23,7 @@ from gateway.flights.reading import (
     joined_rows,
     open_rows,
 )
+from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,
     smooth_records,
@@ -32,13 +32,11 @@ from gateway.flights.smoothed import (
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
-    FusedSample,
     FusionState,
     GpsFix,
     ImuCalibrated,
     ImuRaw,
     NavState,
-    NodeStatus,
     Outgoing,
 )
 from gateway.replay import InterpolatedPosition, Replay, header_for, records_of
@@ -81,12 +79,14 @@ class Refusion:
             correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
         common = PipelineSettings(self._aircraft, {}, self._zero_us or 0, correct)
         self._replay = Replay(Pipeline(common), follow=self._recorded)
+        fresh = Aircraft(table.header.vehicle_id, self._aircraft, correct=correct)
+        self._rows = RowFusion(fresh, follow=self._recorded)
 
     @property
     def remarks(self) -> list[str]:
         """What the user should know of the states, as far as it was seen by now."""
         return [
-            *(SETTLES.format(reason) for reason in self._replay.refused),
+            *(SETTLES.format(reason) for reason in (*self._replay.refused, *self._rows.refused)),
             *self._table.remarks,
         ]
 
@@ -107,7 +107,7 @@ class Refusion:
 
     def table(self) -> RecordedTable:
         """Return the rows with the new states, under a head that tells how they were made."""
-        rows = self._rows()
+        rows = self._rows.rows(self._table.rows)
         first = next(rows, None)
         old, new = self._table.header, header_for(self._aircraft, self._table.header.vehicle_id)
         if not self._recorded or not old.settings:
@@ -115,26 +115,6 @@ class Refusion:
         begins_cold = not isinstance(first, FusionState)
         header = msgspec.structs.replace(old, mavgate_version=__version__, cold_start=begins_cold)
         return RecordedTable(header, chain([] if first is None else [first], rows))
-
-    def _rows(self) -> Iterator[Line]:
-        builder = RowBuilder()
-        for row in self._table.rows:
-            if isinstance(row, FusionState):
-                if self._replay.restore(row):
-                    yield row
-                continue
-            if isinstance(row, TableMark):
-                yield row
-                continue
-            if isinstance(row, NodeStatus):
-                yield row
-            if isinstance(row, TableHeader) and self._recorded:
-                yield row
-            for _, action in self._replay.take(row):
-                if isinstance(action, FusedSample | BaroRaw | GpsFix):
-                    yield from builder.add(action)
-            # A row that stood without an IMU sample does so again.
-            yield from builder.flush()
 
 
 def end_of(file: Path, options: ReadOptions) -> int | None:

@@ -9,11 +9,17 @@ for that of a receiver that finds or loses its fix jumps by any amount.
 """
 
 import math
-from collections.abc import Callable
+from collections import namedtuple
+from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Any, Final
 
+import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.flightlog.tlog.payload_columns import columns_of
+from gateway.flightlog.tlog.tlog import Batch
+from gateway.flightlog.tlog.tlog_scan import IntArray
 from gateway.geometry.quaternion import from_euler
 from gateway.records import (
     NAN,
@@ -72,6 +78,8 @@ class AutopilotReader:
         self._place: Any = None
         """The newest GLOBAL_POSITION_INT, and when it was recorded."""
         self._place_us = 0
+        self._waiting: tuple[Any, int, Any] | None = None
+        """The newest ATTITUDE of a batch, its time, and the place known then."""
         self._handlers: dict[int, Callable[[Any, int], list[Imported]]] = {
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._milli_imu,
@@ -101,19 +109,58 @@ class AutopilotReader:
         handler = self._handlers.get(message_id)
         if handler is None:
             return []
-        system_id, component_id = origin_of(frame)
-        rank = _IMU_RANK.get(message_id, 0)
-        if self.system_id is None and rank:
-            self.system_id = system_id
-        if system_id != self.system_id or component_id != 1 or (rank and rank < self._rank):
+        if not self._takes(message_id, *origin_of(frame)):
             return []
-        self._rank = max(rank, self._rank)
         try:
             message = self._decoder.decode(bytearray(frame))
         except mavlink.MAVError:
             self.undecoded += 1
             return []
         return handler(message, time_us)
+
+    def feed_batch(self, batch: Batch) -> list[Imported]:
+        """Take the next records of the recording, of which every checksum was checked.
+
+        Parameters
+        ----------
+        batch : Batch
+            Behind the last one that was taken.
+
+        Returns
+        -------
+        list of Imported
+            As `feed` gives them, but of the autopilot's states only the last before each sample.
+        """
+        wanted = np.flatnonzero(np.isin(batch.message_ids, list(self._handlers)))
+        found: list[Imported] = []
+        for message_id, origin, time_us, message in zip(
+            batch.message_ids[wanted].tolist(),
+            batch.origins[wanted].tolist(),
+            batch.time_us[wanted].tolist(),
+            _messages(batch, wanted),
+            strict=True,
+        ):
+            if not self._takes(message_id, *divmod(origin, 256)):
+                continue
+            if message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE:
+                place = self._newest_place(time_us)
+                self._waiting = (message, self._time(message, time_us), place)
+                continue
+            if message_id in _IMU_RANK and self._waiting is not None:
+                found.append(_own_state(*self._waiting))
+                self._waiting = None
+            found += self._handlers[message_id](message, time_us)
+        return found
+
+    def _takes(self, message_id: int, system_id: int, component_id: int) -> bool:
+        """Tell whether a message is of the vehicle, and no poorer than others of its kind."""
+        rank = _IMU_RANK.get(message_id, 0)
+        if self.system_id is None and rank:
+            self.system_id = system_id
+        if system_id != self.system_id or component_id != 1 or (rank and rank < self._rank):
+            return False
+        self._rank = max(rank, self._rank)
+        return True
 
     def _time(self, message: Any, recorded_us: int) -> int:
         """Put a message on the records' clock, which never falls."""
@@ -182,26 +229,7 @@ class AutopilotReader:
     def _attitude(self, m: Any, recorded_us: int) -> list[Imported]:
         """Take what the autopilot itself believes, to be compared with."""
         place = self._newest_place(recorded_us)
-        flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-        if place is not None:
-            flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
-        vel = (NAN,) * 3 if place is None else (place.vx, place.vy, place.vz)
-        unknown: Vec3 = (NAN, NAN, NAN)
-        return [
-            NavState(
-                time_us=self._time(m, recorded_us),
-                q_nb=from_euler(m.roll, m.pitch, m.yaw),
-                rate_b_radps=(m.rollspeed, m.pitchspeed, m.yawspeed),
-                lat_deg=NAN if place is None else place.lat * DEG_PER_DEGE7,
-                lon_deg=NAN if place is None else place.lon * DEG_PER_DEGE7,
-                alt_amsl_m=NAN if place is None else place.alt * MILLI,
-                vel_n_mps=(vel[0] * CENTI, vel[1] * CENTI, vel[2] * CENTI),
-                attitude_std_rad=unknown,
-                vel_std_mps=unknown,
-                pos_std_m=unknown,
-                flags=flags,
-            )
-        ]
+        return [_own_state(m, self._time(m, recorded_us), place)]
 
     def _gps(self, m: Any, recorded_us: int) -> list[Imported]:
         time_us = self._time(m, recorded_us)
@@ -242,3 +270,46 @@ class AutopilotReader:
 
 def _known(value: int, scale: float) -> float:
     return NAN if value == UNKNOWN_U16 else value * scale
+
+
+def _own_state(m: Any, time_us: int, place: Any) -> NavState:
+    """Make a state of ATTITUDE and of GLOBAL_POSITION_INT, which may be None."""
+    flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+    if place is not None:
+        flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
+    vel = (NAN,) * 3 if place is None else (place.vx, place.vy, place.vz)
+    unknown: Vec3 = (NAN, NAN, NAN)
+    return NavState(
+        time_us=time_us,
+        q_nb=from_euler(m.roll, m.pitch, m.yaw),
+        rate_b_radps=(m.rollspeed, m.pitchspeed, m.yawspeed),
+        lat_deg=NAN if place is None else place.lat * DEG_PER_DEGE7,
+        lon_deg=NAN if place is None else place.lon * DEG_PER_DEGE7,
+        alt_amsl_m=NAN if place is None else place.alt * MILLI,
+        vel_n_mps=(vel[0] * CENTI, vel[1] * CENTI, vel[2] * CENTI),
+        attitude_std_rad=unknown,
+        vel_std_mps=unknown,
+        pos_std_m=unknown,
+        flags=flags,
+    )
+
+
+@cache
+def _record_of(kind: Any) -> Callable[[Iterable[Any]], Any]:
+    fields: Any = namedtuple("Fields", kind.ordered_fieldnames)  # type: ignore[misc]
+    make: Callable[[Iterable[Any]], Any] = fields._make
+    return make
+
+
+def _messages(batch: Batch, wanted: IntArray) -> list[Any]:
+    """Return some records with their fields as attributes, as pymavlink decodes them."""
+    found: list[Any] = [None] * len(wanted)
+    message_ids = batch.message_ids[wanted]
+    for message_id in np.unique(message_ids).tolist():
+        kind = mavlink.mavlink_map[message_id]
+        make = _record_of(kind)
+        places = np.flatnonzero(message_ids == message_id)
+        rows = columns_of(batch, wanted[places], kind).tolist()
+        for place, values in zip(places.tolist(), rows, strict=True):
+            found[place] = make(values)
+    return found

@@ -1,6 +1,7 @@
 """An autopilot's messages become records in SI, on one clock."""
 
 import math
+import random
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.flightlog.table.autopilot import AutopilotReader, Imported
 from gateway.flightlog.table.row import RowBuilder
+from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
 from gateway.geometry.quaternion import to_euler
 from gateway.records import (
     BaroRaw,
@@ -194,3 +196,51 @@ def test_what_the_autopilot_believes_goes_along() -> None:
     assert [row.state for row in rows if row.imu is not None] == [None, stale], (
         "with the next sample; of two the newer"
     )
+
+
+def recorded(seed: int) -> list[tuple[int, bytes]]:
+    """Make what an autopilot, a second one and a station say in any order, stamps that fall too."""
+    chance, records, at_us = random.Random(seed), [], 0
+    links = [mavlink.MAVLink(None, *sender) for sender in ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))]
+    for _ in range(600):
+        at_us += chance.choice((0, 4, 1000, 20_000, -30_000, 700_000))
+        own_ms = max(0, at_us) // 1000
+        message = chance.choice(
+            (
+                highres(own_ms * 1000, chance.choice((0, 0x1FF))),
+                highres(own_ms * 1000),
+                raw(own_ms * 1000),
+                gps(own_ms * 1000, fix=chance.randint(0, 4)),
+                position(own_ms, chance.randint(-500, 500)),
+                mavlink.MAVLink_attitude_message(own_ms, chance.random(), 0.1, 0.2, 0.3, 0.4, 0.5),
+                mavlink.MAVLink_scaled_pressure_message(own_ms, 950.0, 0.5, 2100),
+                mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3),
+            )
+        )
+        link = chance.choice(links)
+        version_1 = chance.random() < 0.2
+        frame = bytes(message.pack(link, force_mavlink1=version_1))
+        records.append((START_US + at_us, frame))
+    return records
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_batch_gives_the_rows_that_single_frames_give(seed: int) -> None:
+    records = recorded(seed)
+    singly, builder = AutopilotReader(), RowBuilder()
+    expected = [
+        repr(row)
+        for time_us, frame in records
+        for item in singly.feed(frame, time_us)
+        for row in builder.add(item)
+    ]
+    reader, builder, scanner = AutopilotReader(), RowBuilder(), TlogScanner(strict=True)
+    data = b"".join(encode_record(time_us, frame) for time_us, frame in records)
+    found = []
+    for begin in range(0, len(data) + 5000, 5000):
+        batch = scanner.feed(data[begin : begin + 5000], final=begin >= len(data))
+        for item in reader.feed_batch(batch):
+            found += [repr(row) for row in builder.add(item)]
+    assert len(expected) > 20
+    assert found == expected
+    assert (reader.system_id, reader.unix_us_at_zero) == (singly.system_id, singly.unix_us_at_zero)
