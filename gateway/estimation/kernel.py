@@ -153,6 +153,8 @@ class KernelEstimator(Generic[State, Gains]):
 
     def update_imus(self, samples: Sequence[ImuSample]) -> list[NavState]:
         """Advance by IMU samples between which nothing else came, as `update_imu` by each."""
+        if len(samples) == 1:
+            return [self.update_imu(samples[0])]
         rows = np.array([imu_row(sample) for sample in samples]).reshape(-1, IMU_COLUMNS)
         times_us = [sample.time_us for sample in samples]
         nothing, no_times = np.empty(0), np.empty(0, np.int64)
