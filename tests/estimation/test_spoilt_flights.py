@@ -24,12 +24,8 @@ RUNS = {"complementary": run_complementary, "eskf": run_eskf}
 SEEDS = (21, 22)
 PLACE_M = 10.0
 
-LIMIT_DEG: dict[tuple[str, str], float] = {
-    ("complementary", "late_gps"): 5.5,
-    ("complementary", "no_mag"): 4.0,
-    ("complementary", "mid_air"): 8.5,
-}
-"""For tilt and heading alike; where nothing is said, 3 deg."""
+LIMIT_DEG = 3.0
+"""For tilt and heading alike."""
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -48,16 +44,15 @@ def off(flight: Flight, name: str, how: str) -> tuple[float, float, float]:
 @pytest.mark.parametrize("name", RUNS)
 def test_simulated(flight: Flight, name: str, how: str) -> None:
     tilt_deg, heading_deg, place_m = off(flight, name, how)
-    limit_deg = LIMIT_DEG.get((name, how), 3.0)
-    assert tilt_deg < limit_deg
-    assert heading_deg < limit_deg
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
 
 
 REAL_LIMIT_DEG: dict[tuple[str, str], float] = {
     ("complementary", "late_gps"): 4.0,
-    ("complementary", "no_velocity"): 5.0,
-    ("complementary", "no_mag"): 5.0,
+    ("complementary", "no_mag"): 4.0,
+    ("complementary", "mid_air"): 3.6,
 }
 
 
@@ -66,7 +61,7 @@ REAL_LIMIT_DEG: dict[tuple[str, str], float] = {
 def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     tilt_deg, heading_deg, place_m = off(flight, name, how)
-    limit_deg = REAL_LIMIT_DEG.get((name, how), 3.0)
+    limit_deg = REAL_LIMIT_DEG.get((name, how), LIMIT_DEG)
     assert tilt_deg < limit_deg
     assert heading_deg < limit_deg
     assert place_m < PLACE_M
@@ -91,7 +86,7 @@ def test_a_bias_that_changes_at_take_off_is_unlearned(flight: Flight, name: str)
     imu[time_s < 14.0, GYRO + 2] -= math.radians(0.9)
     changed = replace(flight, log=replace(flight.log, imu=imu))
     yaw_deg = attitude_scores(changed, RUNS[name](changed)[:, :4])["yaw"]
-    assert yaw_deg < {"complementary": 7.0, "eskf": 2.0}[name]
+    assert yaw_deg < {"complementary": 2.5, "eskf": 2.0}[name]
 
 
 @pytest.mark.parametrize("name", RUNS)

@@ -5,7 +5,6 @@ back is the horizontal part of the bias error, seen through the same low-pass as
 The gains follow from the accuracy to be reached and from a drift of 0.1 deg/s in 100 s.
 """
 
-import math
 from typing import Final
 
 from gateway.compiled import compiled
@@ -13,14 +12,17 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.heading import carry_heading
+from gateway.estimation.complementary.drift import BIAS_WALK_RAD2PS3, carry_drift, correct_drift
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
 from gateway.estimation.kernel_record import as_quat
-from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 
-DRIFT_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
+SETTLED_S: Final = 5.0
+"""What levels a new attitude in this time is its own error rather than the bias."""
+HAND_MPS2: Final = 1.0
+"""Where GPS tells no acceleration, turns that pull by this much make the level worth half."""
 CLIP_RADPS: Final = 2.0 * RAD_PER_DEG
 """No single observation moves the bias by more than its gain times this."""
 
@@ -40,12 +42,10 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
     dt : float
         Length of the epoch, s.
     """
-    carry_heading(s)
-    growth = DRIFT_RAD2PS * dt
-    for k in range(3):
-        s.bias_cov[k, k] = min(s.bias_cov[k, k] + growth, p.bias_initial_radps**2)
+    carry_drift(s, p)
+    growth = BIAS_WALK_RAD2PS3 * dt
     watch_turn(s, tau_s, dt)
-    settled = s.force_lp_s > tau_s
+    settled = s.force_lp_s > max(tau_s, SETTLED_S)
     if s.at_rest == 1:
         variance = noise_for(p.bias_rest_radps, growth)
         for k in range(3):
@@ -53,18 +53,13 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
             correct_bias(s, p, row, s.gyro_rest[k], variance)
     elif settled:
         variance = noise_for(p.bias_motion_radps, growth)
+        if s.by_gps == 0:
+            variance *= 1.0 + (s.turning_mps2 / HAND_MPS2) ** 2
         for k in range(2):
             row = (s.turn_lp[3 * k], s.turn_lp[3 * k + 1], s.turn_lp[3 * k + 2])
             # The low-passed frame falls behind by the bias error, and gravity pulls it back.
             correct_bias(s, p, row, s.turn_lp[6 + k] - s.tilt_sum[k] / dt, variance)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
-
-
-@compiled
-def raise_bias_variance(s: ComplementaryState, std: float) -> None:
-    """Believe the bias no more firmly than to a standard deviation in rad/s."""
-    for k in range(3):
-        s.bias_cov[k, k] = max(s.bias_cov[k, k], std * std)
 
 
 @compiled
@@ -101,25 +96,7 @@ def settle(s: ComplementaryState, k: int, u: float, cutoff: float, dt: float, ta
 def correct_bias(
     s: ComplementaryState, p: ComplementaryGains, row: Vec3, measured: float, variance: float
 ) -> None:
-    """Scalar Kalman update of the three bias states by `row @ bias = measured`."""
-    P, b = s.bias_cov, s.bias_b
-    column = (
-        P[0, 0] * row[0] + P[0, 1] * row[1] + P[0, 2] * row[2],
-        P[1, 0] * row[0] + P[1, 1] * row[1] + P[1, 2] * row[2],
-        P[2, 0] * row[0] + P[2, 1] * row[1] + P[2, 2] * row[2],
-    )
-    expected = row[0] * b[0] + row[1] * b[1] + row[2] * b[2]
-    spread = row[0] * column[0] + row[1] * column[1] + row[2] * column[2] + variance
+    """Correct the bias by `row @ bias = measured`."""
+    expected = row[0] * s.bias_b[0] + row[1] * s.bias_b[1] + row[2] * s.bias_b[2]
     innovation = max(-CLIP_RADPS, min(CLIP_RADPS, measured - expected))
-    if not math.isfinite(innovation):
-        return
-    c = s.heading_cov
-    shared = row[0] * c[0] + row[1] * c[1] + row[2] * c[2]
-    s.heading_rad = wrap_pi(s.heading_rad + shared / spread * innovation)
-    s.heading_var -= shared * shared / spread
-    for k in range(3):
-        c[k] -= column[k] * shared / spread
-        b[k] += column[k] / spread * innovation
-        b[k] = max(-p.bias_limit_radps, min(p.bias_limit_radps, b[k]))
-        for j in range(3):
-            P[k, j] -= column[k] * column[j] / spread
+    correct_drift(s, p, (row[0], row[1], row[2], 0.0, 0.0), innovation, variance)

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
-from gateway.estimation.complementary.bias import raise_bias_variance, update_bias
+from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
     write_output,
 )
@@ -14,7 +14,13 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.heading import UNKNOWN_VAR, is_heading_good, take_mag
+from gateway.estimation.complementary.drift import (
+    DOUBT,
+    begin_drift,
+    note_turn,
+    raise_bias_variance,
+)
+from gateway.estimation.complementary.heading import is_heading_good, take_mag
 from gateway.estimation.complementary.intake import bridge_gap, take_gps
 from gateway.estimation.complementary.navigation import (
     dead_reckon,
@@ -60,9 +66,8 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     write_quat(s.q_ei, (1.0, 0.0, 0.0, 0.0))
     refresh(s)
     for k in range(3):
-        s.bias_cov[k, k] = p.bias_initial_radps**2
         s.rate_b[k] = NAN
-    s.heading_var = UNKNOWN_VAR
+    begin_drift(s, p)
     s.declination_rad = NAN
     forget_times(s)
 
@@ -77,14 +82,16 @@ def forget_times(s: ComplementaryState) -> None:
 
 
 @compiled
-def begin(s: ComplementaryState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
+def begin(
+    s: ComplementaryState, p: ComplementaryGains, time_us: int, gyro: Vec3, accel: Vec3
+) -> None:
     """Start at the first sound sample, level by its specific force."""
     if not is_start(s, gyro, accel):
         return
     begin_clock(s, time_us, gyro, accel)
     write_vec(s.force_lp_i, accel)
     # One sample may be anything: the alignment finds the level within the first second.
-    lose_attitude(s)
+    lose_attitude(s, p)
     take_gravity(s, accel, 1.0, 1e-3)
     # Two turns: the first leaves a remainder where the start is upside down.
     take_gravity(s, accel, 1.0, 1e-3)
@@ -105,7 +112,7 @@ def take_imu(
     """
     gyro, accel, mag = imu_vectors(row)
     if s.started == 0:
-        begin(s, time_us, gyro, accel)
+        begin(s, p, time_us, gyro, accel)
         return
     dt = step_clock(s, time_us)
     if dt <= 0.0:
@@ -113,7 +120,7 @@ def take_imu(
             forget_times(s)
         return
     if dt > GAP_S:
-        bridge_gap(s, dt)
+        bridge_gap(s, p, dt)
         return
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
     s.fault = 0 if sound_gyro and sound_accel and row[CLIPPED] == 0.0 else 1
@@ -121,14 +128,6 @@ def take_imu(
     if math.isfinite(mag[0]) and math.isfinite(mag[1]) and math.isfinite(mag[2]):
         take_mag(s, p, mag)
     refresh(s)
-
-
-@compiled
-def note_down_turn(s: ComplementaryState, dt: float) -> None:
-    """Note how the bias turns the heading."""
-    down = rotate_inverse(as_quat(s.q_eb), (0.0, 0.0, 1.0))
-    for k in range(3):
-        s.down_turn[k] += down[k] * dt
 
 
 @compiled
@@ -150,7 +149,7 @@ def advance(
         s.missing_gyro_s = 0.0
     strapdown(s, gyro, dt)
     refresh(s)
-    note_down_turn(s, dt)
+    note_turn(s, dt)
     if not sound_accel:
         accel = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
     since_fix = s.time_s - s.fix_s
@@ -158,9 +157,8 @@ def advance(
     if sound_gyro and sound_accel:
         rested = s.at_rest == 1
         watch_rest(s, p, gyro, accel, moving, dt)
-        raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
-        watch_gravity(s)
-    s.heading_var = min(s.heading_var + p.heading_process_rad2ps * dt, UNKNOWN_VAR)
+        raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
+        watch_gravity(s, p)
     coasting = since_fix < p.coast_s and speed(s) > MOVING_MPS
     by_gps = since_fix < FRESH_GPS_S or coasting
     if sound_accel and not (by_gps and is_heading_good(s)):

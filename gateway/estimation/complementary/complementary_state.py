@@ -47,16 +47,16 @@ class ComplementarySettings(Settings, frozen=True):
     tau_heading_s: Annotated[
         float,
         setting(
-            "Time constant of the compass correction. Small follows magnetic noise, large the "
-            "gyroscope's drift.",
+            "Time in which the compass's slow error becomes another. Small takes it for noise and "
+            "follows its mean, large for a constant that the GPS has to tell.",
             "s",
             ge=0.5,
-            le=120.0,
+            le=600.0,
         ),
-    ] = 20.0
+    ] = 60.0
     heading_noise_deg: Annotated[
         float,
-        setting("Slow error of the compass, weighed against the GPS.", "deg", ge=0.1, le=45.0),
+        setting("Slow error of the compass: iron, and the place.", "deg", ge=0.1, le=45.0),
     ] = 3.0
     gps_velocity_noise_mps: Annotated[
         float, setting("Noise of the GPS velocity.", "m/s", ge=0.01, le=5.0)
@@ -129,8 +129,8 @@ class ComplementaryGains(FilterGains):
     tau_accel_s: float
     tau_accel_gps_s: float
     coast_s: float
-    heading_process_rad2ps: float
-    heading_noise_rad2s: float
+    tau_heading_s: float
+    heading_noise_rad: float
     gps_velocity_noise_mps: float
     bias_initial_radps: float
     bias_motion_radps: float
@@ -147,7 +147,6 @@ class ComplementaryState(FilterState):
     """All that the complementary estimator remembers."""
 
     bias_b: Annotated[FloatArray, (3,)]
-    bias_cov: Annotated[FloatArray, (3, 3)]
     q_ei: Annotated[FloatArray, (4,)]
     """The gyroscope's frame to a level frame of free heading."""
     q_eb: Annotated[FloatArray, (4,)]
@@ -167,11 +166,17 @@ class ComplementaryState(FilterState):
 
     heading_rad: float
     """Turn about down from the level frame to NED."""
-    heading_var: float
-    heading_cov: Annotated[FloatArray, (3,)]
-    """With the gyroscope's bias."""
+    compass_rad: float
+    """Slow error of the compass."""
+    drift_cov: Annotated[FloatArray, (5, 5)]
+    """Covariance of the bias, the heading and the compass's error."""
+    drift_gain: Annotated[FloatArray, (5,)]
+    """Scratch."""
     down_turn: Annotated[FloatArray, (3,)]
-    """Integral of the down row of `R_nb` since `heading_cov` was carried on."""
+    """Integral of the down row of `R_nb` since the covariance was carried on."""
+    carried_s: float
+    carried_turn: float
+    """Time since, and angle that the aircraft has turned by."""
     accel_bias_b: Annotated[FloatArray, (3,)]
     """Error of the specific force as the fixes' velocities tell it, m/s2."""
     accel_bias_d: float
@@ -214,7 +219,6 @@ def make_gains(
         if name.endswith("_degps")
     }
     noise_rad = settings.heading_noise_deg * RAD_PER_DEG
-    values["heading_process_rad2ps"] = noise_rad**2 / settings.tau_heading_s
-    values["heading_noise_rad2s"] = noise_rad**2 * settings.tau_heading_s
+    values["heading_noise_rad"] = noise_rad
     values |= filter_gains(reference, rest, compass)
     return filled_record(ComplementaryGains, values)

@@ -15,18 +15,22 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.complementary.drift import carry_drift, correct_drift, heading_variance
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.magfield import STALE_MAG_S, take_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
+from gateway.units import RAD_PER_DEG
 
-UNKNOWN_VAR: Final = 10.0
-"""Variance of a heading of which nothing is known, rad2."""
-BIAS_HEED: Final = 3.0
-"""So much more noise a heading has for the bias."""
-LEAST_VAR: Final = 1e-6
-"""Rounding must not make a variance negative."""
-MATCH_WINDOW_S: Final = 1.0
+MAG_NOISE_DEG: Final = 3.2
+"""Error of the compass that is another within a second or so."""
+UNAIDED_NOISE_DEGPMPS2: Final = 10.0
+"""What it adds that turns tilt the horizon where there is no GPS, by the dip of the field."""
+JITTER_S: Final = 0.03
+"""How much the latency of a fix varies."""
+SLOW_MPS: Final = 5.0
+"""A slower aircraft turns no faster."""
+MATCH_WINDOW_S: Final = 0.33
 """Differences of successive velocities share their noise; over this time it averages out."""
 GOOD_VAR: Final = 0.3
 """Up to 30 deg of standard deviation, the GPS acceleration may be turned by the heading."""
@@ -35,47 +39,7 @@ GOOD_VAR: Final = 0.3
 @compiled
 def is_heading_good(s: ComplementaryState) -> bool:
     """Return whether horizontal vectors may be turned by the heading."""
-    return s.heading_known == 1 and s.heading_var < GOOD_VAR
-
-
-@compiled
-def correct_heading(
-    s: ComplementaryState, p: ComplementaryGains, measured_rad: float, variance: float
-) -> None:
-    """Blend one measured heading in, the shortest way round."""
-    carry_heading(s)
-    if s.heading_known == 0:
-        s.heading_rad, s.heading_var, s.heading_known = measured_rad, variance, 1
-        s.heading_cov[0] = s.heading_cov[1] = s.heading_cov[2] = 0.0
-        return
-    spread = s.heading_var + variance
-    innovation = wrap_pi(measured_rad - s.heading_rad)
-    s.heading_rad = wrap_pi(s.heading_rad + s.heading_var / spread * innovation)
-    # The bias heeds a heading less than the heading does: its errors last, and look like a drift.
-    limit, heed = p.bias_limit_radps, s.heading_var + BIAS_HEED * variance
-    left = (2.0 - spread / heed) / heed
-    for k in range(3):
-        bias = s.bias_b[k] + s.heading_cov[k] / heed * innovation
-        s.bias_b[k] = max(-limit, min(limit, bias))
-        for j in range(3):
-            s.bias_cov[k, j] -= s.heading_cov[k] * s.heading_cov[j] * left
-    for k in range(3):
-        s.heading_cov[k] *= variance / spread
-    s.heading_var = max(s.heading_var * variance / spread, LEAST_VAR)
-
-
-@compiled
-def carry_heading(s: ComplementaryState) -> None:
-    """Let the gyroscope's bias make the heading uncertain, and tied to it, up to now."""
-    P, r, c = s.bias_cov, s.down_turn, s.heading_cov
-    for k in range(3):
-        column = P[k, 0] * r[0] + P[k, 1] * r[1] + P[k, 2] * r[2]
-        # With the covariance before this one is carried on: twice it, and the square.
-        s.heading_var += r[k] * (column - 2.0 * c[k])
-    for k in range(3):
-        c[k] -= P[k, 0] * r[0] + P[k, 1] * r[1] + P[k, 2] * r[2]
-    s.heading_var = min(max(s.heading_var, LEAST_VAR), UNKNOWN_VAR)
-    r[0] = r[1] = r[2] = 0.0
+    return s.heading_known == 1 and heading_variance(s) < GOOD_VAR
 
 
 @compiled
@@ -105,14 +69,26 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     measured = -math.atan2(east, north)
     if math.isfinite(declination):
         measured += declination
-    correct_heading(s, p, measured, p.heading_noise_rad2s / (dt * weight))
+    carry_drift(s, p)
+    if s.heading_known == 0:
+        s.heading_rad, s.heading_known = wrap_pi(measured), 1
+    innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
+    unaided = UNAIDED_NOISE_DEGPMPS2 * s.turning_mps2 if s.by_gps == 0 else 0.0
+    density = (MAG_NOISE_DEG**2 + unaided**2) * RAD_PER_DEG**2
+    correct_drift(s, p, (0.0, 0.0, 0.0, 1.0, 1.0), innovation, density / (dt * weight))
 
 
 @compiled
-def information_of(accel_n: Vec3, dt: float, noise_mps: float) -> float:
-    """Return how much the mean acceleration of one interval says of the heading, 1/rad2."""
-    power = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
-    return power * dt * MATCH_WINDOW_S / (2.0 * noise_mps * noise_mps)
+def match_variance(s: ComplementaryState, force_e: Vec3, dt: float, noise_mps: float) -> float:
+    """Return how uncertain a heading is that one interval's mean acceleration tells, rad2.
+
+    The accelerometer tells how strong that was; the acceleration by GPS is, in straight flight,
+    but its noise. In a turn the latency counts, by how much it varies.
+    """
+    pull = math.hypot(force_e[0], force_e[1])
+    turn = pull / max(math.hypot(s.vel_n[0], s.vel_n[1]), SLOW_MPS)
+    seen = 2.0 * noise_mps * noise_mps / (pull * pull * MATCH_WINDOW_S)
+    return (seen + (JITTER_S * turn) ** 2) / dt
 
 
 @compiled
@@ -141,10 +117,14 @@ def take_match(
     noise : float
         Of the GPS velocity, m/s.
     """
-    if s.heading_known == 1:
-        information = information_of(accel_n, dt, noise)
-        if information > 0.0:
-            s.heading_true = 1
-            real = force_e[0] * accel_n[0] + force_e[1] * accel_n[1]
-            imag = force_e[0] * accel_n[1] - force_e[1] * accel_n[0]
-            correct_heading(s, p, math.atan2(imag, real), 1.0 / information)
+    power = force_e[0] ** 2 + force_e[1] ** 2
+    if s.heading_known == 0 or power <= 0.0:
+        return
+    s.heading_true = 1
+    carry_drift(s, p)
+    half = -0.5 * s.heading_rad
+    told = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel_n)
+    across = force_e[0] * told[1] - force_e[1] * told[0]
+    innovation = max(-1.0, min(1.0, across / power))
+    variance = match_variance(s, force_e, dt, noise)
+    correct_drift(s, p, (0.0, 0.0, 0.0, 1.0, 0.0), innovation, variance)

@@ -20,7 +20,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.heading import UNKNOWN_VAR
+from gateway.estimation.complementary.drift import level_time_s, raise_heading_variance
 from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
@@ -57,7 +57,7 @@ from gateway.records import Vec3
 
 
 @compiled
-def bridge_gap(s: ComplementaryState, dt: float) -> None:
+def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
     s.fault = 1
     still = s.at_rest == 1
@@ -74,9 +74,9 @@ def bridge_gap(s: ComplementaryState, dt: float) -> None:
         turn = (math.cos(half), 0.0, 0.0, math.sin(half))
         write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
     turned = (GAP_TILT_RATE + turning) * dt
-    s.heading_var = min(s.heading_var + turned * turned, UNKNOWN_VAR)
+    raise_heading_variance(s, turned)
     if turned > GAP_LOST_RAD and not still:
-        lose_attitude(s)
+        lose_attitude(s, p)
     refresh(s)
 
 
@@ -101,12 +101,12 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     wanted_s = wanted_time_s(s, p, time_us)
     silent_s = silence_before(s, wanted_s)
     if silent_s > 0.0:
-        bridge_gap(s, silent_s)
+        bridge_gap(s, p, silent_s)
     valid_s = look_back(s, wanted_s)
     lag = s.time_s - valid_s
     pos, told = place_fix(s, row)
     vel, at_s = velocity_of_fix(s, valid_s, pos, told)
-    align(s, at_s, vel, velocity_noise(told))
+    align(s, p, at_s, vel, velocity_noise(told))
     look_back(s, wanted_s)
     past = past_state(s, s.then, lag)
     noise_mps = p.gps_velocity_noise_mps if is_velocity_told(told) else WAY_NOISE_MPS
@@ -119,20 +119,22 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
         at_s = look_back(s, at_s)
         interval = take_fix_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
         if interval > 0.0:
-            update_bias(s, p, p.tau_accel_gps_s, interval)
+            update_bias(s, p, level_time_s(s, p), interval)
     refresh(s)
 
 
 @compiled
-def align(s: ComplementaryState, at_s: float, vel: Vec3, noise_mps: float) -> None:
+def align(
+    s: ComplementaryState, p: ComplementaryGains, at_s: float, vel: Vec3, noise_mps: float
+) -> None:
     """Give the velocity of a fix to the alignment, and heed what that says."""
     if not is_sound(vel, FASTEST_MPS):
         return
     if s.time_s - s.fix_s > DEAD_RECKONING_MAX_S and is_flown_unaided(s, vel):
-        lose_attitude(s)
+        lose_attitude(s, p)
     dt = pair_with(s, at_s, vel, noise_mps)
     if dt > 0.0:
-        review_attitude(s, dt)
+        review_attitude(s, p, dt)
 
 
 @compiled

@@ -14,6 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.complementary.drift import level_time_s
 from gateway.estimation.complementary.heading import is_heading_good, take_match
 from gateway.estimation.complementary.tilt import take_gravity
 from gateway.estimation.kernel_record import as_quat, as_vec, write_vec
@@ -79,5 +80,5 @@ def take_fix_velocity(
     in_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel)
     in_i = rotate_inverse(as_quat(s.q_ei), in_e)
     gravity = (mean[0] - in_i[0], mean[1] - in_i[1], mean[2] - in_i[2])
-    take_gravity(s, gravity, p.tau_accel_gps_s, dt)
+    take_gravity(s, gravity, level_time_s(s, p), dt)
     return dt

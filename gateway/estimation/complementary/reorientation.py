@@ -11,12 +11,23 @@ from gateway.estimation.alignment.review import (
     tells_heading,
 )
 from gateway.estimation.alignment.wahba import align_by_gravity, heading_difference
-from gateway.estimation.complementary.complementary_state import ComplementaryState
-from gateway.estimation.complementary.heading import UNKNOWN_VAR
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
+from gateway.estimation.complementary.drift import (
+    DOUBT,
+    bias_std,
+    forget_heading,
+    heading_variance,
+    raise_bias_variance,
+    start_heading,
+)
 from gateway.estimation.complementary.tilt import refresh
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
-from gateway.geometry.quaternion import multiply, normalise, rotate_inverse, wrap_pi
+from gateway.estimation.rest import BIAS_CHANGE_RADPS
+from gateway.geometry.quaternion import multiply, normalise, rotate_inverse
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 LEVEL_STD_RAD = 0.05
@@ -24,11 +35,11 @@ LEVEL_STD_RAD = 0.05
 
 
 @compiled
-def lose_attitude(s: ComplementaryState) -> None:
+def lose_attitude(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Give the attitude up; the place follows the fixes until the alignment has found another."""
     lose(s)
     begin_level(s)
-    forget_heading(s)
+    forget_heading(s, p)
 
 
 @compiled
@@ -41,38 +52,41 @@ def begin_level(s: ComplementaryState) -> None:
 
 
 @compiled
-def forget_heading(s: ComplementaryState) -> None:
-    """Know nothing of the heading."""
-    s.heading_var = UNKNOWN_VAR
-    for k in range(3):
-        s.heading_cov[k] = s.down_turn[k] = 0.0
-
-
-@compiled
-def watch_gravity(s: ComplementaryState) -> None:
+def watch_gravity(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Look at gravity where GPS tells no velocity."""
     dt = align_by_gravity(s, s.time_s, as_vec(s.integrals), GRAVITY_PAIR_S)
     if dt > 0.0:
-        review_attitude(s, dt)
+        review_attitude(s, p, dt)
 
 
 @compiled
-def review_attitude(s: ComplementaryState, dt: float) -> None:
+def found_heading_std(s: ComplementaryState) -> float:
+    """Return how uncertain a heading of the alignment is: the bias has turned its pairs, too."""
+    turned = 0.5 * bias_std(s) * s.gathered_s
+    return math.hypot(s.heading_std, turned)
+
+
+@compiled
+def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     q = as_quat(s.q_nb)
-    if not is_to_be_taken(s, q, LEVEL_STD_RAD, math.sqrt(s.heading_var), dt):
-        if tells_heading(s):
-            forget_heading(s)
-            s.heading_rad = wrap_pi(s.heading_rad + heading_difference(as_quat(s.found_q_nb), q))
-            s.heading_var = s.heading_std * s.heading_std
+    if not is_to_be_taken(s, q, LEVEL_STD_RAD, math.sqrt(heading_variance(s)), dt):
+        if tells_heading(s) and s.at_rest == 0:
+            forget_heading(s, p)
+            turn_rad = heading_difference(as_quat(s.found_q_nb), q)
+            start_heading(s, s.heading_rad + turn_rad, found_heading_std(s) ** 2)
             s.heading_known = s.heading_true = 1
             refresh(s)
         return
     found = find(s, q)
-    forget_heading(s)
+    raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
+    forget_heading(s, p)
+    if s.at_rest == 1:
+        # Of a heading the GPS tells only its own noise then.
+        s.heading_known = 0
     if s.heading_known == 1:
         s.heading_true = 1
-        s.heading_var = s.heading_std * s.heading_std
+        start_heading(s, s.heading_rad, found_heading_std(s) ** 2)
     begin_level(s)
     # The level frame is NED turned about down by the heading; the gyroscope's frame stays.
     half = -0.5 * s.heading_rad
