@@ -23,18 +23,20 @@ from gateway.estimation.columns import (
     IMU_COLUMNS,
     MAG,
     NAV_ALT,
+    NAV_COLUMNS,
     NAV_FLAGS,
     NAV_LAT,
     NAV_QUAT,
     NAV_VEL,
     GpsRow,
+    nav_row,
 )
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.paper.paper import PaperEstimator
 from gateway.estimation.select import make_estimator
 from gateway.estimation.smoothing.smoother import smooth
-from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample
+from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample, NavState
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 
@@ -104,7 +106,22 @@ def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None)
     if isinstance(estimator, PaperEstimator) and not np.any(np.diff(flight.time_us) < 0):
         out = estimator.run(flight.time_us, sensed.table, flight.fixes)
         return _track(flight, out[:, :4], out[:, 4:7], out[:, 7:10], out[:, 10])
-    return _fuse_by_sample(flight, estimator, sensed)
+    return track_of_states(_states_by_sample(flight, estimator, sensed))
+
+
+def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> FloatArray:
+    """Fuse a flight into all that the estimator tells.
+
+    Returns
+    -------
+    ndarray, shape (N, NAV_COLUMNS)
+        One row per IMU sample; see `gateway.estimation.columns`.
+    """
+    estimator = make_estimator(settings.estimation)
+    if isinstance(estimator, KernelEstimator):
+        return estimator.run(sample_log(flight, estimator.fix_row))
+    states = _states_by_sample(flight, estimator, sensed)
+    return np.array([nav_row(state) for state in states], np.float64).reshape(-1, NAV_COLUMNS)
 
 
 def fuse_smoothed(flight: Flight, settings: FusionSettings) -> FlightTrack:
@@ -169,7 +186,7 @@ def _track(
     return track.where_valid(flags.astype(np.int64))
 
 
-def _fuse_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> FlightTrack:
+def _states_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> list[NavState]:
     others: list[BaroSample | GpsFix] = [
         *flight.fixes,
         *(
@@ -191,4 +208,4 @@ def _fuse_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> Fli
                 estimator.update_baro(record)
             record = next(waiting, None)
         states.append(estimator.update_imu(sample))
-    return track_of_states(states)
+    return states

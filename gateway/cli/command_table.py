@@ -58,7 +58,8 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "Make a page of figures and tables of a flight: the paper's own, and more.",
     ),
     "sweep": CommandEntry(
-        "recorded.sweep", "Try settings on a flight, and write the best as a settings file."
+        "recorded.sweep",
+        "Try settings on one flight or many, and write the best as a settings file.",
     ),
     "record": CommandEntry(
         "live.record", "Start, stop, name, list and delete recordings.", RECORDINGS
@@ -79,6 +80,11 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "info": CommandEntry(
         "recorded.info",
         "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        RECORDINGS,
+    ),
+    "batch": CommandEntry(
+        "recorded.batch",
+        "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
         RECORDINGS,
     ),
     "hangar": CommandEntry(

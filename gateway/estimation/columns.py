@@ -152,3 +152,12 @@ def nav_state(time_us: int, row: FloatArray) -> NavState:
         pos_std_m=(v[19], v[20], v[21]),
         flags=_flags_of(int(v[NAV_FLAGS])),
     )
+
+
+def nav_row(state: NavState) -> list[float]:
+    """Write a navigation state as a row of `NAV_COLUMNS`: the reverse of `nav_state`."""
+    s = state
+    return [
+        *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
+        *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
+    ]  # fmt: skip

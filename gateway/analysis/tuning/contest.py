@@ -145,10 +145,16 @@ def with_value(settings: Any, key: str, value: Value) -> Any:
 
 def settings_at(contest: Contest, values: Sequence[Value]) -> FusionSettings:
     """Put the values of one trial into the settings."""
-    settings: FusionSettings = contest.fusion
-    for key, value in zip(contest.keys, values, strict=True):
-        settings = with_value(settings, key, value)
-    return settings
+    return with_values(contest.fusion, contest.keys, values)
+
+
+def with_values(
+    fusion: FusionSettings, keys: Sequence[str], values: Sequence[Value]
+) -> FusionSettings:
+    """Put values into settings by their keys; raises SweepError as `with_value`."""
+    for key, value in zip(keys, values, strict=True):
+        fusion = with_value(fusion, key, value)
+    return fusion
 
 
 def make_contest(
@@ -182,11 +188,7 @@ def make_contest(
     SweepError
         If the keys belong to several estimators.
     """
-    named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
-    if len(named) > 1:
-        raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
-    if named:
-        fusion = with_value(fusion, ESTIMATOR_KEY, named.pop())
+    fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:
         # Not both: a comb through another comb leaves gaps, or nothing.
@@ -194,6 +196,21 @@ def make_contest(
     elif hold_out:
         keep = withhold(flight, hold_out)
     return Contest(flight, fusion, tuple(keys), make_judge(flight, keep))
+
+
+def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSettings:
+    """Choose the estimator that the keys belong to, if to one; raises SweepError if to several."""
+    named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
+    if len(named) > 1:
+        raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
+    return with_value(fusion, ESTIMATOR_KEY, named.pop()) if named else fusion
+
+
+def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
+    """Score a flight with settings that nothing was changed in, by the same fixes."""
+    judge = rejudged(contest.judge, fusion)
+    track = fuse(judge.fused, fusion)
+    return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
 
 
 class Trials:

@@ -1,7 +1,6 @@
 """`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
 
 import itertools
-import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -32,13 +31,12 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
 from gateway.estimation.alignment.gps_latency import estimate_latency
-from gateway.estimation.columns import NAV_COLUMNS
+from gateway.estimation.columns import NAV_COLUMNS, nav_row
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import ESTIMATORS
-from gateway.flightlog.table.row import NAV_COLUMNS as NAV_NAMES
-from gateway.flightlog.table.table import FORMAT_LINE, TableHeader, encode_header
+from gateway.flights.fused_rows import fused_lines
 from gateway.flights.reading import (
     FlightError,
     ReadOptions,
@@ -51,7 +49,7 @@ from gateway.flights.reading import (
 from gateway.flights.refusion import SETTLES
 from gateway.flights.smoothed import gather_samples, smooth_records, with_smoothed_estimator
 from gateway.output import check_output, write_new
-from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample, NavState
+from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample
 from gateway.replay import header_for, records_of
 from gateway.sensing.chain import SensorChain
 
@@ -59,9 +57,6 @@ Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 HEAD_LINES: Final = 20
-
-LINES: Final = 2000
-"""Lines that are written at once."""
 
 
 def register(app: typer.Typer) -> None:
@@ -136,7 +131,7 @@ def fuse_log(
         header = msgspec.structs.replace(
             header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
         )
-        write_new(out, _lines(header, time_us, states), overwrite=force, inputs=inputs)
+        write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
     tell_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
@@ -209,7 +204,7 @@ def fuse(
                 estimator.update_gps(record)
             case _:
                 times.append(record.time_us)
-                rows.append(_row(estimator.update_imu(_sample(chain, record))))
+                rows.append(nav_row(estimator.update_imu(_sample(chain, record))))
     return np.array(times, np.int64), np.array(rows, float).reshape(-1, NAV_COLUMNS)
 
 
@@ -224,13 +219,6 @@ def _sample(chain: SensorChain, record: ImuRaw | ImuCalibrated) -> ImuSample:
         record.temperature_degc,
         record.flags,
     )
-
-
-def _row(s: NavState) -> list[float]:
-    return [
-        *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
-        *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
-    ]  # fmt: skip
 
 
 def _facts_of(path: Path) -> dict[str, float]:
@@ -269,17 +257,3 @@ def _adjusted(
     except msgspec.ValidationError as error:
         raise FlightError(f"what the file's # line says cannot be: {error}") from error
     return msgspec.structs.replace(aircraft, estimation=estimation)
-
-
-def _lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
-    """Write a table of states alone; what is not known is left blank."""
-    yield f"{FORMAT_LINE}\n{encode_header(header)}time_us,{','.join(NAV_NAMES)}\n".encode()
-    for begin in range(0, len(time_us), LINES):
-        chunk = slice(begin, begin + LINES)
-        yield "".join(map(_line, time_us[chunk].tolist(), states[chunk].tolist())).encode()
-
-
-def _line(time_us: int, values: list[float]) -> str:
-    *figures, flags = values
-    cells = ["" if math.isnan(value) else repr(value) for value in figures]
-    return f"{time_us},{time_us},{','.join(cells)},{int(flags)}\n"

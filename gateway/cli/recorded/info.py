@@ -1,7 +1,6 @@
 """`mavgate info` and `mavgate recover`: what a recording holds, and what can be saved of it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -25,12 +24,11 @@ from gateway.edges.disk.recording_streams import (
     FileKind,
     Progress,
     kind_of,
-    other_format,
     read_batches,
     read_events,
 )
 from gateway.flightlog.moment import civil_time
-from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary, VehicleInfo
+from gateway.flightlog.summary import FileInfo, VehicleInfo
 from gateway.flightlog.table.table import (
     TableFault,
     TableHeader,
@@ -39,14 +37,8 @@ from gateway.flightlog.table.table import (
     encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flights.reading import (
-    NO_RECORDING,
-    FlightError,
-    ReadOptions,
-    is_table,
-    open_rows,
-    shifted,
-)
+from gateway.flights.describing import describe
+from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions
 from gateway.output import write_new
 from gateway.units import US_PER_S
 
@@ -116,52 +108,6 @@ def recover(
         console.print(f"and {len(left_out) - SHOWN} more places")
     verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
     console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
-
-
-def describe(file: Path, options: ReadOptions) -> FileInfo:
-    """Sum up a recording.
-
-    Parameters
-    ----------
-    file : Path
-        A tlog, a table, or what can be read as one.
-    options : ReadOptions
-        Column map; its progress is called with how many more bytes were read.
-
-    Returns
-    -------
-    FileInfo
-
-    Raises
-    ------
-    FlightError
-        If it is none of these.
-    OSError
-        If it cannot be read.
-    """
-    kind, size, advance = kind_of(file), file.stat().st_size, options.progress
-    if kind is FileKind.TLOG:
-        tlog = TlogSummary()
-        for batch in read_batches(file, advance):
-            tlog.add(batch)
-        found = tlog.result(size)
-        if not found.records:
-            raise FlightError(f"{file}: {NO_RECORDING}")
-        return found
-    table, reader = TableSummary(), TableReader()
-    if kind in (FileKind.FOREIGN, FileKind.OTHER):
-        foreign = open_rows(file, options)
-        own = is_table(file)
-        zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
-        for row in foreign.rows:
-            table.add([*shifted(row, zero_us)], foreign.header)
-        name = other_format(file) if kind is FileKind.OTHER else kind.value
-        header = foreign.header if own else None
-        remarks = tuple(foreign.remarks)
-        return replace(table.result(size), kind=name, header=header, remarks=remarks)
-    for event in read_events(file, reader, advance):
-        table.add([event], reader.header)
-    return table.result(size)
 
 
 def _sound_records(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:

@@ -1,17 +1,19 @@
-"""`mavgate sweep`: try settings on a flight, and write the best as a settings file."""
+"""`mavgate sweep`: try settings on flights, and write the best as a settings file."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from gateway.cli.support.loading import FlightArgument, Loading, ReferenceOption, SystemOption
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.loading import Loading, ReferenceOption, SystemOption
 from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
 from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
     or_refuse,
 )
+from gateway.season.batch.storage import is_url
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 
@@ -22,7 +24,14 @@ def register(app: typer.Typer) -> None:
 
 
 def sweep(
-    flight: FlightArgument = None,
+    flights: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Recordings by name, CSV files or tlogs, or a folder; by default the built-in "
+            "simulated flight.",
+            show_default=False,
+        ),
+    ] = None,
     *,
     alpha: Annotated[
         str | None, typer.Option(help="Weight of the acceleration: 0.1:0.9:9 or 0.1,0.5.")
@@ -63,20 +72,31 @@ def sweep(
     config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Try settings on a flight, and write the best as a settings file.
+    """Try settings on one flight or many, and write the best as a settings file.
 
     Without a flight the built-in simulated one is taken. The filter is run causally; fixes that
-    it never sees judge it.
+    it never sees judge it. Of many flights, those of other aircraft and days judge what was chosen.
     """
     # It loads pandas and the optimisers, which no other command should wait for.
     from gateway.cli.support.sweeping import SweepOptions, run_sweep
 
     current = or_refuse(lambda: load_settings(config))
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
+    options = SweepOptions(
+        named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
+    )
+    given = flights or []
+    if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
+        from gateway.cli.season.season_sweeping import run_season_sweep
+        from gateway.cli.season.season_work import SeasonWork, season_options
+
+        if reference is not None or system is not None:
+            refuse("--reference and --system belong to one flight")
+        read = season_options(config, columns, settings)
+        run_season_sweep(SeasonWork(given, config, jobs), read, current, options)
+        return
     run_sweep(
-        flight,
+        Path(given[0]) if given else None,
         Loading(current, settings, columns, system, reference),
-        SweepOptions(
-            named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
-        ),
+        options,
     )

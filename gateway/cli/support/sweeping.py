@@ -73,7 +73,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             if out is not None:
                 check_output(out, [path], overwrite=options.overwrite)
     try:
-        axes = _axes(options)
+        axes = parse_axes(options)
         flight = load_flight(path, loading)
         contest = sweeping.make_contest(
             flight,
@@ -102,7 +102,8 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
 
 
-def _axes(options: SweepOptions) -> list[Axis]:
+def parse_axes(options: SweepOptions) -> list[Axis]:
+    """Read what is varied; raises SweepError if it cannot be."""
     wanted = list(options.named)
     for item in options.vary:
         name, equals, text = item.partition("=")

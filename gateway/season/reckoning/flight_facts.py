@@ -17,6 +17,8 @@ POINT_US: Final = US_PER_S // 10
 """Positions nearer in time than this tell nothing new of a flight."""
 SILENCE_STEPS: Final = 2.5
 """So many usual intervals without a fix are an outage, where fixes come seldom."""
+EARLIEST_US: Final = 315_532_800 * US_PER_S
+"""1980, when GPS began: what is earlier counts from the start of a clock."""
 LOST_STEP: Final = 1.5
 """So many usual intervals between two samples are a loss."""
 
@@ -138,8 +140,8 @@ class FlightTally:
 
 
 def began_text(unix_us: int | None) -> str | None:
-    """Write a civil time as the catalogue does; None if it is of no day of the calendar."""
-    moment = None if unix_us is None else civil_time(unix_us)
+    """Write a civil time as the catalogue does; None if it can be none."""
+    moment = None if unix_us is None or unix_us < EARLIEST_US else civil_time(unix_us)
     return None if moment is None else f"{moment:%Y-%m-%d %H:%M:%S}"
 
 

@@ -1,0 +1,239 @@
+"""`mavgate batch`: one work on many recordings, here or on a cluster."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+import typer
+
+from gateway.cli.season.season_work import (
+    JobsOption,
+    SchedulerOption,
+    SeasonFiles,
+    SeasonWork,
+    failures,
+    season_options,
+)
+from gateway.cli.support.errors import how_to_add, refuse
+from gateway.cli.support.recording_options import (
+    PANEL,
+    ColumnsOption,
+    ForceOption,
+    SettingsOption,
+    refusing,
+)
+from gateway.cli.support.settings_options import ConfigOption, read_settings
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.output import write_new
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from gateway.season.batch.flight_tasks import FlightResult
+    from gateway.season.reckoning.season_errors import Versus
+
+FAILED: Final = 1
+"""What the command ends with where a recording failed."""
+FLIGHTS_CSV: Final = "flights.csv"
+BEST_TOML: Final = "best.toml"
+SWEEP_CSV: Final = "sweep.csv"
+FOR_PAGES: Final = ("jinja2", "matplotlib")
+
+Metric = Literal["held", "interpolated", "reference", "attitude"]
+
+group = typer.Typer(
+    help="Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+    no_args_is_help=True,
+)
+
+OutputOption = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", help="Folder of the results; what is done there is not done again."
+    ),
+]
+AgainstOption = Annotated[
+    Path | None,
+    typer.Option("--against", help="Folder of the results of another version, to compare with."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.add_typer(group, name="batch", rich_help_panel=PANEL)
+
+
+@group.command()
+def fuse(
+    files: SeasonFiles,
+    *,
+    output: OutputOption,
+    against: AgainstOption = None,
+    columns: ColumnsOption = None,
+    settings: SettingsOption = "recorded",
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Fuse many recordings with every estimator, judge each by withheld fixes, make one page."""
+    from gateway.season.batch.flight_tasks import FuseTask
+
+    work = SeasonWork(files, config, jobs, scheduler)
+    task = FuseTask(season_options(config, columns, settings))
+    _finish(work.run(task, work.items(), output), output, against)
+
+
+@group.command()
+def report(
+    files: SeasonFiles,
+    *,
+    output: OutputOption,
+    against: AgainstOption = None,
+    columns: ColumnsOption = None,
+    settings: SettingsOption = "recorded",
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Make the page of each of many recordings, and one of the season."""
+    from gateway.season.batch.flight_tasks import ReportTask
+
+    if not _can_make_pages():
+        refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
+    work = SeasonWork(files, config, jobs, scheduler)
+    task = ReportTask(season_options(config, columns, settings))
+    _finish(work.run(task, work.items(), output), output, against)
+
+
+@group.command()
+def info(
+    files: SeasonFiles,
+    *,
+    output: OutputOption,
+    columns: ColumnsOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Tell what each of many files holds, one by one, as `mavgate info` does."""
+    from gateway.season.batch.flight_tasks import InfoTask
+    from gateway.season.batch.season_page import flight_table
+
+    work = SeasonWork(files, config, jobs, scheduler)
+    task = InfoTask(season_options(config, columns, "recorded"))
+    results = work.run(task, work.items(each_file=True), output)
+    grid = table_of("recording", "aircraft", "began (UTC)", "s", "km", "gaps", "damaged", left=1)
+    for result in results:
+        figures = result.figures
+        if result.error is not None:
+            continue
+        km = sum(vehicle["distance_m"] for vehicle in figures["vehicles"]) / 1000.0
+        grid.add_row(
+            result.place.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
+            f"{figures['duration_s']:.0f}", f"{km:.2f}", str(len(figures["gaps"])),
+            str(figures["damaged_bytes"]),
+        )  # fmt: skip
+    console_of().print(grid)
+    with refusing():
+        rows = flight_table(results).to_csv(index=False).encode()
+        write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
+    _end(results)
+
+
+@group.command()
+def sweep(
+    files: SeasonFiles,
+    *,
+    vary: Annotated[
+        list[str],
+        typer.Option(help="alpha=0.1:0.9:9, gps_latency_s=0:0.4:9, estimator=eskf,paper, …"),
+    ],
+    output: OutputOption,
+    metric: Annotated[Metric, typer.Option(help="What judges, as for `mavgate sweep`.")] = "held",
+    hold_out: Annotated[
+        int, typer.Option(help="Withhold every so many-th fix; 0 for none.", min=0)
+    ] = 5,
+    gps_interval: Annotated[
+        float, typer.Option(help="Fuse one fix in so many seconds; 0 for all.", min=0.0)
+    ] = 0.0,
+    columns: ColumnsOption = None,
+    settings: SettingsOption = "recorded",
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    config: ConfigOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Find one set of settings for many flights; those of other days judge what was chosen."""
+    from gateway.cli.season.season_sweeping import run_season_sweep
+    from gateway.cli.support.sweeping import SweepOptions
+
+    work = SeasonWork(files, config, jobs, scheduler)
+    options = SweepOptions(
+        [], vary, 0, metric, hold_out, gps_interval, jobs, output / BEST_TOML, output / SWEEP_CSV,
+        force,
+    )  # fmt: skip
+    read = season_options(config, columns, settings)
+    _end(run_season_sweep(work, read, read_settings(config), options, output))
+
+
+def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | None) -> None:
+    """Show the season as a table, and write its page."""
+    from gateway.season.batch.season_page import errors_of, flight_table, write_season_page
+    from gateway.season.reckoning.season_errors import errors_by_group
+
+    compared = None if against is None else _compare(results, against)
+    grid = table_of(
+        "aircraft", "estimator", "flights", "median, m", "9 in 10, m", "worst, m", left=2
+    )
+    for row in errors_by_group(errors_of(results)):
+        grid.add_row(
+            "all" if row.vehicle is None else str(row.vehicle), row.estimator, str(row.flights),
+            f"{row.median_m:.3f}", f"{row.most_m:.3f}", f"{row.worst_m:.3f}",
+        )  # fmt: skip
+    console = console_of()
+    console.print(grid)
+    if compared is not None:
+        _show_versus(compared)
+    with refusing():
+        rows = flight_table(results).to_csv(index=False).encode()
+        write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
+        if _can_make_pages():
+            print(write_season_page(results, output, compared))
+        else:
+            print(output / FLIGHTS_CSV)
+            console.print(f"a page needs the extra mavgate[plot]:\n{how_to_add('plot')}")
+    _end(results)
+
+
+def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
+    from gateway.season.batch.result_folder import read_results
+    from gateway.season.batch.season_page import errors_of
+    from gateway.season.reckoning.season_errors import versus
+
+    with refusing():
+        found = versus(errors_of(results), errors_of([*read_results(against)]))
+    if not found.compared:
+        refuse(f"{against}: holds no result of any of these recordings")
+    return found
+
+
+def _show_versus(compared: "Versus") -> None:
+    console = console_of()
+    for estimator, lead in compared.leads.items():
+        console.print(f"{estimator} against the other results: {lead.text}", markup=False)
+    for change in compared.worse:
+        console.print(
+            f"worse: {change.place}, {change.estimator}: {change.before_m:.3f} m before, "
+            f"{change.after_m:.3f} m now",
+            markup=False,
+        )
+
+
+def _end(results: "Sequence[FlightResult]") -> None:
+    if count := failures(results):
+        console_of(stderr=True).print(f"{count} of {len(results)} recordings failed")
+        raise typer.Exit(FAILED)
+
+
+def _can_make_pages() -> bool:
+    return all(find_spec(name) is not None for name in FOR_PAGES)

@@ -1,0 +1,1 @@
+"""What the commands over many recordings share."""

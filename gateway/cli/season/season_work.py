@@ -1,0 +1,152 @@
+"""Many recordings as a command: where they are, who does the work, how far it is."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gateway.cli.support.errors import how_to_add, refuse
+from gateway.cli.support.named_recordings import Wanted, files_of, recordings_folder
+from gateway.cli.support.recording_options import read_column_map, refusing
+from gateway.cli.support.settings_options import pipeline_settings, read_settings
+from gateway.cli.support.terminal import console_of
+from gateway.flights.reading import ReadOptions, SettingsChoice
+from gateway.season.batch.dask_executor import ClusterError, DaskCluster, has_dask
+from gateway.season.batch.flight_tasks import FlightResult, FlightTask, warm_up, without_secrets
+from gateway.season.batch.result_folder import ResultFolder
+from gateway.season.batch.season_run import run_season
+from gateway.season.batch.storage import BatchItem, StorageError, has_fsspec, is_url, items_of
+from gateway.season.executors import Executor, LocalProcesses
+
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", help="Work on a Dask cluster: tcp://HOST:8786.", show_default=False
+    ),
+]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", help="Processes here; one a core by default.", min=1)
+]
+SeasonFiles = Annotated[
+    list[str],
+    typer.Argument(
+        help="Recordings by name or file, folders of them, and URLs: s3://, gs://, sftp://, …",
+        show_default=False,
+    ),
+]
+
+SHOWN: Final = 12
+"""Failures that are told one by one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeasonWork:
+    """Which recordings, and who works on them."""
+
+    names: Sequence[str]
+    config: Path | None
+    jobs: int | None = None
+    scheduler: str | None = None
+
+    def items(self, *, each_file: bool = False) -> list[BatchItem]:
+        """Find the recordings; what is not there ends the command."""
+        if any(map(is_url, self.names)) and not has_fsspec():
+            refuse(f"URLs need fsspec, the extra mavgate[batch]:\n{how_to_add('batch')}")
+        wanted: Wanted = "all" if each_file else "tables"
+        names: list[str] = []
+        with refusing():
+            for name in self.names:
+                if is_url(name):
+                    names.append(name)
+                    continue
+                folder = recordings_folder(self.config)
+                found = [*map(str, files_of([Path(name).expanduser()], folder, wanted))]
+                names += found
+        try:
+            items = items_of(names, each_file=each_file)
+        except (StorageError, OSError) as error:
+            refuse(str(error))
+        if not items:
+            refuse(f"{', '.join(self.names)}: no recording is there")
+        return items
+
+    @contextmanager
+    def executor(self) -> Iterator[Executor]:
+        """Have somebody who does the work; a cluster that cannot be used ends the command."""
+        if self.scheduler is None:
+            console = console_of(stderr=True)
+            # After an upgrade the compiler works for a minute: once, and not in every process.
+            with console.status("making the estimators ready"):
+                warm_up()
+            yield LocalProcesses(self.jobs)
+            return
+        if not has_dask():
+            refuse(f"--scheduler needs Dask, the extra mavgate[batch]:\n{how_to_add('batch')}")
+        try:
+            cluster = DaskCluster(self.scheduler)
+        except ClusterError as error:
+            refuse(str(error))
+        try:
+            yield cluster
+        finally:
+            cluster.close()
+
+    def run(
+        self, task: FlightTask, items: Sequence[BatchItem], output: Path | None
+    ) -> list[FlightResult]:
+        """Do a task on all, with a bar, and tell what failed."""
+        console = console_of(stderr=True)
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )  # fmt: skip
+        with refusing():
+            folder = None if output is None else ResultFolder(output)
+        # No thread of its own: processes are forked while it shows.
+        with self.executor() as executor, Progress(
+            *columns, console=console, transient=True, auto_refresh=False,
+            disable=not console.is_terminal,
+        ) as progress, refusing():  # fmt: skip
+            bar = progress.add_task(task.name, total=len(items))
+
+            def tell(what: str, done: int, total: int) -> None:
+                text = f"{task.name}: {what.rsplit('/', 1)[-1][-40:]}"
+                progress.update(bar, description=text, completed=done, total=total, refresh=True)
+
+            results = run_season(task, items, executor, folder, tell)
+        _tell_failures(results)
+        return results
+
+
+def season_options(
+    config: Path | None, columns: Path | None, choice: SettingsChoice
+) -> ReadOptions:
+    """Take what reads a season's flights out of the settings; nothing that must stay secret."""
+    with refusing():
+        return without_secrets(
+            ReadOptions(
+                pipeline_settings(read_settings(config)),
+                choice=choice,
+                columns=read_column_map(columns),
+            )
+        )
+
+
+def failures(results: Sequence[FlightResult]) -> int:
+    """Count the recordings that there are no figures of."""
+    return sum(result.error is not None for result in results)
+
+
+def _tell_failures(results: Sequence[FlightResult]) -> None:
+    console = console_of(stderr=True)
+    failed = [result for result in results if result.error is not None]
+    for result in failed[:SHOWN]:
+        text = result.error or ""
+        told = text if text.startswith(result.place) else f"{result.place}: {text}"
+        console.print(told, style="red", markup=False)
+    if len(failed) > SHOWN:
+        console.print(f"and {len(failed) - SHOWN} more that failed")

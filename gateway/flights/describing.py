@@ -1,0 +1,68 @@
+"""Any recording summed up: what `mavgate info` tells of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from gateway.edges.disk.recording_streams import (
+    FileKind,
+    kind_of,
+    other_format,
+    read_batches,
+    read_events,
+)
+from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary
+from gateway.flightlog.table.table import TableReader
+from gateway.flights.reading import (
+    NO_RECORDING,
+    FlightError,
+    ReadOptions,
+    is_table,
+    open_rows,
+    shifted,
+)
+
+
+def describe(file: Path, options: ReadOptions) -> FileInfo:
+    """Sum up a recording.
+
+    Parameters
+    ----------
+    file : Path
+        A tlog, a table, or what can be read as one.
+    options : ReadOptions
+        Column map; its progress is called with how many more bytes were read.
+
+    Returns
+    -------
+    FileInfo
+
+    Raises
+    ------
+    FlightError
+        If it is none of these.
+    OSError
+        If it cannot be read.
+    """
+    kind, size, advance = kind_of(file), file.stat().st_size, options.progress
+    if kind is FileKind.TLOG:
+        tlog = TlogSummary()
+        for batch in read_batches(file, advance):
+            tlog.add(batch)
+        found = tlog.result(size)
+        if not found.records:
+            raise FlightError(f"{file}: {NO_RECORDING}")
+        return found
+    table, reader = TableSummary(), TableReader()
+    if kind in (FileKind.FOREIGN, FileKind.OTHER):
+        foreign = open_rows(file, options)
+        own = is_table(file)
+        zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
+        for row in foreign.rows:
+            table.add([*shifted(row, zero_us)], foreign.header)
+        name = other_format(file) if kind is FileKind.OTHER else kind.value
+        header = foreign.header if own else None
+        remarks = tuple(foreign.remarks)
+        return replace(table.result(size), kind=name, header=header, remarks=remarks)
+    for event in read_events(file, reader, advance):
+        table.add([event], reader.header)
+    return table.result(size)

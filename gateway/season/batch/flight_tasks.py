@@ -1,0 +1,321 @@
+"""What can be done to each recording of a season: the same here and on any machine."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from gateway import __version__
+from gateway.analysis.case import Case, make_case
+from gateway.analysis.flight_arrays import Flight, FusionSettings, flight_of_records
+from gateway.analysis.fusion import fuse_states
+from gateway.analysis.key_figures import summarise, withheld_error_m
+from gateway.analysis.sources import flight_of_rows
+from gateway.analysis.tuning.contest import Axis, SweepError, Trials, base_score, grid, make_contest
+from gateway.edges.disk.recordings import recording_name
+from gateway.flights.describing import describe
+from gateway.flights.fused_rows import fused_lines
+from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, joined_rows, open_rows
+from gateway.records import ImuCalibrated, ImuFlags, NodeId
+from gateway.replay import header_for
+from gateway.season.batch.storage import BatchItem, StorageError, local_files
+from gateway.season.reckoning.flight_facts import began_text
+from gateway.sensing.calibration import NodeCalibration
+
+HELD: Final = "held_m"
+"""Errors at the withheld fixes, by estimator."""
+
+
+class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What came out for one recording, as it is kept."""
+
+    place: str
+    """Path or URL of its first file."""
+    digest: str
+    key: str
+    """Of file, task, settings and version together."""
+    task: str
+    version: str
+    vehicle: int | None = None
+    began: str | None = None
+    error: str | None = None
+    """Why there are no figures."""
+    figures: dict[str, Any] = {}
+    """JSON alone."""
+    files: tuple[str, ...] = ()
+    """What was written, from the folder of the results on."""
+
+
+Files = Mapping[str, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Worked:
+    """What a task gives for one recording."""
+
+    vehicle: int | None
+    began: str | None
+    figures: dict[str, Any]
+    files: Files = field(default_factory=dict)
+
+
+class FlightTask(Protocol):
+    """One work on one recording."""
+
+    @property
+    def name(self) -> str:
+        """Of the command."""
+        ...
+
+    @property
+    def fingerprint(self) -> bytes:
+        """All that changes what comes out, but for the recording and the version."""
+        ...
+
+    def do(self, files: list[Path], name: str) -> Worked:
+        """Do it.
+
+        Parameters
+        ----------
+        files : list of Path
+            The recording's.
+        name : str
+            What it is called, for what is written.
+
+        Raises
+        ------
+        FlightError, OSError, ValueError
+            If there is no flight in it.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class FuseTask:
+    """Fuse with every estimator, judge each by withheld fixes, write the settings' own states."""
+
+    options: ReadOptions
+    name: str = "fuse"
+
+    @property
+    def fingerprint(self) -> bytes:
+        """See `FlightTask`."""
+        return options_bytes(self.options)
+
+    def do(self, files: list[Path], name: str) -> Worked:
+        """See `FlightTask`."""
+        read = read_season_flight(files, self.options, name)
+        case = make_case(read.flight)
+        states = fuse_states(read.flight, case.fusion, case.sensed)
+        lines = fused_lines(read.header, read.flight.time_us, states)
+        written = {f"fused/{name}.csv": b"".join(lines)}
+        return Worked(read.vehicle, read.began, _figures(case), written)
+
+
+@dataclass(frozen=True)
+class ReportTask:
+    """Make the page of each flight."""
+
+    options: ReadOptions
+    name: str = "report"
+
+    @property
+    def fingerprint(self) -> bytes:
+        """See `FlightTask`."""
+        return options_bytes(self.options)
+
+    def do(self, files: list[Path], name: str) -> Worked:
+        """See `FlightTask`."""
+        # They need what may be missing, and load for a second.
+        from gateway.analysis.reporting.compose import make_report
+        from gateway.analysis.reporting.page import write_report
+
+        read = read_season_flight(files, self.options, name)
+        case = make_case(read.flight)
+        with TemporaryDirectory(prefix="mavgate-") as folder:
+            write_report(make_report(case), Path(folder), jobs=1)
+            pages = sorted(Path(folder).iterdir())
+            written = {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
+        return Worked(read.vehicle, read.began, _figures(case), written)
+
+
+@dataclass(frozen=True)
+class SweepTask:
+    """Score every point of a grid of settings."""
+
+    options: ReadOptions
+    axes: tuple[Axis, ...]
+    metric_column: str
+    hold_out: int
+    interval_s: float
+    name: str = "sweep"
+
+    @property
+    def fingerprint(self) -> bytes:
+        """See `FlightTask`."""
+        axes = [(axis.key, axis.values) for axis in self.axes]
+        asked = (axes, self.metric_column, self.hold_out, self.interval_s)
+        return options_bytes(self.options) + msgspec.json.encode(asked)
+
+    def do(self, files: list[Path], name: str) -> Worked:
+        """See `FlightTask`."""
+        read = read_season_flight(files, self.options, name)
+        flight = read.flight
+        contest = make_contest(
+            flight,
+            flight.fusion,
+            [axis.key for axis in self.axes],
+            hold_out=self.hold_out,
+            interval_s=self.interval_s,
+        )
+        trials = Trials(contest)
+        scores = [trials.run(values)[self.metric_column] for values in grid(self.axes)]
+        base = base_score(contest, flight.fusion)[self.metric_column]
+        told = [None if score != score else score for score in (base, *scores)]
+        return Worked(read.vehicle, read.began, {"base": told[0], "scores": told[1:]})
+
+
+@dataclass(frozen=True)
+class InfoTask:
+    """Tell what is in each file."""
+
+    options: ReadOptions
+    name: str = "info"
+
+    @property
+    def fingerprint(self) -> bytes:
+        """See `FlightTask`."""
+        return options_bytes(self.options)
+
+    def do(self, files: list[Path], name: str) -> Worked:  # noqa: ARG002
+        """See `FlightTask`."""
+        (file,) = files
+        found = describe(file, self.options)
+        zero_us = 0 if found.header is None else found.header.unix_us_at_zero
+        first_us = found.first_us
+        began = None if zero_us is None or first_us is None else zero_us + first_us
+        vehicle = found.vehicles[0].system_id if found.vehicles else None
+        figures = msgspec.to_builtins(replace(found, header=None))
+        return Worked(vehicle, began_text(began), figures)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFlight:
+    """A flight, and what its file tells beside the samples."""
+
+    flight: Flight
+    header: Any
+    vehicle: int
+    began: str | None
+
+
+def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
+    """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
+    table = joined_rows([open_rows(file, options) for file in files])
+    aircraft = aircraft_of(table, options)
+    fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+    flight = flight_of_rows(
+        table.plain_rows, aircraft.calibration, fusion, name=name, story="One of a season."
+    )
+    known = table.header
+    header = msgspec.structs.replace(
+        header_for(aircraft, known.vehicle_id),
+        session=known.session,
+        unix_us_at_zero=known.unix_us_at_zero,
+    )
+    zero_us = known.unix_us_at_zero
+    began = None if zero_us is None else zero_us + int(flight.time_us[0])
+    return ReadFlight(flight, header, known.vehicle_id, began_text(began))
+
+
+def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[FlightResult, Files]:
+    """Do a task on one recording; whatever is wrong with it stands in the result.
+
+    Parameters
+    ----------
+    task : FlightTask
+    known : tuple
+        The recording, its digest, its key, and the name for what is written.
+    """
+    item, digest, key, name = known
+    result = FlightResult(
+        place=item.place, digest=digest, key=key, task=task.name, version=__version__
+    )
+    try:
+        with local_files(item) as files:
+            worked = task.do(files, name)
+    except SweepError:
+        # It is the question that is wrong, not the recording.
+        raise
+    except (FlightError, StorageError, ValueError) as error:
+        return msgspec.structs.replace(result, error=str(error) or type(error).__name__), {}
+    return (
+        msgspec.structs.replace(
+            result,
+            vehicle=worked.vehicle,
+            began=worked.began,
+            figures=worked.figures,
+            files=tuple(worked.files),
+        ),
+        worked.files,
+    )
+
+
+def options_bytes(options: ReadOptions) -> bytes:
+    """Write down how flights are read, so that it can be told whether it was the same."""
+    current = options.current
+    told = {
+        "default": current.default,
+        "aircraft": {str(number): own for number, own in sorted(current.aircraft.items())},
+        "choice": options.choice,
+        "columns": options.columns,
+        "system": options.system_id,
+    }
+    return msgspec.json.encode(told, order="sorted")
+
+
+def without_secrets(options: ReadOptions) -> ReadOptions:
+    """Take out what no other machine needs to know: the passphrase that signs."""
+    current = options.current
+
+    def plain(aircraft: Any) -> Any:
+        vehicle = msgspec.structs.replace(aircraft.vehicle, signing_passphrase="")
+        return msgspec.structs.replace(aircraft, vehicle=vehicle)
+
+    stripped = replace(
+        current,
+        default=plain(current.default),
+        aircraft={number: plain(own) for number, own in current.aircraft.items()},
+    )
+    return replace(options, current=stripped, progress=None)
+
+
+def name_of(item: BatchItem) -> str:
+    """Return what a recording is called in the folder of the results."""
+    name = recording_name(Path(item.place))
+    for ending in (".gz", ".csv", ".tlog"):
+        name = name.removesuffix(ending)
+    return name
+
+
+def _figures(case: Case) -> dict[str, Any]:
+    """Sum one flight up; what is not known is left out, for JSON has no word for it."""
+    known = {name: value for name, value in summarise(case).items() if value == value}
+    held = {name: withheld_error_m(case, name) for name in case.tracks}
+    return {"summary": known, HELD: {name: m for name, m in held.items() if m == m}}
+
+
+def warm_up() -> None:
+    """Have the estimators' machine code in this process, and so in all that are forked from it."""
+    node = NodeId(1, 0)
+    records = [
+        ImuCalibrated(time_us, node, (0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0))
+        for time_us in range(0, 30_000, 10_000)
+    ]
+    flight = flight_of_records(
+        records, NodeCalibration(), name="warm-up", story="", fusion=FusionSettings()
+    )
+    make_case(flight)

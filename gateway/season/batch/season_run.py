@@ -1,0 +1,113 @@
+"""One task over many recordings: what is done already is left, the rest goes to the executor."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from hashlib import sha256
+
+import msgspec
+
+from gateway import __version__
+from gateway.season.batch.flight_tasks import FlightResult, FlightTask, name_of, work_on
+from gateway.season.batch.result_folder import ResultFolder
+from gateway.season.batch.storage import BatchItem, digest_of_item
+from gateway.season.executors import Executor, WorkFailed
+
+Tell = Callable[[str, int, int], None]
+"""Called with what was done last, how many are done, and of how many."""
+
+
+def run_season(
+    task: FlightTask,
+    items: Sequence[BatchItem],
+    executor: Executor,
+    folder: ResultFolder | None,
+    tell: Tell,
+) -> list[FlightResult]:
+    """Do a task on every recording that it is not done on yet.
+
+    Parameters
+    ----------
+    task : FlightTask
+    items : sequence of BatchItem
+    executor : Executor
+        Does the work.
+    folder : ResultFolder or None
+        Where results are kept, and found again; None to keep nothing.
+    tell : callable
+        For a progress bar.
+
+    Returns
+    -------
+    list of FlightResult
+        One an item, in their order. What failed for a reason that may pass, such as a machine that
+        died, is not kept and will be tried again.
+    """
+    found: list[FlightResult | None] = [None] * len(items)
+    todo: list[tuple[BatchItem, str, str, str]] = []
+    numbers: list[int] = []
+    digests = _digests(items, executor, tell)
+    names = _names(items, digests)
+    for number, (item, digest) in enumerate(zip(items, digests, strict=True)):
+        if isinstance(digest, WorkFailed):
+            found[number] = _failed(task, item, "", "", digest)
+            continue
+        key = _key(task, digest)
+        kept = folder.find(key) if folder is not None else None
+        if kept is not None:
+            found[number] = msgspec.structs.replace(kept, place=item.place)
+        else:
+            todo.append((item, digest, key, names[number]))
+            numbers.append(number)
+    done = len(items) - len(todo)
+    for place, outcome in executor.run(partial(work_on, task), todo):
+        item, digest, key, _ = todo[place]
+        if isinstance(outcome, WorkFailed):
+            result = _failed(task, item, digest, key, outcome)
+        else:
+            result, files = outcome
+            if result.version != __version__:
+                reason = WorkFailed(f"done by mavgate {result.version}; here is {__version__}")
+                result = _failed(task, item, digest, key, reason)
+            elif folder is not None:
+                folder.keep(result, files)
+        found[numbers[place]] = result
+        done += 1
+        tell(item.place, done, len(items))
+    return [result for result in found if result is not None]
+
+
+def _digests(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[str | WorkFailed]:
+    found: list[str | WorkFailed] = [""] * len(items)
+    for done, (number, outcome) in enumerate(executor.run(digest_of_item, items), 1):
+        found[number] = outcome
+        tell("looking for changes", done, len(items))
+    return found
+
+
+def _names(items: Sequence[BatchItem], digests: Sequence[str | WorkFailed]) -> list[str]:
+    """Name what is written; where two recordings have one name, with a part of their digests."""
+    names = [name_of(item) for item in items]
+    often = Counter(names)
+    return [
+        f"{name}-{digest[:8]}" if often[name] > 1 and isinstance(digest, str) else name
+        for name, digest in zip(names, digests, strict=True)
+    ]
+
+
+def _key(task: FlightTask, digest: str) -> str:
+    told = "\n".join((task.name, digest, __version__)).encode()
+    return sha256(told + b"\n" + task.fingerprint).hexdigest()[:32]
+
+
+def _failed(
+    task: FlightTask, item: BatchItem, digest: str, key: str, failure: WorkFailed
+) -> FlightResult:
+    return FlightResult(
+        place=item.place,
+        digest=digest,
+        key=key,
+        task=task.name,
+        version=__version__,
+        error=failure.reason,
+    )

@@ -1,0 +1,274 @@
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fsspec
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.app import app
+from gateway.flights.reading import ReadOptions
+from gateway.pipeline import PipelineSettings
+from gateway.season.batch.flight_tasks import FlightResult, FuseTask, without_secrets
+from gateway.season.batch.result_folder import RESULTS, ResultFolder
+from gateway.season.batch.season_run import run_season
+from gateway.season.batch.storage import StorageError, items_of
+from gateway.season.executors import LocalProcesses, WorkFailed
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
+FLIGHTS = ("alpha_01_v1.csv", "beta_01_v1.csv", "gamma_01_v2.csv", "delta_01_v2.csv")
+
+
+def run(*words: object) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["batch", *map(str, words)])
+    return done.exit_code, done.output
+
+
+def silent(what: str, done: int, total: int) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def fused(season: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
+    """The whole season fused by the command."""
+    out = tmp_path_factory.mktemp("out")
+    return out, *run("fuse", season, "-o", out, "--jobs", 2)
+
+
+def test_one_broken_file_stops_nothing_and_is_told(fused: tuple[Path, int, str]) -> None:
+    out, code, text = fused
+    assert code == 1
+    assert "broken.csv" in text
+    assert "1 of 5 recordings failed" in text
+    flights = pd.read_csv(out / "flights.csv")
+    assert flights["failed"].notna().sum() == 1
+    errors = flights.dropna(subset="complementary, m")
+    assert sorted(errors["recording"]) == sorted(FLIGHTS)
+    assert errors["complementary, m"].between(0.01, 5.0).all()
+    page = (out / "index.html").read_text()
+    assert "Errors by aircraft and estimator" in page
+    assert "broken.csv" in page
+
+
+def test_what_is_fused_is_what_the_command_fuses(
+    season: Path, fused: tuple[Path, int, str], tmp_path: Path
+) -> None:
+    single = tmp_path / "alone.csv"
+    words = ["fuse", str(season / "alpha_01_v1.csv"), "-o", str(single)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert (fused[0] / "fused" / "alpha.csv").read_bytes() == single.read_bytes()
+
+
+def test_what_is_done_is_not_done_again(season: Path, fused: tuple[Path, int, str]) -> None:
+    out, _, _ = fused
+    before = {path: path.stat().st_mtime_ns for path in (out / RESULTS).iterdir()}
+    assert len(before) == 5
+    (out / "fused" / "beta.csv").unlink()
+    code, _ = run("fuse", season, "-o", out, "--jobs", 1)
+    after = {path: path.stat().st_mtime_ns for path in (out / RESULTS).iterdir()}
+    changed = [path for path in after if after[path] != before[path]]
+    assert code == 1
+    assert [json.loads(path.read_bytes())["files"] for path in changed] == [["fused/beta.csv"]]
+
+
+def test_other_settings_are_other_work(season: Path, tmp_path: Path) -> None:
+    items = items_of([str(season / FLIGHTS[0])])
+    seen: list[str] = []
+
+    class Counted(LocalProcesses):
+        def run(self, work, items):
+            for number, outcome in super().run(work, items):
+                seen.append(type(outcome).__name__)
+                yield number, outcome
+
+    folder = ResultFolder(tmp_path)
+    for choice in ("recorded", "current", "recorded"):
+        options = ReadOptions(OPTIONS.current, choice=choice)
+        run_season(FuseTask(options), items, Counted(1), folder, silent)
+    # A digest each time, and two works.
+    assert sorted(seen) == ["str", "str", "str", "tuple", "tuple"]
+
+
+def test_a_version_is_compared_with_another(
+    fused: tuple[Path, int, str], season: Path, tmp_path: Path
+) -> None:
+    out, _, _ = fused
+    then = tmp_path / "then"
+    shutil.copytree(out / RESULTS, then / RESULTS)
+    for path in (then / RESULTS).iterdir():
+        result = json.loads(path.read_bytes())
+        if "held_m" in result["figures"]:
+            result["figures"]["held_m"]["eskf"] /= 2.0
+            path.write_text(json.dumps(result))
+    code, text = run("fuse", season, "-o", out, "--against", then)
+    assert code == 1
+    assert (
+        "eskf against the other results: +100.0 % error over 4 flights on 4 aircraft-days" in text
+    )
+    assert "complementary against the other results: +0.0 %" in text
+    assert text.count("worse: ") == 4
+    assert "got worse" in (out / "index.html").read_text()
+    missing = run("fuse", season, "-o", out, "--against", tmp_path / "nowhere")
+    assert missing[0] == 2
+
+
+def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ResultFolder(tmp_path)
+    result = FlightResult(
+        place="a", digest="d", key="k", task="report", version="1", files=("reports/a/index.html",)
+    )
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", fail)
+        with pytest.raises(OSError, match="full"):
+            folder.keep(result, {"reports/a/index.html": b"page"})
+    assert folder.find("k") is None
+    assert not (tmp_path / "reports" / "a").exists()
+    again = ResultFolder(tmp_path)
+    assert not (tmp_path / ".partial").exists()
+    again.keep(result, {"reports/a/index.html": b"page"})
+    assert again.find("k") == result
+    (tmp_path / RESULTS / "k.json").write_bytes(b"")
+    assert again.find("k") is None
+
+
+def test_info_tells_every_file(season: Path, tmp_path: Path) -> None:
+    code, text = run("info", season, "-o", tmp_path)
+    assert code == 1
+    assert all(name in text for name in FLIGHTS)
+    kept = [json.loads(path.read_bytes()) for path in (tmp_path / RESULTS).iterdir()]
+    durations = [entry["figures"]["duration_s"] for entry in kept if entry["error"] is None]
+    assert durations == pytest.approx([40.0] * 4, abs=0.2)
+
+
+def test_a_report_is_put_in_place_as_a_whole(season: Path, tmp_path: Path) -> None:
+    code, _ = run("report", season / FLIGHTS[0], "-o", tmp_path)
+    assert code == 0
+    assert "Flight report: alpha" in (tmp_path / "reports" / "alpha" / "index.html").read_text()
+    assert (tmp_path / "reports" / "alpha" / "ground_track.svg").exists()
+
+
+def test_two_recordings_of_one_name_are_kept_apart(season: Path, tmp_path: Path) -> None:
+    for folder, name in (("x", FLIGHTS[0]), ("y", FLIGHTS[1])):
+        (tmp_path / folder).mkdir()
+        shutil.copy(season / name, tmp_path / folder / "log_01_v1.csv")
+    assert run("fuse", tmp_path / "x", tmp_path / "y", "-o", tmp_path / "out")[0] == 0
+    assert len(list((tmp_path / "out" / "fused").glob("log-*.csv"))) == 2
+
+
+def test_tables_stand_for_their_recordings_tlogs(tmp_path: Path) -> None:
+    for name in ("a_01.tlog", "a_01_v1.csv", "a_02_v1.csv", "b_01.tlog"):
+        (tmp_path / name).write_text("x")
+    found = items_of([str(tmp_path)])
+    names = [[Path(part.place).name for part in item.parts] for item in found]
+    assert names == [["a_01_v1.csv", "a_02_v1.csv"], ["b_01.tlog"]]
+    assert len(items_of([str(tmp_path)], each_file=True)) == 4
+
+
+def _die_once(marker: Path) -> str:
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return marker.name
+
+
+def _die_always(marker: Path) -> str:
+    if marker.name == "bad":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return marker.name
+
+
+def _raise(marker: Path) -> str:
+    if marker.name == "bad":
+        raise IndexError("no such thing")
+    return marker.name
+
+
+@pytest.mark.parametrize(
+    ("work", "told"),
+    [(_die_once, "once"), (_die_always, "its process died"), (_raise, "IndexError: no such thing")],
+)
+def test_a_process_that_dies_is_made_up_for(
+    work: Callable[[Path], str], told: str, tmp_path: Path
+) -> None:
+    items = [tmp_path / name for name in ("a", "b", "bad", "c", "d", "e")]
+    for item in items:
+        if told != "once" or item.name != "bad":
+            item.touch()
+    found = dict(LocalProcesses(2).run(work, items))
+    assert [found[k] for k in (0, 1, 3, 4, 5)] == ["a", "b", "c", "d", "e"]
+    bad = found[2]
+    assert bad == "bad" if told == "once" else isinstance(bad, WorkFailed) and told in bad.reason
+
+
+@pytest.fixture
+def memory(season: Path) -> Iterator[str]:
+    """The season in fsspec's file system in memory."""
+    storage = fsspec.filesystem("memory")
+    for name in FLIGHTS[:2]:
+        storage.pipe_file(f"/flights/{name}", (season / name).read_bytes())
+    yield "memory://flights"
+    storage.rm("/flights", recursive=True)
+
+
+@pytest.mark.parametrize("pattern", ["", "/*.csv", f"/{FLIGHTS[1]}"])
+def test_urls_give_what_local_files_give(
+    memory: str, pattern: str, season: Path, fused: tuple[Path, int, str], tmp_path: Path
+) -> None:
+    code, text = run("fuse", memory + pattern, "-o", tmp_path, "--jobs", 2)
+    assert code == 0, text
+    made = sorted(path.name for path in (tmp_path / "fused").iterdir())
+    assert made == (["beta.csv"] if "beta" in pattern else ["alpha.csv", "beta.csv"])
+    for name in made:
+        alone = (fused[0] / "fused" / name).read_bytes()
+        assert (tmp_path / "fused" / name).read_bytes() == alone
+
+
+def test_a_local_url_is_read_too(season: Path, tmp_path: Path) -> None:
+    code, text = run("info", f"file://{season}", "-o", tmp_path)
+    assert code == 1
+    assert all(name in text for name in FLIGHTS)
+
+
+def test_a_url_that_leads_nowhere_is_said(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no recording is there"):
+        items_of(["memory://nothing/*.csv"])
+    with pytest.raises(StorageError, match="gopher"):
+        items_of(["gopher://old/flights"])
+    code, text = run("fuse", tmp_path, "-o", tmp_path / "out")
+    assert (code, "no recording is there" in text) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "lacking"),
+    [(("memory://flights",), "has_fsspec"), (("{season}", "--scheduler", "tcp://x:1"), "has_dask")],
+)
+def test_without_the_extra_it_says_how_to_add_it(
+    words: tuple[str, ...], lacking: str, season: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(f"gateway.cli.season.season_work.{lacking}", lambda: False)
+    named = [word.format(season=season) for word in words]
+    code, text = run("fuse", *named, "-o", tmp_path)
+    assert code == 2
+    assert "mavgate[batch]" in text
+
+
+def test_no_passphrase_leaves_the_machine() -> None:
+    import msgspec
+
+    vehicle = msgspec.structs.replace(AircraftSettings().vehicle, signing_passphrase="secret word")
+    aircraft = msgspec.structs.replace(AircraftSettings(), vehicle=vehicle)
+    told = without_secrets(ReadOptions(PipelineSettings(aircraft, {2: aircraft})))
+    assert b"secret word" not in FuseTask(told).fingerprint
+    assert told.current.aircraft[2].vehicle.signing_passphrase == ""

@@ -1,0 +1,97 @@
+"""A real cluster of Dask: a scheduler and worker processes on this machine."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.season.batch.dask_executor import ClusterError, DaskCluster
+from gateway.season.executors import WorkFailed
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1",
+        dashboard_address=None, silence_logs=50,
+    ) as cluster:  # fmt: skip
+        yield cluster.scheduler_address
+
+
+def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
+    from typer.testing import CliRunner
+
+    from gateway.cli.app import app
+
+    done = CliRunner().invoke(app, ["batch", "fuse", str(season), "-o", str(out), *more])
+    return done.exit_code, done.output
+
+
+def _kill_one_worker(marker: Path) -> int:
+    """Die the first time, as a machine does."""
+    if marker.name == "deadly" and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.01)
+    return len(marker.name)
+
+
+def _fail(marker: Path) -> int:
+    raise KeyError(marker.name)
+
+
+def test_a_cluster_gives_what_this_machine_gives(
+    address: str, season: Path, tmp_path: Path
+) -> None:
+    code, text = _run(season, tmp_path / "cluster", "--scheduler", address)
+    assert (code, "1 of 5 recordings failed" in text) == (1, True), text
+    assert _run(season, tmp_path / "here")[0] == 1
+    for part in ("results", "fused"):
+        here, there = (
+            {path.name: path.read_bytes() for path in (tmp_path / side / part).iterdir()}
+            for side in ("here", "cluster")
+        )
+        assert here == there
+        assert len(here) >= 4
+
+
+def test_a_worker_that_is_killed_is_made_up_for(address: str, tmp_path: Path) -> None:
+    cluster = DaskCluster(address)
+    try:
+        names = ["a", "bb", "deadly", "ccc", *(f"more {k}" for k in range(20))]
+        found = dict(cluster.run(_kill_one_worker, [tmp_path / name for name in names]))
+    finally:
+        cluster.close()
+    assert (tmp_path / "deadly").exists()
+    assert found == {k: len(name) for k, name in enumerate(names)}
+
+
+def test_work_that_fails_fails_alone(address: str, tmp_path: Path) -> None:
+    cluster = DaskCluster(address)
+    try:
+        ((_, outcome),) = cluster.run(_fail, [tmp_path / "x"])
+    finally:
+        cluster.close()
+    assert outcome == WorkFailed("KeyError: 'x'")
+
+
+def test_a_scheduler_that_is_not_there_is_said(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.season.batch.dask_executor.CONNECT_S", 0.3)
+    with pytest.raises(ClusterError, match="no Dask scheduler answers"):
+        DaskCluster("tcp://127.0.0.1:9")
+
+
+def test_workers_of_another_version_are_refused(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.season.batch.dask_executor.__version__", "0.0.1")
+    with pytest.raises(ClusterError, match=r"here is mavgate 0\.0\.1, but"):
+        DaskCluster(address)

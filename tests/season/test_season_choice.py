@@ -1,0 +1,133 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.config import load
+from gateway.season.reckoning.chance import lead_of
+from gateway.season.reckoning.cross_validation import choose, folds_of
+from gateway.season.reckoning.season_errors import FlightErrors, errors_by_group, versus
+
+GROUPS = [f"{1 + k % 2} 2026-06-{1 + k // 4:02d}" for k in range(40)]
+
+
+def test_flights_of_one_day_stay_in_one_fold() -> None:
+    fold = folds_of(GROUPS)
+    assert {len(set(fold[[g == group for g in GROUPS]].tolist())) for group in GROUPS} == {1}
+    assert fold.max() == 9
+    assert np.bincount(fold).tolist() == [4] * 10
+
+
+def test_flights_of_a_single_day_are_folds_of_their_own() -> None:
+    assert sorted(folds_of(["1 2026-06-01"] * 4).tolist()) == [0, 1, 2, 3]
+
+
+def test_no_flight_judges_what_it_chose() -> None:
+    """On noise alone the best of many points leads by luck; judged by others, on average not."""
+    in_sample, judged = [], []
+    for seed in range(12):
+        errors = np.exp(np.random.default_rng(seed).normal(0.0, 0.3, (40, 60)))
+        found = choose(errors, np.ones(40), GROUPS)
+        assert found.over_base is not None
+        in_sample.append(np.log(found.means[found.winner]))
+        judged.append(np.log(found.over_base.ratio))
+    assert np.mean(in_sample) < -0.1
+    assert np.mean(judged) > -0.05
+
+
+def test_a_true_lead_is_told_from_chance(rng: np.random.Generator) -> None:
+    errors = np.exp(rng.normal(0.0, 0.1, (40, 5)))
+    errors[:, 3] *= 0.8
+    found = choose(errors, np.exp(rng.normal(0.0, 0.1, 40)), GROUPS)
+    assert (found.winner, found.folds, found.stable) == (3, 10, 10)
+    lead = found.over_base
+    assert lead is not None
+    assert lead.low is not None
+    assert lead.high is not None
+    assert lead.low < lead.ratio < lead.high < 0.9
+    assert lead.ratio == pytest.approx(0.8, abs=0.05)
+    assert lead.units == 20
+    assert "more than chance" in lead.text
+
+
+def test_flights_that_know_nothing_are_left_out() -> None:
+    errors = np.array([[1.0, 2.0], [np.nan, 1.0], [1.0, 3.0]])
+    found = choose(errors, np.array([2.0, 2.0, np.nan]), ["a", "b", "c"])
+    assert found.winner == 0
+    assert np.isnan(found.judged[1])
+    assert found.means == pytest.approx([1.0, 6.0**0.5])
+    with pytest.raises(ValueError, match="too few fixes"):
+        choose(np.full((2, 2), np.nan), np.ones(2), ["a", "b"])
+
+
+def test_a_single_day_tells_nothing_from_chance() -> None:
+    lead = lead_of(np.array([1.0, 1.0]), np.array([2.0, 2.0]), ["a", "a"])
+    assert lead is not None
+    assert (lead.ratio, lead.p) == (pytest.approx(0.5), None)
+    assert "nothing tells it from chance" in lead.text
+    same = lead_of(np.ones(3), np.ones(3), ["a", "b", "c"])
+    assert same is not None
+    assert same.p == 1.0
+    assert lead_of(np.array([np.nan]), np.ones(1), ["a"]) is None
+
+
+def flight(place: str, vehicle: int, **held_m: float) -> FlightErrors:
+    return FlightErrors(place, place, vehicle, "2026-06-01 10:00:00", held_m)
+
+
+def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
+    rows = errors_by_group(
+        [flight("a", 1, eskf=1.0), flight("b", 1, eskf=3.0), flight("c", 2, eskf=8.0, paper=1.0)]
+    )
+    told = [(r.vehicle, r.estimator, r.flights, r.median_m, r.worst_m) for r in rows]
+    assert told == [
+        (None, "eskf", 3, 3.0, 8.0),
+        (None, "paper", 1, 1.0, 1.0),
+        (1, "eskf", 2, 2.0, 3.0),
+        (2, "eskf", 1, 8.0, 8.0),
+        (2, "paper", 1, 1.0, 1.0),
+    ]
+
+
+def test_what_got_worse_is_listed_the_worst_first() -> None:
+    then = [flight("a", 1, eskf=1.0), flight("b", 1, eskf=1.0), flight("c", 1, eskf=1.0)]
+    now = [flight("a", 1, eskf=1.04), flight("b", 1, eskf=2.0), flight("c", 1, eskf=3.0)]
+    found = versus([*now, flight("new", 1, eskf=9.0)], then)
+    assert [(c.place, c.after_m) for c in found.worse] == [("c", 3.0), ("b", 2.0)]
+    assert found.compared == 3
+
+
+@pytest.mark.io
+def test_one_set_is_found_for_a_season(season: Path, tmp_path: Path) -> None:
+    words = ["batch", "sweep", str(season), "-o", str(tmp_path), "--vary", "beta=0.1,0.5,0.9"]
+    done = CliRunner().invoke(app, [*words, "--jobs", "2"])
+    assert done.exit_code == 1, done.output
+    assert "3 points on 4 flights, in 4 folds by aircraft and day" in done.output
+    assert "against the settings that the flights came with" in done.output
+    assert "p = " in done.output
+    kept = [json.loads(path.read_bytes()) for path in (tmp_path / "results").iterdir()]
+    scores = np.array([entry["figures"]["scores"] for entry in kept if entry["error"] is None])
+    winner = (0.1, 0.5, 0.9)[int(np.exp(np.log(scores).mean(axis=0)).argmin())]
+    best = load(tmp_path / "best.toml").estimation
+    assert (best.estimator, best.paper.beta_velocity) == ("paper", winner)
+    table = pd.read_csv(tmp_path / "sweep.csv")
+    assert len(table) == 4
+    assert table["as others chose"].gt(0.0).all()
+
+
+@pytest.mark.io
+def test_sweep_takes_many_flights(season: Path, tmp_path: Path) -> None:
+    flights = [str(season / name) for name in ("alpha_01_v1.csv", "gamma_01_v2.csv")]
+    best = tmp_path / "best.toml"
+    words = ["sweep", *flights, "--beta", "0.1,0.9", "-o", str(best), "--jobs", "2"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "2 points on 2 flights" in done.output
+    assert load(best).estimation.estimator == "paper"
+    refused = CliRunner().invoke(app, [*words[:3], "--optimise", "3", "--beta", "0:1"])
+    assert refused.exit_code == 2
+    assert "give a grid" in refused.output
