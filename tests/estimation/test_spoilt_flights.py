@@ -16,6 +16,7 @@ from tools.score_estimators import (
     run_complementary,
     run_eskf,
 )
+from tools.score_honesty import share, two_sigma
 from tools.spoil_flight import RECOVERY_S, SPOILS, applies, departure, mid_air, no_mag
 
 pytestmark = pytest.mark.slow
@@ -109,9 +110,32 @@ def test_a_fix_without_height_leaves_the_rest_of_it(flight: Flight, name: str) -
 
 
 def test_turns_without_gps_are_not_taken_for_level(flight: Flight) -> None:
-    """What pulls for long is flown: the compass hangs on the level, so the heading tells."""
+    """A speed that the gyroscope cannot explain by tilt is flown, and doubts the levelling."""
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
-    assert attitude_scores(alone, run_eskf(alone)[:, :4])["heading"] < 6.0
+    out = run_eskf(alone)
+    assert attitude_scores(alone, out[:, :4])["heading"] < 3.0
+    assert share(two_sigma(alone, out)["heading"]) > 0.9
+
+
+def test_real_turns_without_gps_are_told_as_unsure(data_dir: Path) -> None:
+    """The declination of the log's header counts before any fix."""
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
+    out = run_eskf(alone)
+    assert attitude_scores(alone, out[:, :4])["heading"] < 3.5
+    within = two_sigma(alone, out)
+    assert share(within["tilt"]) > 0.9
+    assert share(within["heading"]) > 0.9
+    assert (out[-1000:, NAV_FLAGS].astype(int) & int(NavFlags.HEADING_VALID)).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["broad_15_undisturbed_fast_translation_A", "broad_30_disturbed_stationary_magnet_C"]
+)
+def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(data_dir: Path, name: str) -> None:
+    tilt_deg, heading_deg, _ = off(read_flight(data_dir / f"{name}.csv.gz"), "eskf", "silence")
+    assert tilt_deg < 5.0
+    assert heading_deg < 8.0
 
 
 def test_every_way_of_spoiling_applies_to_a_whole_flight(flight: Flight) -> None:

@@ -128,9 +128,10 @@ def is_to_be_taken(
     q_ni = solve_alignment(s)
     s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni))
     write_quat(s.found_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
-    level_found = s.level_std < FOUND_LEVEL_RAD
     if s.lost == 1:
         s.lost_s += dt
+        # Of a motion that does not end, a worse level in time is better than none.
+        level_found = s.level_std < FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S)
         pulled = s.by_gps == 0 and s.pull_mps2 > PULLED_MPS2
         return level_found and not (pulled and s.lost_s < PATIENCE_S)
     doubted = is_contradicted(s, q_nb, level_told, heading_told)

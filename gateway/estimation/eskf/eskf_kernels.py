@@ -10,7 +10,7 @@ from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import EskfState
+from gateway.estimation.eskf.eskf_state import VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.measure import (
     UNAIDED_CORRELATION_S,
@@ -68,6 +68,9 @@ ROUGH_LIMIT: Final = 1e4
 HAND_MPS2: Final = 0.5
 TURN_S: Final = 4.0
 """What pulls more than a hand does for long is flown; its velocity turns in about this time."""
+HAND_MPS: Final = 2.8
+"""A hand is not faster for long; what is faster is flown, and for a while after."""
+FLOWN_S: Final = 20.0
 UNAIDED_PULL_MPS2: Final = 0.5
 """A lasting acceleration of this much halves the belief in standing still."""
 ZERO: Final = (0.0, 0.0, 0.0)
@@ -236,8 +239,22 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
         pull = s.pull_mps2 / UNAIDED_PULL_MPS2
         flown = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
         variance = p.unaided_var * (1.0 + pull * pull) + flown * flown
-        variance *= UNAIDED_CORRELATION_S / dt
-        update_by_velocity(s, p, variance)
+        propagate(s, p)
+        variance = max(variance, TURN_S * unaided_speed_sq(s, dt))
+        update_by_velocity(s, p, variance * UNAIDED_CORRELATION_S / dt)
+
+
+@compiled
+def unaided_speed_sq(s: EskfState, dt: float) -> float:
+    """Return the squared speed that has lately shown itself beyond what the covariance explains.
+
+    A standing or hovering aircraft has none. The acceleration of a flight, taken for tilt, would
+    have to come with a turn that the gyroscope did not see: the speed of about zero that stands in
+    for a sensor is refuted by so much.
+    """
+    shown = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2 - s.P[VEL, VEL] - s.P[VEL + 1, VEL + 1])
+    s.unaided_sq = max(s.unaided_sq * math.exp(-dt / FLOWN_S), shown - HAND_MPS * HAND_MPS)
+    return s.unaided_sq
 
 
 @compiled

@@ -32,6 +32,8 @@ from gateway.records import NAN
 LEVEL_VAR = 0.1**2
 HEADING_VAR = 0.26**2
 NO_HOLD_S = 1.0
+DECLINATION_RAD = 0.2
+"""Magnetic north may be off by so much where the declination is not known."""
 
 
 @compiled
@@ -58,6 +60,8 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3] = NAN
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
+        if s.heading_known == 1 and s.heading_true == 0:
+            row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], DECLINATION_RAD)
     write_place(s, row)
 
 

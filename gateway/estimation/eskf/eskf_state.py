@@ -65,6 +65,8 @@ class EskfState(FilterState):
     """1 once the iron that the calibration left is looked for."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
+    unaided_sq: float
+    """Mean square of the speed that has shown itself where no GPS tells it, per axis, m2/s2."""
     hold_s: float
     """How long position is dead-reckoned."""
     baro_down_m: float

@@ -48,7 +48,7 @@ def start(s: EskfState, p: EskfGains) -> None:
         s.wander_var[k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
         s.rate_b[k] = NAN
-    s.declination_rad = NAN
+    s.declination_rad = p.declination_rad
     forget_times(s)
 
 
@@ -185,8 +185,9 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
     propagate(s, p)
     s.restarts += 1
     s.aided = 0
+    s.unaided_sq = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2)
     for k in range(3):
-        decorrelate(s.P, VEL + k, p.unaided_var)
+        decorrelate(s.P, VEL + k, p.unaided_var + s.unaided_sq)
         s.vel_n[k] = 0.0
 
 
