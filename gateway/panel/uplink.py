@@ -33,6 +33,8 @@ USER_COMPONENTS: Final = 75
 """MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
 AUTOPILOT: Final = 1
 HEARTBEAT_S: Final = 1.0
+KNOCK_S: Final = 0.2
+"""Between heartbeats while nothing is heard: the first one may find no socket open yet."""
 SILENT_US: Final = 3 * US_PER_S
 ACK_TIMEOUT_S: Final = 1.5
 ATTEMPTS: Final = 3
@@ -255,7 +257,7 @@ class Uplink:
             if self.is_local and not self.is_alive:
                 await self._find_gateway()
             self.send(beat)
-            await asyncio.sleep(HEARTBEAT_S)
+            await asyncio.sleep(HEARTBEAT_S if self.is_alive else KNOCK_S)
 
     async def _find_gateway(self) -> None:
         """Ask the gateway on this machine for a port of the panel's own, and speak to it."""
