@@ -1,5 +1,6 @@
 """View 4: recordings, and a flight that is played again."""
 
+import asyncio
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -15,10 +16,14 @@ from gateway.panel.live_table import Cells, LiveTable, RowButton
 from gateway.panel.page_prompts import confirm, notify_failure
 from gateway.panel.recorded_aircraft import Profile
 from gateway.panel.recording_player import SPEEDS, Playback
+from gateway.panel.serving.recording_facts import RecordingFacts
 from gateway.panel.view_context import WEB, ViewContext
+from gateway.season.hangar.hangar_file import Row
 
 REFRESH_S: Final = 1.0
 PLACE_S: Final = 0.25
+MUCH_LOST: Final = 0.05
+"""A share of lost samples that a pilot should see."""
 IDLE: Final = "idle"
 STATES: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
 
@@ -42,6 +47,7 @@ class RecordingsView:
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
+        self._facts = RecordingFacts()
         with ui.element("div").classes("cards one"):
             self._player = ui.element("div").classes("card padded").props("data-role=player")
             with self._player:
@@ -51,12 +57,15 @@ class RecordingsView:
             with ui.element("div").classes("card padded"):
                 with ui.element("div").classes("line"):
                     ui.label("Recordings").classes("title spring")
+                    self._search = ui.input(placeholder="Name, or duration > 300 and loss > 0.05")
+                    self._search.props('dense outlined clearable aria-label="Search recordings"')
                     if context.may_change:
                         upload = UploadButton()
                         upload.props(f":limit={context.parts.settings.upload_limit_mb * 1_000_000}")
                         upload.on("told", self._on_upload)
+                self._trouble = ui.label().classes("soft")
                 self._table = LiveTable(
-                    ("Name", "Last written (UTC)", "Size", "Files"),
+                    ("Name", "Last written (UTC)", "Size", "Files", "s", "km", "m up", "Loss"),
                     "Nothing was recorded yet.",
                     buttons=self._buttons(),
                 )
@@ -118,8 +127,15 @@ class RecordingsView:
             self._state.set_text(recorder["state"])
             self._state.classes(replace=f"chip {STATES.get(recorder['state'], '')}")
             self._detail.set_text(_detail_of(recorder))
-        recordings = list_recordings(self._context.parts.recordings_folder)
-        self._table.show({entry.name: _row(entry) for entry in reversed(recordings)})
+        facts, search = self._facts, (self._search.value or "").strip()
+        folder = self._context.parts.recordings_folder
+        # Asking the catalogue of thousands takes longer than a page may stand still.
+        await asyncio.to_thread(facts.look, folder, search)
+        self._trouble.set_text(facts.trouble)
+        self._trouble.set_visibility(bool(facts.trouble))
+        recordings = list_recordings(folder)
+        shown = [entry for entry in reversed(recordings) if facts.shows(entry.name, search)]
+        self._table.show({entry.name: _row(entry, facts.of(entry.name)) for entry in shown})
 
     def _show_place(self) -> None:
         playback = self._context.parts.playback
@@ -237,7 +253,7 @@ def _detail_of(recorder: dict[str, Any]) -> str:
     return " · ".join(parts)
 
 
-def _row(recording: Any) -> Cells:
+def _row(recording: Any, facts: Row | None) -> Cells:
     when = datetime.fromtimestamp(recording.modified_s, UTC)
     kinds = sorted({Path(file).suffix.lstrip(".") for file in recording.files})
     return (
@@ -245,4 +261,22 @@ def _row(recording: Any) -> Cells:
         (f"{when:%Y-%m-%d %H:%M:%S}", ""),
         (f"{recording.size / 1e6:.2f} MB", ""),
         (f"{len(recording.files)} {'+'.join(kinds)}", ""),
+        *_facts_cells(facts),
+    )
+
+
+def _facts_cells(facts: Row | None) -> Cells:
+    """Tell what the catalogue knows; blank where it knows nothing."""
+    if facts is None:
+        return (("", ""),) * 4
+    if facts["error"] is not None:
+        return (("broken", "bad"), ("", ""), ("", ""), ("", ""))
+    duration, distance, highest, loss = (
+        facts[key] for key in ("duration", "distance", "highest", "loss")
+    )
+    return (
+        ("" if duration is None else f"{duration:.0f}", ""),
+        ("" if distance is None else f"{distance / 1000.0:.2f}", ""),
+        ("" if highest is None else f"{highest:.0f}", ""),
+        ("" if loss is None else f"{loss:.1%}", "warn" if (loss or 0.0) > MUCH_LOST else ""),
     )
