@@ -19,6 +19,7 @@ SITE_COUNTERS: Final = (
     ("unknown", "unknown", "Frames that no dialect here knows, so that no id can be changed."),
     ("signed", "signed", "Signed frames that could not pass for want of the passphrase."),
     ("forged", "forged", "Frames whose signature is not of the site's passphrase."),
+    ("looped", "looped", "Frames of the fleet that came back through the site, and ended here."),
 )
 VEHICLE_GAUGES: Final = (
     ("rate_hz", "rate_hertz", "Frames a second of the last seconds."),
@@ -54,6 +55,7 @@ def fleet_families(status: Mapping[str, Any]) -> Iterator[Metric]:
         yield gauge(f"fleet_{key}", text, (), [((), float(len(status[key])))])
     for key, text in (
         ("overflowed", "Messages that came faster than they could be taken."),
+        ("looped", "Frames for sites that a client here brought back, and that ended here."),
         ("bad_names", "Messages under names that no site may have, or of too many sites."),
     ):
         yield counter(f"fleet_{key}", text, (), [((), float(status[key]))])

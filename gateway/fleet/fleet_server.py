@@ -9,7 +9,6 @@ import msgspec
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
 from gateway.edges.operator.control_socket import (
     ControlError,
     ControlServer,
@@ -17,11 +16,13 @@ from gateway.edges.operator.control_socket import (
     socket_path,
 )
 from gateway.edges.operator.prometheus import MetricsServer
+from gateway.fleet.fleet_hub import FleetHub
 from gateway.fleet.fleet_session import FleetSession, SessionEvents
 from gateway.fleet.fleet_settings import FleetSettings
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import LEFT_OUT
 from gateway.fleet.ids_file import IdsFile
+from gateway.fleet.loop_watch import LoopWatch
 from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.fleet.site_client import SiteClient, site_endpoint
 from gateway.routing.endpoint import SITE_NAME
@@ -79,7 +80,8 @@ class FleetServer:
         }
         self._ping_interval_us = round(hub_settings.ping_interval_s * US_PER_S)
         self._ping_us = 0
-        self._hub = Hub(hub_settings, lambda _: None, self._now_us)
+        self._loops = LoopWatch()
+        self._hub = FleetHub(hub_settings, self._now_us, self._loops)
         self._metrics = MetricsServer(self._metrics_text)
         self._metrics_port = hub_settings.metrics_port
         self._sites: dict[str, SiteClient] = {}
@@ -129,6 +131,7 @@ class FleetServer:
             "unmapped": sorted(f"{site}/{system}" for site, system in self._ids.unmapped),
             "left_out": sorted(f"{site}/{system}" for site, system in self._ids.left_out),
             "bad_names": self._bad_names,
+            "looped": self._loops.looped,
             "overflowed": self._session.overflowed,
             "clients": [client for client in self._hub.clients() if client.name not in self._sites],
         }
@@ -186,7 +189,7 @@ class FleetServer:
             self._bad_names += 1
             return None
         client = SiteClient(self._hub, self._hub.new_client_id(), site_endpoint(name))
-        translation = FrameTranslation(name, self._ids, self._keys.get(name))
+        translation = FrameTranslation(name, self._ids, self._keys.get(name), self._loops)
         site = self._sites[name] = client.set_up(translation, lambda: self._session.outlets)
         self._hub.appear(site)
         return site

@@ -16,6 +16,7 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.fleet.id_map import IdMap
+from gateway.fleet.loop_watch import LoopWatch
 from gateway.fleet.named_systems import changes_of_names
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
@@ -49,6 +50,8 @@ class TranslationCounters:
     """They are signed, would change, and there is no passphrase."""
     forged: int = 0
     """Their signature is not of the site's passphrase."""
+    looped: int = 0
+    """They had been here, and came back through the site."""
 
 
 @dataclass(slots=True)
@@ -83,12 +86,17 @@ class FrameTranslation:
         Shared by all sites.
     key : bytes, optional
         32 bytes, of the site's passphrase.
+    loops : LoopWatch, optional
+        Shared by all sites.
     """
 
-    def __init__(self, site: str, ids: IdMap, key: bytes | None = None) -> None:
+    def __init__(
+        self, site: str, ids: IdMap, key: bytes | None = None, loops: LoopWatch | None = None
+    ) -> None:
         self._site = site
         self._ids = ids
         self._key = key
+        self._loops = loops or LoopWatch()
         self._sequences: dict[tuple[int, int], int] = {}
         self.counters = TranslationCounters()
         self.traffic: dict[int, VehicleTraffic] = {}
@@ -102,18 +110,29 @@ class FrameTranslation:
     def from_site(self, frame: bytes, now_us: int) -> bytes | None:
         """Return a frame of the site as it is to be seen here; None if it cannot pass."""
         origin = origin_of(frame)
-        own_id = self._ids.id_of(self._site, origin[0])
+        vehicle = (self._site, origin[0])
+        has_id = self.id_of(origin[0]) is not None
+        if self._loops.is_back(frame, vehicle, has_id=has_id, now_us=now_us):
+            self.counters.looped += 1
+            return None
+        own_id = self._ids.id_of(*vehicle)
         if own_id is None:
             self.counters.unmapped += 1
             return None
         self._note(frame, origin, now_us)
-        return self._rewritten(frame, own_id, self._id_here)
+        given = self._rewritten(frame, own_id, self._id_here)
+        if given is not None:
+            self._loops.note_given(given, vehicle, now_us)
+        return given
 
-    def to_site(self, frame: bytes) -> tuple[int, bytes] | None:
+    def to_site(self, frame: bytes, now_us: int) -> tuple[int, bytes] | None:
         """Return the system at the site that a frame is for (0: all) and the frame for it."""
         sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
         changed = self._rewritten(frame, sender, self._id_there)
-        return None if changed is None else (self._id_there(target), changed)
+        if changed is None:
+            return None
+        self._loops.note_sent(frame, changed, now_us)
+        return self._id_there(target), changed
 
     def id_of(self, system_id: int) -> int | None:
         """Return the id that a system of the site has here, if it has one."""

@@ -55,7 +55,7 @@ class SiteClient(Client):
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Publish a frame for a vehicle of the site."""
         outlets = self.outlets()
-        found = self.translation.to_site(frame)
+        found = self.translation.to_site(frame, self.context.now_us())
         if outlets is None or found is None:
             self.counters.dropped += 1
             return
@@ -92,6 +92,7 @@ class SiteClient(Client):
             "unknown": counters.unknown,
             "signed": counters.signed,
             "forged": counters.forged,
+            "looped": counters.looped,
         }
 
     @property

@@ -15,7 +15,7 @@ Only trusted clients belong in here: whoever may write into these tables decides
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
 
@@ -33,6 +33,8 @@ MEMORY_OF_ONE: Final = 224
 bytes."""
 MEMORY_FRAMES: Final = 8192
 """Per generation: a second of a fast link, at most 2.3 MB."""
+
+Note = TypeVar("Note")
 
 
 @dataclass(slots=True)
@@ -179,15 +181,48 @@ class RoutingTable:
                 del self._components[origin[0]]
 
 
+class FrameMemory(Generic[Note]):
+    """What is known of the newest frames, by their bytes: of one to two spans, and so many at most.
+
+    Parameters
+    ----------
+    span_us : int
+        How long a generation is.
+    most : int
+        Frames of a generation; there are two.
+    """
+
+    def __init__(self, span_us: int, most: int) -> None:
+        self._span_us = span_us
+        self._most = most
+        self._recent: dict[bytes, Note] = {}
+        self._older: dict[bytes, Note] = {}
+        self._turned_us = 0
+
+    def turn(self, now_us: int) -> bool:
+        """Begin another generation if it is time, and return whether it was."""
+        if now_us - self._turned_us < self._span_us and len(self._recent) < self._most:
+            return False
+        self._older, self._recent = self._recent, {}
+        self._turned_us = now_us
+        return True
+
+    def get(self, frame: bytes) -> Note | None:
+        """Return what is known of a frame."""
+        return self._recent.get(frame) or self._older.get(frame)
+
+    def put(self, frame: bytes, note: Note) -> None:
+        """Remember a frame."""
+        self._recent[frame] = note
+
+
 class LoopGuard:
     """Remember the frames of the last second and tell copies."""
 
     def __init__(self) -> None:
-        self._recent: dict[bytes, tuple[int, int, int]] = {}
-        self._older: dict[bytes, tuple[int, int, int]] = {}
+        self._memory: FrameMemory[tuple[int, int, int]] = FrameMemory(MEMORY_US, MEMORY_FRAMES)
         """When a frame came first, by whom, and as which of its component's."""
         self._counts: dict[Origin, int] = {}
-        self._turned_us = 0
 
     def first_way(
         self, frame: bytes, origin: Origin, client_id: int, since_us: int, now_us: int
@@ -212,15 +247,12 @@ class LoopGuard:
         int or None
             The client that was first, maybe the same one; None if the frame is no copy.
         """
-        if now_us - self._turned_us >= MEMORY_US or len(self._recent) >= MEMORY_FRAMES:
-            self._older, self._recent = self._recent, {}
-            self._turned_us = now_us
-            if len(self._counts) > MEMORY_FRAMES:
-                self._counts.clear()
-        known = self._recent.get(frame) or self._older.get(frame)
+        if self._memory.turn(now_us) and len(self._counts) > MEMORY_FRAMES:
+            self._counts.clear()
+        known = self._memory.get(frame)
         count = self._counts.get(origin, 0)
         if known is not None and known[0] >= since_us and count - known[2] < MEMORY_OF_ONE:
             return known[1]
-        self._recent[frame] = (now_us, client_id, count)
+        self._memory.put(frame, (now_us, client_id, count))
         self._counts[origin] = count + 1
         return None

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
+from typer.testing import CliRunner
 
+from gateway.cli.app import app
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
 from gateway.routing.hub_settings import HubSettings
@@ -30,12 +32,15 @@ class World:
         self.vehicles: dict[str, Sender] = {}
         self.got: list[Any] = []
 
-    def open_site(self, name: str, options: str = "", recordings: Path | None = None) -> Any:
+    def open_site(
+        self, name: str, options: str = "", recordings: Path | None = None, beside: str = ""
+    ) -> Any:
         incoming: list[Any] = []
         rig = Rig()
         rig.clock = self.rig.clock
         rig.incoming = incoming
-        hub = rig.hub(f"zenoh:{self.place}?site={name}{options}", recordings=recordings)
+        endpoints = [f"zenoh:{self.place}?site={name}{options}", *filter(None, [beside])]
+        hub = rig.hub(*endpoints, recordings=recordings)
         self.rig.closing += rig.closing
         self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
         return hub
@@ -70,6 +75,13 @@ class World:
         link = mavlink.MAVLink(None)
         found = [link.decode(bytearray(each.frame)) for each in self.heard[name]]
         return [message for message in found if message.get_type() == "COMMAND_LONG"]
+
+
+async def run(*words: str) -> str:
+    """Run a command as a person does, in a thread, since the fleet answers it here."""
+    result = await asyncio.to_thread(CliRunner().invoke, app, list(words))
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings
 from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.signing import key_from_passphrase
-from tests.fleet.conftest import World
+from tests.fleet.conftest import World, run
 
 pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
 
@@ -70,6 +70,20 @@ async def test_a_site_goes_and_that_is_told_once(world: World) -> None:
     assert texts == ["Site field-b is gone"]
     gone = {site["name"]: site["is_here"] for site in world.fleet.status()["sites"]}
     assert gone == {"field-a": True, "field-b": False}
+
+
+async def test_what_a_site_is_fed_with_ends_after_one_round(world: World) -> None:
+    hub = world.open_site("field-a", beside="udp-listen:127.0.0.1:0")
+    world.fleet._ids.set_by_hand("field-a", 1, 7)
+    world.fleet._hub.add(f"udp:127.0.0.1:{hub.listening_ports()[0]}")
+    await world.until(lambda: world.fleet.status()["sites"][0:1] != [] and 7 in world.systems())
+    world.station.say(world.station.sender.command(7, 1))
+    await world.until(lambda: world.fleet.status()["sites"][0]["looped"] > 50)
+    (site,) = world.fleet.status()["sites"]
+    assert [(each["system_id"], each["id"]) for each in site["vehicles"]] == [(1, 7)]
+    assert [own_id for _, own_id in world.fleet._ids.items()] == [7]
+    assert len(world.commands("field-a")) == 1
+    assert "looped frames ended" in await run("fleet", "status")
 
 
 async def test_signed_frames_are_checked_and_sealed_anew(world: World) -> None:

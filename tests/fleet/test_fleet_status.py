@@ -7,24 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.edges.operator.control_socket import request
-from tests.fleet.conftest import World
+from tests.fleet.conftest import World, run
 
 pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
 
 
 def site_of(world: World, name: str) -> dict[str, Any]:
     return {site["name"]: site for site in world.fleet.status()["sites"]}.get(name, {})
-
-
-async def run(*words: str) -> str:
-    """Run a command as a person does, in a thread, since the fleet answers it here."""
-    result = await asyncio.to_thread(CliRunner().invoke, app, list(words))
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 async def test_round_trip_rate_and_table(world: World) -> None:

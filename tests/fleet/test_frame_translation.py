@@ -59,7 +59,7 @@ def test_from_the_site(v1: bool) -> None:
 
 @pytest.mark.parametrize("v1", [False, True])
 def test_to_the_site(v1: bool) -> None:
-    system_id, frame = translation().to_site(packed(command(2), 255, v1=v1)) or (0, b"")
+    system_id, frame = translation().to_site(packed(command(2), 255, v1=v1), 0) or (0, b"")
     got = read(frame)
     assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
     assert (got.command, got.param7) == (400, 7)
@@ -86,7 +86,7 @@ def follow(leader: int, kind: Any) -> Any:
 )
 def test_a_system_that_a_command_names(kind: Any, v1: bool) -> None:
     both = translation()
-    _, frame = both.to_site(packed(follow(2, kind), 255, v1=v1)) or (0, b"")
+    _, frame = both.to_site(packed(follow(2, kind), 255, v1=v1), 0) or (0, b"")
     there = read(frame)
     assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
     back = read(both.from_site(packed(follow(1, kind), 1, v1=v1), 0) or b"")
@@ -98,7 +98,7 @@ def test_what_names_no_vehicle_stays(value: float) -> None:
     message = mavlink.MAVLink_command_long_message(
         2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
     )
-    _, frame = translation().to_site(packed(message, 255)) or (0, b"")
+    _, frame = translation().to_site(packed(message, 255), 0) or (0, b"")
     got = read(frame)
     assert (got.param1, got.param2, got.param4) == (1, 2, 2)
     assert got.param3 == pytest.approx(value, nan_ok=True)
@@ -125,7 +125,7 @@ def test_a_vehicle_that_addresses_another_of_its_site() -> None:
 
 def test_what_a_station_says_to_all_stays_as_it_is() -> None:
     beat = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255)
-    assert translation().to_site(beat) == (0, beat)
+    assert translation().to_site(beat, 0) == (0, beat)
 
 
 def test_a_zero_that_version_2_has_cut_off_is_still_nobody() -> None:
@@ -148,7 +148,7 @@ class TestSigned:
         assert got[-13:-6] == frame[-13:-6]
 
     def test_to_the_site(self) -> None:
-        found = translation(KEY).to_site(packed(command(2), 255, key=KEY))
+        found = translation(KEY).to_site(packed(command(2), 255, key=KEY), 0)
         assert found is not None
         assert read(found[1], KEY).target_system == 1
 
@@ -220,11 +220,11 @@ def test_every_message_with_a_target(message_id: int) -> None:
     crc.accumulate(bytes((kind.crc_extra,)))
     frame += crc.crc.to_bytes(2, "little")
     there = translation()
-    system_id, changed = there.to_site(frame) or (0, b"")
+    system_id, changed = there.to_site(frame, 0) or (0, b"")
     assert system_id == 1
     assert split_datagram(changed) == [changed]
     assert target_of(changed)[0] == 1
-    back = there.from_site(changed, 0)
+    back = translation().from_site(changed, 0)
     assert back is not None
     assert target_of(back)[0] == 2
     differing = sum(a != b for a, b in zip(changed, frame, strict=True))

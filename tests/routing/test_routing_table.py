@@ -151,4 +151,4 @@ class TestLoopGuard:
         guard = LoopGuard()
         for n in range(5 * MEMORY_FRAMES):
             is_new(guard, n.to_bytes(4, "little"), 0, 1)
-        assert len(guard._recent) + len(guard._older) <= 2 * MEMORY_FRAMES
+        assert len(guard._memory._recent) + len(guard._memory._older) <= 2 * MEMORY_FRAMES

@@ -94,6 +94,13 @@ def status(*, json: JsonOption = False) -> None:
         console.print(f"left out by hand: {', '.join(found['left_out'])}", markup=False)
     if found["overflowed"]:
         console.print(f"{found['overflowed']} messages came too fast to be taken", markup=False)
+    loops = [
+        f"{site['looped']} through {site['name']}" for site in found["sites"] if site["looped"]
+    ]
+    if found["looped"]:
+        loops.append(f"{found['looped']} through clients here")
+    if loops:
+        console.print(f"looped frames ended: {', '.join(loops)}", markup=False)
 
 
 @group.command("id")

@@ -1,0 +1,119 @@
+"""A fleet's own clients fed back into a site: frames end after one round."""
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.fleet.frame_translation import FrameTranslation
+from gateway.fleet.id_map import IdMap
+from gateway.fleet.loop_watch import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopWatch
+from gateway.wire.mavlink_splitter import origin_of
+from tests.edges.hub.conftest import Sender
+
+STEP_US = 20_000
+
+
+class Ring:
+    """Sites a and b of one aircraft 1 each, and c, which is fed with what the fleet gives out."""
+
+    def __init__(self, ids: IdMap | None = None) -> None:
+        self.ids = ids or IdMap()
+        self.loops = LoopWatch()
+        self.sites = {name: FrameTranslation(name, self.ids, None, self.loops) for name in "abc"}
+        self.vehicles = {name: Sender(1, 1) for name in "ab"}
+        self.now_us = 0
+
+    def attitude(self, name: str) -> bytes:
+        self.now_us += STEP_US
+        time_ms = self.now_us // 1000
+        return self.vehicles[name].pack(mavlink.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0))
+
+    def give(self, name: str, frame: bytes) -> bytes | None:
+        return self.sites[name].from_site(frame, self.now_us)
+
+
+def test_frames_end_after_one_round_and_give_nobody_an_id() -> None:
+    ring = Ring()
+    for _ in range(300):
+        for name in "ab":
+            given = ring.give(name, ring.attitude(name))
+            assert given is not None
+            ring.now_us += STEP_US
+            assert ring.give("c", given) is None
+    assert ring.ids.items() == [(("a", 1), 1), (("b", 1), 2)]
+    assert ring.sites["c"].counters.looped == 600
+    assert ring.sites["c"].traffic == {}
+    assert ring.sites["a"].counters.looped == ring.sites["b"].counters.looped == 0
+
+
+def test_through_the_site_that_it_is_from() -> None:
+    ring = Ring(IdMap({("a", 1): 7}))
+    given = ring.give("a", ring.attitude("a"))
+    assert given is not None
+    assert origin_of(given)[0] == 7
+    assert ring.give("a", given) is None
+    assert ring.ids.known_id("a", 7) is None
+
+
+def test_two_of_one_type_are_told_apart_by_the_first_frame_that_differs() -> None:
+    """Their heartbeats are equal, byte for byte."""
+    ring = Ring()
+    assert ring.give("a", ring.vehicles["a"].heartbeat()) is not None
+    assert ring.give("b", ring.vehicles["b"].heartbeat()) is None
+    for _ in range(50):
+        for name in "ab":
+            assert ring.give(name, ring.attitude(name)) is not None
+        for name in "ab":
+            assert ring.give(name, ring.vehicles[name].heartbeat()) is not None
+    assert ring.ids.known_id("b", 1) == 2
+
+
+def test_two_of_one_type_that_only_ever_repeat_themselves_in_step() -> None:
+    ring = Ring()
+    for _ in range(MAX_CHANCE + 1):
+        frames = [vehicle.heartbeat() for vehicle in ring.vehicles.values()]
+        assert frames[0] == frames[1]
+        passed = [ring.give(*each) for each in zip("ab", frames, strict=True)]
+    assert None not in passed
+    assert ring.ids.known_id("b", 1) == 2
+    given = passed[1]
+    assert given is not None
+    assert ring.give("c", given) is None, "its id is not its own: this has gone round"
+
+
+def test_a_looped_vehicle_that_had_an_id_falls_silent() -> None:
+    ring = Ring(IdMap({("b", 1): 2, ("c", 2): 3}))
+    passed = 0
+    for _ in range(100):
+        given = ring.give("b", ring.attitude("b"))
+        assert given is not None
+        passed += ring.give("c", given) is not None
+    assert passed == MAX_CHANCE
+    assert ring.sites["c"].counters.looped == 100 - MAX_CHANCE
+    own = Sender(2, 1).pack(mavlink.MAVLink_attitude_message(1, 2, 0, 0, 0, 0, 0))
+    assert ring.give("c", own) is not None, "an aircraft that is really there"
+
+
+def test_a_command_ends_by_either_way_back() -> None:
+    ring = Ring(IdMap({("a", 1): 7}))
+    said = Sender(255, 190).command(7, 1)
+    found = ring.sites["a"].to_site(said, 0)
+    assert found is not None
+    assert found[0] == 1
+    for frame in (said, found[1]):
+        assert ring.give("c", frame) is None
+    assert ring.ids.known_id("c", 255) is None
+    assert ring.loops.came_back(found[1], 0), "for another vehicle's id"
+    assert not ring.loops.came_back(said, 0), "a program may say the same again"
+    assert ring.loops.looped == 1
+
+
+def test_memory_ends_in_time_and_number() -> None:
+    ring = Ring()
+    given = ring.give("b", ring.attitude("b"))
+    assert given is not None
+    ring.now_us += 2 * SPAN_US + 1
+    assert ring.give("c", given) is not None
+    loops = LoopWatch()
+    for number in range(3 * MAX_FRAMES):
+        frame = b"\xfd\x04" + bytes(8) + number.to_bytes(4, "little")
+        loops.note_given(frame, ("a", 1), 0)
+    assert len(loops._given._recent) + len(loops._given._older) <= 2 * MAX_FRAMES
