@@ -123,6 +123,48 @@ def test_a_vehicle_that_addresses_another_of_its_site() -> None:
     assert (got.get_srcSystem(), got.target_system) == (30, 2)
 
 
+ASKED: list[Any] = [
+    mavlink.MAVLink_param_request_list_message(2, 1),
+    mavlink.MAVLink_param_request_read_message(2, 1, b"GPS_LAG", -1),
+    mavlink.MAVLink_param_set_message(2, 1, b"GPS_LAG", 0.25, 9),
+    mavlink.MAVLink_mission_count_message(2, 1, 3),
+    mavlink.MAVLink_mission_item_int_message(2, 1, 2, 3, 16, 0, 1, 0, 2, 0, 0, 5, 6, 7),
+    mavlink.MAVLink_mission_request_list_message(2, 1),
+    mavlink.MAVLink_mission_request_int_message(2, 1, 2),
+]
+ANSWERED: list[Any] = [
+    mavlink.MAVLink_param_value_message(b"GPS_LAG", 0.25, 9, 40, 7),
+    mavlink.MAVLink_mission_request_int_message(255, 190, 2),
+    mavlink.MAVLink_mission_count_message(255, 190, 3),
+    mavlink.MAVLink_mission_item_int_message(255, 190, 2, 3, 16, 0, 1, 0, 2, 0, 0, 5, 6, 7),
+    mavlink.MAVLink_mission_ack_message(255, 190, 0),
+]
+
+
+@pytest.mark.parametrize("message", ASKED, ids=lambda each: each.get_type())
+def test_parameters_and_missions_are_asked_of_the_vehicle(message: Any) -> None:
+    system_id, frame = translation().to_site(packed(message, 255), 0) or (0, b"")
+    got = read(frame)
+    assert (system_id, got.get_srcSystem(), got.target_system) == (1, 255, 1)
+    assert got.to_dict() == message.to_dict() | {"target_system": 1}
+
+
+@pytest.mark.parametrize("message", ANSWERED, ids=lambda each: each.get_type())
+def test_parameters_and_missions_are_answered_to_the_station(message: Any) -> None:
+    got = read(translation().from_site(packed(message, 1), 0) or b"")
+    assert got.get_srcSystem() == 2
+    assert got.to_dict() == message.to_dict()
+
+
+@pytest.mark.parametrize("unix_us", [0, 946_684_800_000_000, 4_102_444_800_000_000])
+def test_a_clock_that_is_wrong_by_years_is_passed_on_as_it_is(unix_us: int) -> None:
+    message = mavlink.MAVLink_system_time_message(unix_us, 5)
+    frame = packed(message, 1)
+    given = translation().from_site(frame, 0) or b""
+    assert read(given).time_unix_usec == unix_us
+    assert given[6:-2] == frame[6:-2], "all but the sender and the checksum"
+
+
 def test_what_a_station_says_to_all_stays_as_it_is() -> None:
     beat = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255)
     assert translation().to_site(beat, 0) == (0, beat)

@@ -240,14 +240,25 @@ class TestTrouble:
 
     async def test_a_router_that_stalls_holds_nobody_up(self, rig: Rig, router: Router) -> None:
         hub = await open_site(rig, router)
+        hub.add("udp-listen:127.0.0.1:0")
+        station = rig.station(hub.listening_ports()[0])
+        station.say(station.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 2)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        while not station.is_silent():
+            pass
         router.signal(signal.SIGSTOP)
         loop = asyncio.get_running_loop()
         begin = loop.time()
         for _ in range(5000):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
-            hub.send(rig.out(rig.vehicle.command(1, 1)))
+            for frame in (rig.vehicle.raw_imu(), rig.vehicle.command(1, 1)):
+                hub.send(rig.out(frame))
+                assert station.socket.recv(65535) == frame, "a local client has it at once"
         assert loop.time() - begin < 5.0
-        assert hub.clients()[0].queued <= zenoh_session.MAX_PATIENT
+        fleet, local = hub.clients()
+        assert fleet.queued <= zenoh_session.MAX_PATIENT
+        assert fleet.dropped > 0
+        assert local.dropped == 0
         router.signal(signal.SIGCONT)
 
     async def test_two_sites_of_one_name_are_told_on_both(self, rig: Rig, router: Router) -> None:
