@@ -73,11 +73,11 @@ def told(
 
 
 def until_drawn(page: Page, *texts: str) -> None:
-    """Wait until the flight display has drawn all of these since now."""
-    page.evaluate("window.drawn.length = 0")
+    """Wait until the flight display has drawn all of these since the last such wait."""
     page.wait_for_function(
         "(texts) => texts.every((text) => window.drawn.includes(text))", arg=list(texts)
     )
+    page.evaluate("window.drawn.length = 0")
 
 
 def display_of(page: Page) -> Locator:
@@ -132,7 +132,7 @@ class TestFlightDisplay:
 
     def test_row_speed(self, told: tuple[ToldVehicle, Page]) -> None:
         vehicle, page = told
-        vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.25
+        vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.3
         until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
         vehicle.airspeed_mps = 0.0
         until_drawn(page, "GS  m/s", "19.3")
