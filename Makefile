@@ -17,7 +17,7 @@ demo: .venv/.run
 test: .venv/.dev
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
-	.venv/bin/pytest -q -n 2 --dist loadgroup
+	.venv/bin/pytest -q -n 2 --dist loadfile
 
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files

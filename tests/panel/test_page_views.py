@@ -98,6 +98,7 @@ def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None
 def test_magnetometer_is_seen_as_a_cloud_and_undone_without_a_trace(desk: Desk) -> None:
     view, kept = desk.view("calibration"), desk.kept
     view.locator(".step", has_text="Magnetometer").click()
+    expect(view.locator(".guide h2")).to_have_text("Magnetometer")
     desk.receiver.is_turned = True
     view.get_by_role("button", name="Start").click()
     sphere = view.locator("canvas.field-sphere")
