@@ -16,7 +16,6 @@ from tests.conftest import ROOT
 pytestmark = [
     pytest.mark.io,
     pytest.mark.slow,
-    pytest.mark.xdist_group("deb"),
     pytest.mark.skipif(not shutil.which("dpkg-deb"), reason="needs Debian's dpkg-deb"),
 ]
 UNIT = "usr/lib/systemd/system/mavgate.service"

@@ -19,7 +19,7 @@ from gateway.estimation.select import EstimationSettings
 from tests.end_to_end.processes import START_LIMIT_S, Gateway, MavProxy, free_udp_ports
 from tests.end_to_end.test_ground_stations import WAYPOINTS
 
-pytestmark = [pytest.mark.io, pytest.mark.slow, pytest.mark.xdist_group("zenoh")]
+pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 SITES = ("field-1", "field-2", "field-3")
 SITE = """

@@ -14,7 +14,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_con
 
 zenoh = pytest.importorskip("zenoh")
 
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+pytestmark = pytest.mark.io
 
 DOC = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
 PATIENCE_S = 20.0

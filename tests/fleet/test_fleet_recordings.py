@@ -21,7 +21,7 @@ from gateway.edges.hub.fleet_link.recording_answers import MAX_PIECE, RecordingA
 from gateway.edges.operator.control_socket import ControlError, request
 from tests.fleet.conftest import World
 
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+pytestmark = pytest.mark.io
 
 NAME, SIZE = "flight_01.tlog", 300_000
 CONTENT = np.random.default_rng(1).bytes(SIZE)

@@ -19,7 +19,7 @@ from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.signing import key_from_passphrase
 from tests.fleet.conftest import World, run
 
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+pytestmark = pytest.mark.io
 
 STATUSTEXT, COMMAND_LONG = 253, 76
 

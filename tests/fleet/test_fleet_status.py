@@ -11,7 +11,7 @@ import pytest
 from gateway.edges.operator.control_socket import request
 from tests.fleet.conftest import World, run
 
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+pytestmark = pytest.mark.io
 
 
 def site_of(world: World, name: str) -> dict[str, Any]:

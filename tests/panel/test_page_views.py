@@ -20,7 +20,6 @@ pytestmark = [
     pytest.mark.io,
     pytest.mark.slow,
     needs_chromium,
-    pytest.mark.xdist_group("panel"),
 ]
 expect.set_options(timeout=WAIT_MS)
 VIEWS = (

@@ -13,8 +13,7 @@ from gateway.analysis.reporting.page import Report, ReportTable, prose, write_re
 from gateway.analysis.reporting.style import CSS_NAMES
 from tests.analysis.flights import short_case
 
-# Its report takes seconds: one worker makes it for all of them.
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("report")]
+pytestmark = pytest.mark.io
 
 CHROMIUM = shutil.which("chromium")
 OFFLINE = (

@@ -18,7 +18,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inl
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.edges.hub.conftest import Rig
 
-pytestmark = [pytest.mark.io, pytest.mark.xdist_group("zenoh")]
+pytestmark = pytest.mark.io
 
 ROUTER = """
 import json, sys, time, zenoh
