@@ -1,5 +1,6 @@
 """`python -m gateway.cli` is `mavgate`."""
 
+import os
 import sys
 
 INTERRUPTED = 128 + 2
@@ -15,6 +16,22 @@ def main() -> None:
         run()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    finally:
+        _leave_what_hangs()
+
+
+def _leave_what_hangs() -> None:
+    """Exit here if a thread still waits for Zenoh: Python would wait for it too."""
+    link = sys.modules.get("gateway.edges.hub.fleet_link.zenoh_threads")
+    if link is None or link.end_calls():
+        return
+    end = sys.exception()
+    code = end.code if isinstance(end, SystemExit) else end
+    if not isinstance(end, SystemExit) and end is not None:
+        sys.excepthook(type(end), end, end.__traceback__)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else int(code is not None))
 
 
 if __name__ == "__main__":

@@ -110,11 +110,11 @@ class FleetServer:
         self._metrics.listen(self._metrics_port)
         self._task = asyncio.get_running_loop().create_task(self._keep())
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """End everything."""
         if self._task is not None:
             self._task.cancel()
-        await self._session.close()
+        self._session.close()
         self._ids_file.keep()
         self._metrics.close()
         self._hub.close()

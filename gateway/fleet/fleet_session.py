@@ -1,6 +1,5 @@
 """The Zenoh session of a fleet: opened until it works, declared, asked, and ended."""
 
-import asyncio
 import logging
 import re
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     open_session,
     session_config,
 )
+from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
 from gateway.fleet.fleet_settings import FleetSettings
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class FleetSession:
         if self._session is not None:
             return
         try:
-            session = await asyncio.to_thread(open_session, self._config)
+            session = await off_loop(open_session, self._config)
         except OSError as error:
             if str(error) != self._trouble:
                 self._trouble = str(error)
@@ -117,16 +117,15 @@ class FleetSession:
         self._session, self.outlets = session, Outlets(session)
         self._declare(session)
 
-    async def close(self) -> None:
-        """End the session."""
+    def close(self) -> None:
+        """End the session; it says good-bye by itself, which may take a moment."""
         for inlet in self._inlets:
             inlet.close()
         if self.outlets is not None:
-            self._declared += self.outlets.close()
-            self.outlets = None
+            self.outlets.close()
         if self._session is not None:
-            session, self._session = self._session, None
-            await asyncio.to_thread(end_session, session, self._declared)
+            off_loop(end_session, self._session, self.outlets, self._declared)
+        self._session, self.outlets, self._declared = None, None, []
 
     def ask_round_trips(self) -> None:
         """Ask every site to answer at once; one query does for all that a pattern matches."""
@@ -176,7 +175,7 @@ class FleetSession:
         """
         if self._session is None:
             raise NoAnswerError(f"{self.place}: no session")
-        return await asyncio.to_thread(_query, self._session, key, payload, timeout_s)
+        return await off_loop(_query, self._session, key, payload, timeout_s)
 
     def _declare(self, session: "zenoh.Session") -> None:
         import zenoh

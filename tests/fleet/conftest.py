@@ -109,7 +109,7 @@ async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
         while not fleet._session.is_open:
             await asyncio.sleep(0.01)
     yield world
-    await fleet.close()
+    fleet.close()
     for close in rig.closing:
         close()
     rig.closing.clear()

@@ -148,22 +148,39 @@ def test_patterns_that_are_none(settings: FleetSettings, site: str) -> None:
         FleetServer(FleetSettings(sites=(site,), ids_file=settings.ids_file), HubSettings())
 
 
-def test_the_command_ends_at_once(tmp_path: Path, settings: FleetSettings) -> None:
-    config = tmp_path / "fleet.toml"
-    config.write_text(f'[fleet]\nids_file = "{tmp_path}/ids.json"\n')
-    words = ("fleet", "--listen", settings.listen, "--config", str(config))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "gateway.cli", *words, "--endpoint", "udp:127.0.0.1:9"],
-        stderr=subprocess.DEVNULL,
-    )
-    try:
+class TestTheCommand:
+    def start(self, tmp_path: Path, *words: str) -> "subprocess.Popen[bytes]":
+        config = tmp_path / "fleet.toml"
+        config.write_text(f'[fleet]\nids_file = "{tmp_path}/ids.json"\n')
+        words = (*words, "--config", str(config), "--endpoint", "udp:127.0.0.1:9")
+        return subprocess.Popen(
+            [sys.executable, "-m", "gateway.cli", "fleet", *words], stderr=subprocess.DEVNULL
+        )
+
+    def end(self, process: "subprocess.Popen[bytes]", within_s: float) -> None:
+        try:
+            process.terminate()
+            assert process.wait(within_s) == 0
+        finally:
+            process.kill()
+            process.wait()
+
+    def test_ends_at_once(self, tmp_path: Path, settings: FleetSettings) -> None:
+        process = self.start(tmp_path, "--listen", settings.listen)
         host, port = settings.listen.removeprefix("tcp/").split(":")
         for _ in range(600):
             with suppress(ConnectionRefusedError), socket.create_connection((host, int(port))):
                 break
             time.sleep(0.1)
-        process.terminate()
-        assert process.wait(30) == 0
-    finally:
-        process.kill()
-        process.wait()
+        self.end(process, 30)
+
+    def test_ends_soon_when_its_router_never_answers(
+        self, tmp_path: Path, settings: FleetSettings
+    ) -> None:
+        """Zenoh waits 10 s for a router to say who it is."""
+        with socket.create_server(("127.0.0.1", 0)) as mute:
+            mute.settimeout(60)
+            place = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+            process = self.start(tmp_path, "--connect", place)
+            with mute.accept()[0]:
+                self.end(process, 9)

@@ -156,7 +156,7 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
     try:
         await stopped.wait()
     finally:
-        await server.close()
+        server.close()
 
 
 @recordings_group.callback()

@@ -32,6 +32,10 @@ sys.stdin.read()
 """
 
 
+ZENOH_GIVES_UP_S = 9.5
+"""It waits for 10 s, or for ever."""
+
+
 class Router:
     """A router as a process that can be killed, stopped and started again at the same place."""
 
@@ -311,24 +315,47 @@ class TestInlet:
 
 SITE = """
 import asyncio, sys
+from gateway.cli.__main__ import _leave_what_hangs
 from gateway.edges.clock import GatewayClock
+from gateway.edges.hub.fleet_link.zenoh_session import MAX_PATIENT
 from gateway.edges.hub.hub import Hub
+from gateway.records import Outgoing
 from gateway.routing.hub_settings import HubSettings
+from tests.edges.hub.conftest import Sender, dialect
 
 async def main():
     hub = Hub(HubSettings(endpoints=(f"zenoh:{sys.argv[1]}?site=field",)), print, GatewayClock())
     hub.start()
     while hub.clients()[0].state != "open":
         await asyncio.sleep(0.01)
+    print("open", flush=True)
+    piece = dialect.MAVLink_file_transfer_protocol_message(0, 0, 0, [1] * 251)
+    if sys.stdin.readline() == "fill\\n":
+        while hub.clients()[0].queued < MAX_PATIENT:
+            hub.send(Outgoing(Sender(1, 1).pack(piece), piece.get_msgId(), None))
+            await asyncio.sleep(0)
     hub.close()
 
-asyncio.run(main())
+try:
+    asyncio.run(main())
+    raise SystemExit(7)
+finally:
+    _leave_what_hangs()
 """
 
 
-async def test_a_process_ends_when_its_session_is_closed(router: Router) -> None:
-    """What is still declared at the end of Python waits for threads that have ended."""
-    done = await asyncio.to_thread(
-        subprocess.run, [sys.executable, "-c", SITE, router.place], timeout=60, check=False
-    )
-    assert done.returncode == 0
+@pytest.mark.parametrize("stalls", [False, True])
+def test_a_process_ends_soon_when_its_session_is_closed(router: Router, *, stalls: bool) -> None:
+    """Zenoh may wait for a stalled link, Python for threads and for what is still declared."""
+    words = [sys.executable, "-c", SITE, router.place]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as site:
+        assert site.stdin is not None
+        assert site.stdout is not None
+        assert site.stdout.readline() == "open\n"
+        if stalls:
+            router.signal(signal.SIGSTOP)
+        try:
+            site.communicate("fill\n" if stalls else "end\n", timeout=ZENOH_GIVES_UP_S)
+        finally:
+            site.kill()
+        assert site.returncode == 7

@@ -13,6 +13,9 @@ log = logging.getLogger(__name__)
 MAX_QUERIES: Final = 64
 """That wait for their answer; then the oldest gets none."""
 
+ANSWER_S: Final = 1.0
+"""Nearly every answer is given by then."""
+
 
 class RefusedQueryError(Exception):
     """A query that cannot be answered; the text says why."""
@@ -41,11 +44,13 @@ class QueryAnswers:
         self._failure = zenoh.ZError
         waiting: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_QUERIES)
         self._queryable: Any = session.declare_queryable(key, waiting)
-        threading.Thread(target=self._serve, name=key, daemon=True).start()
+        self._thread = threading.Thread(target=self._serve, name=key, daemon=True)
+        self._thread.start()
 
     def undeclare(self) -> None:
-        """Answer no more, and let the thread end."""
+        """Answer no more, and wait for the thread, though not for all of a long answer."""
         self._queryable.undeclare()
+        self._thread.join(ANSWER_S)
 
     def _serve(self) -> None:
         for query in self._queryable:

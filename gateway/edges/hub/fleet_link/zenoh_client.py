@@ -28,6 +28,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     open_session,
     session_config,
 )
+from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
 from gateway.edges.hub.listener import RETRY_US
 from gateway.routing.endpoint import RAW_KEYS, Endpoint
 from gateway.routing.outbox import Packer
@@ -100,11 +101,10 @@ class ZenohClient(Client):
         for inlet in self._inlets:
             inlet.close()
         if self._outlets is not None:
-            self._declared += self._outlets.close()
-            self._outlets = None
+            self._outlets.close()
         if self._session is not None:
-            self.loop.run_in_executor(None, end_session, self._session, self._declared)
-            self._session, self._declared = None, []
+            off_loop(end_session, self._session, self._outlets, self._declared)
+        self._session, self._outlets, self._declared = None, None, []
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Take over changed options; another site or file needs the endpoint to be added anew."""
@@ -119,7 +119,7 @@ class ZenohClient(Client):
     async def _open(self) -> None:
         try:
             config = session_config(self.endpoint.host, self.endpoint.config)
-            session = await asyncio.to_thread(open_session, config)
+            session = await off_loop(open_session, config)
         except ModuleNotFoundError:
             self.become("unreachable")
             self.reason = HOW_TO_ADD

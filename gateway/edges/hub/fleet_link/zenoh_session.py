@@ -35,6 +35,8 @@ MAX_PATIENT: Final = 1024
 """What waits for a congested link and must not be lost: a whole parameter list."""
 BATCHES: Final = 4
 """Of 64 KiB that may wait on a link: two thousand frames at once, and not much memory a site."""
+GIVE_UP_S: Final = 10.0
+"""Zenoh gives a message up after half of this, and closes the link."""
 PATIENT_IDS: Final = BULK_IDS | {75, 76, 77, 253}
 """Parameters, missions, files, commands, their answers, texts: none of them comes again."""
 
@@ -97,16 +99,20 @@ def open_session(config: "zenoh.Config") -> "zenoh.Session":
         raise OSError(_words(error)) from None
 
 
-def end_session(session: "zenoh.Session", declared: list[Any]) -> None:
+def end_session(session: "zenoh.Session", outlets: "Outlets | None", declared: list[Any]) -> None:
     """Undeclare what was declared, and close; waits, so not on the loop.
 
-    What is still declared when Python ends would wait for ever for threads that have ended.
+    What is still declared when Python ends would wait for ever for threads that have ended. A
+    publisher cannot be undeclared while its thread publishes.
     """
     import zenoh
 
-    with suppress(zenoh.ZError):
-        while declared:
+    if outlets is not None:
+        declared += outlets.ended()
+    while declared:
+        with suppress(zenoh.ZError, RuntimeError):
             declared.pop().undeclare()
+    with suppress(zenoh.ZError):
         session.close()  # type: ignore[no-untyped-call]
 
 
@@ -174,6 +180,7 @@ class Outlets:
         self._session = session
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
         self._waiting: queue.Queue[tuple[zenoh.Publisher, bytes] | None] = queue.Queue(MAX_PATIENT)
+        self._is_closed = False
         self._thread = threading.Thread(target=self._publish, name="zenoh-patient", daemon=True)
         self._thread.start()
 
@@ -204,20 +211,17 @@ class Outlets:
         """How many wait for a congested link."""
         return self._waiting.qsize()
 
-    def close(self) -> list["zenoh.Publisher"]:
-        """Publish nothing more, what waits is lost; return what is to be undeclared."""
-        self._end_thread()
-        publishers = [*self._publishers.values()]
-        self._publishers.clear()
-        return publishers
+    def close(self) -> None:
+        """Publish nothing more; what waits is lost."""
+        self._is_closed = True
+        # It wakes the thread; if there is no room for it the thread is awake.
+        with suppress(queue.Full):
+            self._waiting.put_nowait(None)
 
-    def _end_thread(self) -> None:
-        while True:
-            try:
-                self._waiting.put_nowait(None)
-                break
-            except queue.Full:
-                self._waiting.get_nowait()
+    def ended(self) -> list["zenoh.Publisher"]:
+        """Wait for what is being published, and return what is to be undeclared."""
+        self._thread.join(GIVE_UP_S)
+        return [*self._publishers.values()]
 
     def _declare(self, key: str, *, patient: bool) -> "zenoh.Publisher":
         control, priority = self._zenoh.CongestionControl, self._zenoh.Priority
@@ -230,14 +234,12 @@ class Outlets:
         return publisher
 
     def _publish(self) -> None:
-        while (item := self._waiting.get()) is not None:
+        while (item := self._waiting.get()) is not None and not self._is_closed:
             publisher, payload = item
             try:
                 publisher.put(payload)
             except self._zenoh.ZError as error:
                 log.debug("not published: %s", error)
-                if self._session.is_closed():
-                    return
 
 
 def _words(error: Exception) -> str:
