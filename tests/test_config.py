@@ -115,7 +115,7 @@ def test_every_endpoint_is_told_also_beside_other_errors(tmp_path: Path) -> None
     lines = str(caught.value).splitlines()
     assert len(lines) == 5
     assert all(line.startswith(f"{file}: ") for line in lines)
-    for told in ("max_clients", "'udp:'", "99999", "is there twice", "serial.baud"):
+    for told in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
         assert sum(told in line for line in lines) == 1
 
 

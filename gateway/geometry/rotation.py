@@ -1,4 +1,4 @@
-"""Rotation matrices, and the three angles by which people tell them."""
+"""Rotation matrices, and the three angles by which people describe them."""
 
 import math
 
@@ -11,7 +11,7 @@ _GIMBAL_LOCK = 1e-9
 
 
 def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
-    """Turn by yaw, then pitch, then roll, each about the axes already turned (Z-Y-X).
+    """Build a matrix from yaw, then pitch, then roll, each about the axes already turned (Z-Y-X).
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
 
 
 def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
-    """Give the angles of `matrix_from_euler_deg`.
+    """Return the angles of `matrix_from_euler_deg`.
 
     Parameters
     ----------
@@ -44,8 +44,9 @@ def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
     Returns
     -------
     tuple of 3 floats
-        Roll (-180 to 180), pitch (-90 to 90), yaw (-180 to 180) in degrees. Where the pitch leaves
-        but the sum or difference of roll and yaw to be told, the roll is zero.
+        Roll (-180 to 180), pitch (-90 to 90), yaw (-180 to 180) in degrees. Where the pitch is a
+        right angle, only the sum or difference of roll and yaw is determined, and the roll is
+        zero.
     """
     (xx, xy, _), (yx, yy, _), (zx, zy, zz) = matrix
     level = math.hypot(xx, yx)
@@ -58,7 +59,7 @@ def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
 
 
 def determinant(matrix: Matrix3) -> float:
-    """Give the volume of the box that the rows span; negative where they are left-handed."""
+    """Return the volume of the box that the rows span; negative if they are left-handed."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 

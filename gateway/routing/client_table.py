@@ -1,10 +1,10 @@
 """What is known of each client, and which clients of a listening port are still there.
 
 A UDP port knows its clients only by what they send. A client is dropped after a silence; one that
-comes back on another port (a ground station that was started again) takes the place of its old
-self as soon as that has missed a few heartbeats, so that nobody is served twice; and a port never
-serves more than a bounded number, whoever knocks. Whoever is silent makes room in a full port, and
-so does a machine that holds more than its share, for one that holds less.
+comes back on another port (a ground station that was restarted) takes over its old place as soon
+as that has missed a few heartbeats, so that no client is served twice; and a port never serves
+more than a bounded number. In a full port a silent client makes room, and so does a machine that
+holds more than its share, for one that holds less.
 """
 
 from collections import Counter
@@ -51,9 +51,9 @@ class ClientStats:
     heard_us: int | None
     round_trip_us: int | None
     reason: str = ""
-    """Why nothing goes out, in the words of the operating system; empty if it does."""
+    """Why nothing is sent: the operating system's error; empty if frames are sent."""
     unheard: int = 0
-    """Frames for a port at which nobody listened: no loss of the link's."""
+    """Frames sent to a port on which nobody listened; they do not count as loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +63,14 @@ class ListenerStats:
     name: str
     endpoint: str
     state: str
-    """`open`, or `closed` while it cannot be bound or can take nobody in."""
+    """`open`, or `closed` while it cannot be bound or accept clients."""
     reason: str
-    """Why it is closed, in the words of the operating system; empty if it is open."""
+    """Why it is closed: the operating system's error; empty if it is open."""
     port: int
     """The port that is bound, or 0."""
     clients: int
     turned_away: int
-    """How often somebody came who had no room."""
+    """How often a new client was turned away for lack of room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +82,13 @@ class HubCounters:
     forwarded: int = 0
     """Frames of other systems that were passed on."""
     duplicates: int = 0
-    """Copies that came a second way."""
+    """Copies that came by a second path."""
     looped: int = 0
     """Frames of ours that came back."""
     unroutable: int = 0
-    """Frames for a system that nobody has heard, or from one who may not."""
+    """Frames for an unknown system, or from a client that may not send to it."""
     unserved: int = 0
-    """Requests given up since their client asks for more than its share."""
+    """Requests dropped because their client exceeded its quota."""
 
 
 @dataclass(slots=True)
@@ -104,7 +104,7 @@ class Presence:
 
 
 class ClientTable:
-    """Who speaks to one listening port.
+    """The clients of one listening port.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class ClientTable:
         return len(self._by_address)
 
     def is_full(self, now_us: int) -> bool:
-        """Return whether there is no room and nobody has been silent for long; soon told."""
+        """Return whether there is no room and no client is silent; cheaper than `admit`."""
         return len(self) >= self.max_clients and now_us < self._full_until_us
 
     def presences(self) -> tuple[Presence, ...]:
@@ -145,7 +145,7 @@ class ClientTable:
         -------
         tuple
             The client, or None if the table is full of clients that are alive; and the silent
-            client that had to go for it, if any.
+            client that had to make room, if any.
         """
         leaver = None
         if len(self._by_address) >= self.max_clients:
@@ -166,7 +166,7 @@ class ClientTable:
         self._by_address.pop(presence.address, None)
 
     def expire(self, now_us: int) -> list[Presence]:
-        """Remove and return the clients that have gone or have come back elsewhere."""
+        """Remove and return the clients that have gone or have come back on another port."""
         newest: dict[tuple[str, tuple[int, int]], Presence] = {}
         for presence in self._by_address.values():
             if presence.identity:
@@ -204,9 +204,9 @@ def who_leaves(
     Parameters
     ----------
     present : collection of Presence
-        Everybody who is there, in the order in which they came.
+        All clients, in the order in which they came.
     host : str
-        Where the newcomer is.
+        Address of the newcomer.
     max_clients : int
         Most clients at once.
     now_us : int
@@ -215,8 +215,8 @@ def who_leaves(
     Returns
     -------
     Presence or None
-        Who has been silent for longest, else the last who came from the machine that holds more
-        than its share; None if all are alive and none does, or only the newcomer's own.
+        The client that has been silent longest, else the newest from the machine that holds more
+        than its share; None if all are alive and no machine, or only the newcomer's, holds more.
     """
     stalest = min(present, key=lambda presence: presence.heard_us)
     if now_us - stalest.heard_us >= SILENT_AFTER_US:

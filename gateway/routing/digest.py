@@ -1,4 +1,4 @@
-"""What strangers cause is told line by line only up to a rate, and beyond it as a number."""
+"""Limit the lines that strangers can cause: a few a minute in full, the rest as a number."""
 
 from typing import Final
 
@@ -8,14 +8,14 @@ WINDOW_US: Final = 60 * US_PER_S
 
 
 class Digest:
-    """Lines of one kind: a few of each minute in full, of the rest how many there were.
+    """Lines of one kind: a few of each minute in full, the others as their number.
 
     Parameters
     ----------
     in_full : int
-        Most lines told in full in one minute.
+        Most lines passed in full in one minute.
     rest : str
-        Called after the number of the others.
+        Text that follows the number of the others.
     """
 
     def __init__(self, in_full: int, rest: str) -> None:
@@ -25,13 +25,13 @@ class Digest:
         self._lines = 0
 
     def say(self, line: str, now_us: int) -> list[str]:
-        """Return what to tell when a line comes: it, or nothing."""
+        """Return the line if it may pass in full, else nothing."""
         found = self.poll(now_us)
         self._lines += 1
         return [*found, line] if self._lines <= self._in_full else found
 
     def poll(self, now_us: int) -> list[str]:
-        """Return what to tell at the end of a minute: how many were not told, if any."""
+        """Return at the end of a minute how many lines were held back, if any."""
         if now_us - self._begin_us < WINDOW_US:
             return []
         untold, self._lines, self._begin_us = self._lines - self._in_full, 0, now_us

@@ -2,18 +2,19 @@
 
     udp:HOST:PORT            send there; answers come back to the same socket
     udp-listen:HOST:PORT     serve every client that speaks to this port
-    udp-broadcast:HOST:PORT  send to a broadcast address, hear unicast answers
-    udp-multicast:GROUP:PORT send to a group and hear it
-    tcp:HOST:PORT            connect, and connect again when it breaks
+    udp-broadcast:HOST:PORT  send to a broadcast address, receive unicast answers
+    udp-multicast:GROUP:PORT send to a group and receive from it
+    tcp:HOST:PORT            connect, and reconnect when it breaks
     tcp-listen:HOST:PORT     serve every client that connects
-    ws:HOST:PORT             connect by WebSocket, and connect again when it breaks
+    ws:HOST:PORT             connect by WebSocket, and reconnect when it breaks
     ws-listen:HOST:PORT      serve every program and page that connects by WebSocket
-    wss:, wss-listen:        the same within TLS
+    wss:, wss-listen:        the same over TLS
     zenoh:tcp/HOST:7447      a fleet, through a Zenoh router; needs ?site=NAME
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
-IPv6 addresses stand in brackets. Options follow as in any URL:
-`?name=tablet&deny=RAW_IMU&pack=1100`. What other programs write is understood too: `spelling.py`.
+IPv6 addresses are written in brackets. Options follow as in any URL:
+`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of other programs are understood too:
+`spelling.py`.
 """
 
 import re
@@ -50,7 +51,7 @@ LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
 """How Zenoh names a place."""
 RAW_KEYS: Final = "mavlink_raw"
 SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
-"""What may stand between two slashes of a Zenoh key, or of a path, and means only itself there."""
+"""A segment of a Zenoh key or of a path without special characters."""
 
 
 class EndpointKind(StrEnum):
@@ -80,7 +81,7 @@ OPEN_TO_ALL: Final = frozenset(
         EndpointKind.WSS_LISTEN,
     }
 )
-"""Kinds whose peers nobody has named. They bind to an address; to look up a name would block."""
+"""Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
 LISTENING: Final = frozenset(
     {
         EndpointKind.UDP_LISTEN,
@@ -91,7 +92,7 @@ LISTENING: Final = frozenset(
 )
 """Kinds that bind to their port; to port 0 they bind to any that is free."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
-"""Kinds that speak within TLS."""
+"""Kinds that use TLS."""
 COMMON_OPTIONS: Final = frozenset(
     {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted"}
 )
@@ -102,7 +103,7 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WSS_LISTEN: frozenset({"origins"}),
     EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
 }
-"""What only some kinds know."""
+"""Options that only some kinds have."""
 
 
 HOSTED: Final = frozenset(
@@ -111,7 +112,7 @@ HOSTED: Final = frozenset(
 )
 """Kinds whose frames go to hosts by their addresses, one by one."""
 ADDED_KINDS: Final[set[str]] = set()
-"""Kinds of other packages; what follows their word is theirs to read."""
+"""Kinds of other packages, which parse the rest of the URL themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +129,7 @@ class Endpoint:
     place: str
     """The URL in our own spelling and without options; no two endpoints share one."""
     name: str
-    """What the operator calls it; the place unless given."""
+    """The name given by the operator; the place by default."""
     allow: frozenset[int] = frozenset()
     """Only these messages pass; empty lets all pass."""
     deny: frozenset[int] = frozenset()
@@ -145,9 +146,9 @@ class Endpoint:
     origins: frozenset[str] = frozenset()
     """Pages of other machines that may connect by WebSocket, as browsers name them."""
     path: str = "/"
-    """What a WebSocket server is asked for."""
+    """The path requested from a WebSocket server."""
     site: str = ""
-    """What a fleet calls this place."""
+    """The site's name in a fleet."""
     keys: str = SITE_KEYS
     """Where a fleet finds the frames: `site`, or `mavlink_raw` as mavlink-server has it."""
     config: str = ""
@@ -155,16 +156,16 @@ class Endpoint:
 
     @property
     def address(self) -> str:
-        """Where it is: `HOST:PORT`, or the device of a serial port."""
+        """Its address: `HOST:PORT`, or the device of a serial port."""
         whole = self.kind in (EndpointKind.SERIAL, EndpointKind.ZENOH) or self.kind in ADDED_KINDS
         return self.host if whole else host_and_port(self.host, self.port)
 
     def name_of(self, peer: str) -> str:
-        """Return what a caller of a listening endpoint is called, the name of the port first."""
+        """Return the name of a client of this port, which begins with the port's name."""
         return peer if self.name == self.place else f"{self.name} {peer}"
 
     def passes(self, message_id: int) -> bool:
-        """Return whether the lists let a message out to this endpoint."""
+        """Return whether the `allow` and `deny` lists let a message out to this endpoint."""
         return message_id not in self.deny and (not self.allow or message_id in self.allow)
 
 
@@ -218,7 +219,7 @@ def parse_endpoint(url: str) -> Endpoint:
 
 
 def host_and_port(host: object, port: object) -> str:
-    """Write a place as in a URL, an IPv6 address in brackets."""
+    """Write host and port as in a URL, an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
 
 
@@ -275,14 +276,14 @@ def stays_here(endpoint: Endpoint) -> bool:
 
 
 def _options(kind: str, query: str) -> dict[str, str]:
-    """Read the options; each may be there once, or it would hang on the order which one holds."""
+    """Read the options; each may be given once, or their order would decide which one counts."""
     known = COMMON_OPTIONS | OWN_OPTIONS.get(kind, frozenset())
     options: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
             raise ValueError(f"option {key!r} is none of {', '.join(sorted(known))}")
         if key in options:
-            raise ValueError(f"option {key!r} is there twice")
+            raise ValueError(f"option {key!r} is given twice")
         if ";" in value:
             raise ValueError(f"{key}={value!r}: options are joined by &")
         options[key] = value

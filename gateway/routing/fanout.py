@@ -1,15 +1,15 @@
 """Which outlet gets which frame, in which order and with which sequence number.
 
 Theory of operation. The first frame of each (system, component, message) makes a plan: the outlets
-that take it at every time, those that take it at a limited rate, and those that do not take it.
-Plans are thrown away when an outlet or a wish changes, so the usual frame costs one dictionary
-look-up and one call per outlet.
+that take every such frame, those that take it at a limited rate, and those that do not take it.
+Plans are discarded when an outlet or a requested rate changes, so the usual frame costs one
+dictionary look-up and one call per outlet.
 
 A frame that one outlet does not get (filtered, limited, or an answer to another client) leaves a
-gap in the sequence numbers there, which ground stations show as loss of the radio. So our own
-frames are numbered anew for those outlets: each outlet remembers how many it was not given, and
-all outlets that lack the same number share one copy, which is signed too if our vehicle signs.
-Frames of other vehicles are never touched; a filter on those does show as loss.
+gap in the sequence numbers there, which ground stations show as radio loss. So our own frames are
+renumbered for those outlets: each outlet remembers how many it was not given, and all outlets that
+lack the same number share one copy, which is signed too if our vehicle signs. Frames of other
+vehicles are never touched; a filter on those does show as loss.
 
 What goes to an outlet of a known width is counted, and thinned once a second so that it fits: see
 `width.py`.
@@ -68,7 +68,7 @@ class _Outlet:
         return self.stamps.setdefault(origin, _Stamp())
 
     def interval_us(self, key: bytes, plan: "_Plan") -> int:
-        """Return the least time between two frames; the settings bound what a client wishes."""
+        """Return the least time between two frames; the settings bound a client's request."""
         endpoint, message_id, system = self.endpoint, plan.message_id, plan.origin[0]
         if not endpoint.passes(message_id):
             return NO_MESSAGES
@@ -114,7 +114,7 @@ class _Plan:
     closed: list[_Stamp] = field(default_factory=list)
 
     def due(self, now_us: int) -> list[_Lane]:
-        """Return who gets a frame now; those for whom it is too soon skip its number."""
+        """Return the lanes that get a frame now; those for which it is too soon skip its number."""
         lanes = list(self.open)
         for lane in self.limited:
             if lane.is_due(now_us):
@@ -153,7 +153,7 @@ class Fanout:
             self._change()
 
     def reconfigure(self, client_id: int, endpoint: Endpoint) -> None:
-        """Let changed lists and rates hold from the next frame on."""
+        """Apply changed lists and rates from the next frame on."""
         if outlet := self._outlets.get(client_id):
             if outlet.endpoint.budget != endpoint.budget:
                 outlet.width = _width(endpoint)
@@ -161,7 +161,7 @@ class Fanout:
             self._change()
 
     def set_interval(self, wish: ClientInterval) -> None:
-        """Take a client's wish for a rate; a wish of a client that has gone is ignored."""
+        """Apply a client's requested rate; that of a client that has gone is ignored."""
         if outlet := self._outlets.get(wish.client_id):
             outlet.wishes[wish.system_id, wish.message_id] = wish.interval_us
             self._plans.clear()
@@ -183,9 +183,9 @@ class Fanout:
             _skip(stamp)
 
     def align(self, client_ids: Sequence[int]) -> None:
-        """Let outlets be sent the same from now on, number for number: they lead to one peer.
+        """Send outlets to one peer the same frames, number for number, from now on.
 
-        What one of them wishes holds for all; where they differ, the first decides.
+        A rate that one of them requested holds for all; where they differ, the first decides.
         """
         outlets = [self._outlets[key] for key in client_ids if key in self._outlets]
         origins = {origin for outlet in outlets for origin in outlet.stamps}
@@ -237,12 +237,12 @@ class Fanout:
                 outlet.transmit(frame, message_id)
 
     def thin(self, now_us: int) -> bool:
-        """Fit what goes to outlets of a known width into it; to be called once a second or so.
+        """Thin the frames to outlets of a known width so that they fit; call it once a second.
 
         Returns
         -------
         bool
-            Whether somebody who got all frames of a kind gets fewer now, or all of them again.
+            Whether an outlet that got all frames of a kind gets fewer now, or all of them again.
         """
         if not self._is_metered or now_us - self._thinned_us < US_PER_S:
             return False
@@ -259,7 +259,7 @@ class Fanout:
         return bool(stale)
 
     def _rethin(self, key: bytes, plan: _Plan) -> bool:
-        """Give a plan's lanes their new intervals; return whether one belongs elsewhere now."""
+        """Give a plan's lanes new intervals; return whether one belongs to another list now."""
         is_stale = False
         for lanes, is_limited in ((plan.open, False), (plan.limited, True)):
             for lane in lanes:
@@ -271,7 +271,7 @@ class Fanout:
         return is_stale
 
     def meter(self, key: bytes, message_id: int, frames: int, size: int) -> None:
-        """Note frames that went to all who take them, on whatever way."""
+        """Count frames that went to all who take them, whichever way they went."""
         _, known_frames, known_size = self._offered.get(key, (0, 0, 0))
         if self._is_metered and len(self._offered) < MAX_PLANS:
             self._offered[key] = message_id, known_frames + frames, known_size + size

@@ -96,7 +96,7 @@ class HubSettings(Settings, frozen=True):
                 errors.append(str(error))
                 continue
             if endpoint.place in places:
-                errors.append(f"endpoint {endpoint.place!r} is there twice")
+                errors.append(f"endpoint {endpoint.place!r} is given twice")
             if endpoint.kind is EndpointKind.WSS_LISTEN and not self.tls_certificate:
                 errors.append(f"endpoint {endpoint.place!r} needs a tls_certificate")
             places.add(endpoint.place)

@@ -1,4 +1,4 @@
-"""Values of an endpoint's options: read, bounded, and refused by saying what is allowed."""
+"""Values of an endpoint's options: read and checked; the errors say what is allowed."""
 
 from typing import Final
 

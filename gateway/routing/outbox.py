@@ -2,12 +2,12 @@
 
 Three queues. The attitude and the answers a person waits for are urgent; other telemetry is usual;
 parameters, missions and files are bulk. An urgent frame goes first, but after a few of them one of
-the others gets its turn, so that a parameter list is slow on a slow radio and yet ends. When the
-bound is reached the oldest telemetry goes, usual before urgent, and bulk last: telemetry comes
-again, an answer does not.
+the others gets its turn, so that a parameter list is slow on a slow radio but completes. When the
+bound is reached the oldest telemetry is dropped, usual before urgent, and bulk last: telemetry
+comes again, an answer does not.
 
-Frames leave in another order than they came, and some do not leave at all; the numbers of our own
-are therefore given at the exit. Loss that a ground station shows is then the link's alone.
+Frames leave in another order than they came, and some are dropped; so our own frames are numbered
+at the exit. Loss that a ground station shows is then only that of the link.
 """
 
 import math
@@ -45,12 +45,12 @@ class Numbering:
     Each frame keeps its step from the one before it in our own order; at the exit the steps of
     those that leave add up. So without drops every frame leaves as it came, gaps of a recording
     included, and with drops the numbers run on without a gap.
-    What is signed is signed anew, since a frame that was overtaken bears too early a stamp.
+    Signed frames are signed again, since a frame that was overtaken has too early a time stamp.
 
     Parameters
     ----------
     is_own : callable
-        Tells whether an origin is one of our vehicles; frames of others are never touched.
+        Whether an origin is one of our vehicles; frames of others are never touched.
     seal : callable
         Numbers, and signs, each frame of ours that leaves.
     """
@@ -73,7 +73,7 @@ class Numbering:
         return sequence - before & SEQUENCE_MASK
 
     def leave(self, frame: bytes, step: int | None) -> bytes:
-        """Return a frame as it shall go out."""
+        """Return a frame as it is to be sent."""
         if step is None:
             return frame
         origin = origin_of(frame)
@@ -113,14 +113,14 @@ class Outbox:
         frame : bytes
             A complete frame.
         message_id : int
-            Tells the queue.
+            Decides in which queue it waits.
         step : int, optional
-            Comes out again with the frame; see `Numbering`.
+            Returned with the frame; see `Numbering`.
 
         Returns
         -------
         int
-            How many older frames had to go for it.
+            How many older frames were dropped for it.
         """
         if message_id in URGENT_IDS:
             queue = self._urgent
@@ -192,10 +192,10 @@ class Packer:
 
 
 class Pacer:
-    """Keep the buffer of a serial line short, so that the urgent need not wait behind it.
+    """Keep the buffer of a serial line short, so that urgent frames need not wait behind it.
 
-    A driver takes kilobytes at once, which at 57600 Bd is most of a second. The pacer reckons when
-    the line will have sent what it was given and lets the next frame in just before.
+    A driver takes kilobytes at once, which at 57600 Bd is most of a second. The pacer computes
+    when the line will have sent what it was given and lets the next frame in just before.
 
     Parameters
     ----------

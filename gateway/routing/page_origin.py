@@ -1,10 +1,10 @@
-"""Hosts: what they are, and whose pages may open a WebSocket.
+"""Hosts: how to classify them, and whose pages may open a WebSocket.
 
-Those of this machine may, and those that the operator names.
+Pages of this machine may, and those of origins that the operator allows.
 
-A browser lets any page of any site connect to any port, this machine's own included, and tells
-the server only whose page it is (RFC 6454, RFC 6455 section 10.2). Programs that are no browsers
-tell nothing and are judged like those that come by TCP.
+A browser lets any page of any site connect to any port, this machine's own included, and sends the
+server only the page's origin (RFC 6454, RFC 6455 section 10.2). Programs that are not browsers
+send none and are treated like TCP clients.
 """
 
 import ipaddress
@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 _HOST: Final = re.compile(r"[\w.-]+")
 NULL_ORIGIN: Final = "null"
-"""What a browser tells of a page that was opened as a file, and of any page in a sandbox."""
+"""The origin that a browser sends for a page opened as a file, and for any sandboxed page."""
 
 
 def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
@@ -24,12 +24,12 @@ def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
     Parameters
     ----------
     origin : str
-        As the browser tells it, such as `http://localhost:8080`.
+        As the browser sends it, such as `http://localhost:8080`.
     local_host : str
         Address of ours that the browser connected to. A page from there is of this machine too;
-        what the browser believes to be our name proves nothing.
+        the host name that the browser used proves nothing.
     named : collection of str
-        Origins that are allowed beside those of this machine, in lower case.
+        Origins that are allowed in addition to those of this machine, in lower case.
 
     Returns
     -------
@@ -60,12 +60,12 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_name(host: str) -> bool:
-    """Return whether the resolver would take it; one that does not raises each time it is asked."""
+    """Return whether the resolver would accept a host; it raises for every one that it does not."""
     try:
         host.encode("idna")
     except UnicodeError:
         return False
-    # Four numbers with a slip of the hand are no name either.
+    # A mistyped IPv4 address is no name either.
     return _HOST.fullmatch(host) is not None and not host.replace(".", "").isdecimal()
 
 
@@ -84,7 +84,7 @@ def is_group(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is one of this machine alone; a name is none but `localhost`."""
+    """Return whether an address is loopback; of the names only `localhost` is."""
     if host == "localhost":
         return True
     if not is_numeric(host):

@@ -1,9 +1,9 @@
-"""Round trips: the questions that clients answer by themselves, and which answer is ours.
+"""Round trips, measured by requests that clients answer automatically.
 
-Some ground stations answer PING, others only TIMESYNC; both are asked. The questions come from a
-component of their own (the MAVLink id of a UDP bridge), so they leave no gap in the sequence
-numbers of the vehicle and no answer meant for the vehicle is mistaken. Those of another gateway are
-answered by that component too, and go no further: what they measure is this one link.
+Some ground stations answer PING, others only TIMESYNC; both are sent. The requests come from a
+separate component (the MAVLink id of a UDP bridge), so they leave no gap in the sequence numbers
+of the vehicle, and no answer meant for the vehicle is mistaken for one of theirs. Requests of
+another gateway are answered by that component too and not forwarded: they measure this one link.
 """
 
 from typing import Final
@@ -17,14 +17,14 @@ from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, tar
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
 LONGEST_US: Final = 60 * US_PER_S
-"""An answer to anything older is none."""
+"""An answer to an older request is ignored."""
 NS_PER_US: Final = 1000
 NOBODY: Final = 0
 MEASURING: Final = frozenset({dialect.MAVLINK_MSG_ID_PING, dialect.MAVLINK_MSG_ID_TIMESYNC})
 
 
 def is_of_probe(frame: bytes) -> bool:
-    """Return whether a frame is one by which another gateway measures a link."""
+    """Return whether a frame is a round-trip request or answer of another gateway."""
     return (
         origin_of(frame)[1] == PROBE_COMPONENT
         and message_id_of(frame) in MEASURING
@@ -33,12 +33,12 @@ def is_of_probe(frame: bytes) -> bool:
 
 
 class RoundTrip:
-    """Ask for round trips and read the answers.
+    """Send round-trip requests and read the answers.
 
     Parameters
     ----------
     seal : callable
-        Numbers, and signs, each question that leaves.
+        Numbers, and signs, each request that leaves.
     """
 
     def __init__(self, seal: Seal = restamp) -> None:
@@ -48,16 +48,16 @@ class RoundTrip:
 
     @property
     def origin(self) -> Origin:
-        """System and component that the questions come from; system 0 before the first."""
+        """System and component that the requests come from; system 0 before the first."""
         return self._sender.srcSystem, PROBE_COMPONENT
 
     def ask(self, system: int, now_us: int) -> list[tuple[bytes, int]]:
-        """Build the questions of one round.
+        """Build the requests of one round.
 
         Parameters
         ----------
         system : int
-            One of our vehicles, as whose part the gateway speaks.
+            One of our vehicles; the gateway sends as one of its components.
         now_us : int
             Gateway time; comes back in the answers.
 
@@ -76,7 +76,7 @@ class RoundTrip:
         ]
 
     def read(self, frame: bytes, now_us: int) -> int | None:
-        """Return the round trip in microseconds if a frame answers a question of ours."""
+        """Return the round trip in microseconds if a frame answers a request of ours."""
         message_id = message_id_of(frame)
         if message_id == dialect.MAVLINK_MSG_ID_PING:
             answer = self._decode(frame)
@@ -94,21 +94,21 @@ class RoundTrip:
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None
 
     def answer(self, frame: bytes, system: int, now_us: int) -> tuple[bytes, int] | None:
-        """Answer a question that another gateway asks this one.
+        """Answer a round-trip request of another gateway.
 
         Parameters
         ----------
         frame : bytes
             Any frame.
         system : int
-            One of our vehicles, as whose part the gateway speaks.
+            One of our vehicles; the gateway sends as one of its components.
         now_us : int
             Gateway time.
 
         Returns
         -------
         tuple of bytes and int, or None
-            Frame and message id; None if that is no such question.
+            Frame and message id; None if the frame is no such request.
         """
         asked = self._decode(frame) if is_of_probe(frame) else None
         if asked is None:

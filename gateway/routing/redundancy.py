@@ -1,11 +1,11 @@
 """Which clients are links to one and the same peer.
 
-Two links to one peer bring the same bytes, each by its own way. What we pass on may come back and
-looks the same, so only frames that go no further count. Whoever is known to be such a pair is
-answered on both, and what is sent to one in a stream of its own is sent to the other: then both
-links carry the same numbers, and the peer can tell copies by their bytes in its turn. Two ground
-stations that share an id and were started at the same moment look alike, and are served alike: each
-gets the answer to what only one of them was heard to ask.
+Two links to one peer bring the same bytes, each by its own path. Frames that we forward may come
+back and look the same, so only frames that are not forwarded count. The two links of such a pair
+both get every answer, and also any stream that only one of them requested: then both links carry
+the same sequence numbers, and the peer can recognise copies by their bytes too. Two ground
+stations that share an id and were started at the same moment look like such a pair: each gets the
+answers to the other's requests.
 """
 
 from typing import Final
@@ -24,7 +24,7 @@ class RedundantLinks:
         self._groups: dict[int, tuple[int, ...]] = {}
 
     def note(self, first: int, second: int, now_us: int) -> bool:
-        """Note that a client has brought a copy of another's frame; return whether that is news."""
+        """Note that a client brought a copy of another's frame; return if the pair is new."""
         pair = (first, second) if first < second else (second, first)
         is_new = pair not in self._seen_us
         self._seen_us[pair] = now_us
@@ -37,7 +37,7 @@ class RedundantLinks:
         return self._groups.get(client_id, (client_id,))
 
     def expire(self, now_us: int) -> None:
-        """Part pairs of which no copies come any more."""
+        """Separate pairs that bring no copies any more."""
         gone = [pair for pair, us in self._seen_us.items() if now_us - us > LINKED_US]
         self._part(gone)
 

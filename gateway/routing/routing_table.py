@@ -1,17 +1,17 @@
-"""Where systems are, and which frames have been here before.
+"""Which client leads to which system, and which frames have been seen before.
 
-Routing follows the MAVLink guide: a frame that names nobody goes to everybody but its sender; a
-frame that names a system goes only where that system (and component, if it was ever heard) speaks.
-Two ways to one system, or a cable that leads back, bring the same bytes twice; all but the first
-are dropped, from wherever they come, or they would run round a ring for ever. Memory of frames is
-kept only for systems that are heard by more than one way; a copy of what was said before its way
-was there passes, for there is no telling it from a program that was started again and repeats its
-first frames from another port.
+Routing follows the MAVLink guide: a frame without a target goes to everybody but its sender; a
+frame with a target system goes only where that system (and component, if it was ever heard) was
+heard. Two paths to one system, or a link that leads back, bring the same bytes twice; all but the
+first are dropped, whichever client brings them, or they would run round a loop for ever. Frames
+are remembered only for systems that are heard by more than one path; a copy of a frame from before
+its path existed passes, because it cannot be told from a program that was restarted and repeats
+its first frames from another port.
 
-One deviation: what a ground station says to everybody goes only where there are vehicles. Stations
-have nothing to tell each other, and scripts take the first heartbeat they hear for the vehicle's.
+One deviation: broadcasts of a ground station go only where there are vehicles. Stations need no
+messages of each other, and scripts take the first heartbeat they receive for the vehicle's.
 
-Only trusted clients belong in here: whoever may write into these tables decides who hears what.
+Only trusted clients belong in here: these tables decide who receives what.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ Origin = tuple[int, int]
 MAX_ORIGINS: Final = 256
 """Remembered per client: every system there can be, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
-"""A way on which a system has spoken so lately is preferred to ways on which it fell silent."""
+"""A path on which a system was heard this recently is preferred to silent ones."""
 MEMORY_US: Final = US_PER_S
 """Copies come within a radio's delay."""
 MEMORY_OF_ONE: Final = 224
@@ -45,19 +45,19 @@ class _Way:
     """Its first frame after a silence."""
     heard_us: int
     is_station: bool = False
-    """What its last heartbeat by this way said."""
+    """Whether its last heartbeat by this path was a ground station's."""
 
     def is_fresh(self, now_us: int) -> bool:
         return now_us - self.heard_us <= ROUTE_FRESH_US
 
 
 class RoutingTable:
-    """Which client has spoken for which system.
+    """Which client has brought frames of which system.
 
     Parameters
     ----------
     max_origins : int, optional
-        Remembered per client; a newcomer takes the place of the one that is silent longest.
+        Remembered per client; a new one replaces the one that has been silent longest.
     """
 
     def __init__(self, max_origins: int = MAX_ORIGINS) -> None:
@@ -74,7 +74,7 @@ class RoutingTable:
         Returns
         -------
         bool
-            Whether it is news of which others must know: a further way to a system.
+            Whether this is a new path to a system, which other parts must take into account.
         """
         ways = self._to.get(origin)
         way = ways.get(client_id) if ways else None
@@ -87,7 +87,7 @@ class RoutingTable:
         return len(self._to[origin]) > 1
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
-        """Return whether a system has been heard recently by more than one way."""
+        """Return whether a system has been heard recently by more than one path."""
         ways = self._to.get(origin)
         if ways is None or len(ways) == 1:
             return False
@@ -99,7 +99,7 @@ class RoutingTable:
         return 0 if way is None else way.since_us
 
     def note_kind(self, client_id: int, origin: Origin, *, is_station: bool) -> None:
-        """Note what a heartbeat that a client brought says of its sender."""
+        """Note what a client's heartbeat says about the type of its sender."""
         if way := self._to.get(origin, {}).get(client_id):
             way.is_station = is_station
 
@@ -117,7 +117,7 @@ class RoutingTable:
         ]
 
     def forget(self, client_id: int) -> None:
-        """Drop what a client has said."""
+        """Forget everything about a client."""
         for origin in self._of_client.pop(client_id, {}):
             self._drop(client_id, origin)
 
@@ -126,7 +126,7 @@ class RoutingTable:
         return tuple(self._of_client.get(client_id, ()))
 
     def ways_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
-        """Find the clients behind which a target is.
+        """Find the clients that lead to a target.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class RoutingTable:
         if len(known) >= self._max_origins:
             stalest = min(known, key=lambda each: known[each].heard_us)
             if known[stalest].is_fresh(now_us):
-                # More live systems than there is room for: to keep this one would lose another.
+                # More live systems than there is room for: keeping this one would lose another.
                 return False
             del known[stalest]
             self._drop(client_id, stalest)
@@ -182,7 +182,7 @@ class RoutingTable:
 
 
 class FrameMemory(Generic[Note]):
-    """What is known of the newest frames, by their bytes: of one to two spans, and so many at most.
+    """What is known of the newest frames, by their bytes: of one to two spans, bounded.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ class FrameMemory(Generic[Note]):
 
 
 class LoopGuard:
-    """Remember the frames of the last second and tell copies."""
+    """Remember the frames of the last second and recognise copies."""
 
     def __init__(self) -> None:
         self._memory: FrameMemory[tuple[int, int, int]] = FrameMemory(MEMORY_US, MEMORY_FRAMES)
@@ -227,7 +227,7 @@ class LoopGuard:
     def first_way(
         self, frame: bytes, origin: Origin, client_id: int, since_us: int, now_us: int
     ) -> int | None:
-        """Note a frame; return who has brought the same bytes before.
+        """Note a frame; return which client brought the same bytes before.
 
         Parameters
         ----------

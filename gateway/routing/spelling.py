@@ -1,4 +1,4 @@
-"""How other programs write an endpoint, read as they mean it.
+"""The endpoint spellings of other programs, read with their meaning.
 
 | written                                        | by                         | here             |
 | ---------------------------------------------- | -------------------------- | ---------------- |
@@ -38,7 +38,7 @@ LISTENING: Final = frozenset({"udp-listen", "tcp-listen", "ws-listen", "wss-list
 
 
 def respell(address: str) -> tuple[str, str]:
-    """Read an endpoint without its options, as whoever wrote it means it.
+    """Read an endpoint without its options, in any of the spellings.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def respell(address: str) -> tuple[str, str]:
     Raises
     ------
     ValueError
-        If programs differ about what it means; the text says how to write what is meant.
+        If programs differ about its meaning; the error names the unambiguous spellings.
     """
     if address.startswith("/"):
         device, comma, baud = address.partition(",")
@@ -84,7 +84,7 @@ def _is_bare(word: str, place: str) -> bool:
 
 
 def _either(kind: str, place: str) -> str:
-    """Say how to write both things that may be meant."""
+    """Return how to write both possible meanings."""
     host, _, port = place.rpartition(":")
     if not port.isdecimal():
         host, port = place, "PORT"

@@ -1,7 +1,7 @@
-"""Trouble with clients and ports, told in words: once when it comes, once when it has passed.
+"""Problems of clients and ports, announced as text: once when they begin, once when they end.
 
-Every configured client has its own words. Those who call at a listening port may be anybody, and
-any number: of them only a few are named in a minute, so that an attack drowns nothing else.
+Every configured client gets its own texts. The clients of a listening port may be anybody, and any
+number: of them only a few are named in a minute, so that an attack cannot hide other texts.
 """
 
 from typing import Final
@@ -11,20 +11,20 @@ from gateway.routing.digest import Digest
 from gateway.units import US_PER_S
 
 PATIENCE_US: Final = 5 * US_PER_S
-"""A network that comes back sooner is not worth a word."""
+"""A shorter outage is not announced."""
 QUIET_US: Final = 30 * US_PER_S
 """A client that has dropped nothing for so long is no longer slow."""
 TROUBLED_STATES: Final = frozenset({"unreachable", "resolving", "connecting"})
 """`refused` is not among them: a ground station that is not running is nothing unusual."""
 CALLERS_IN_FULL: Final = 3
-"""Callers' troubles that are told one by one in a minute."""
+"""Problems of listening ports' clients that are announced one by one in a minute."""
 
 Key = int | str
 """Id of a client, or URL of a listening port."""
 
 
 class TroubleWatch:
-    """Tell trouble from the figures of clients and listening ports."""
+    """Detect problems from the figures of clients and listening ports."""
 
     def __init__(self) -> None:
         self._away_since_us: dict[Key, int] = {}
@@ -40,7 +40,7 @@ class TroubleWatch:
         listeners: tuple[ListenerStats, ...],
         now_us: int,
     ) -> list[str]:
-        """Look at all; return what is new to tell.
+        """Look at all figures; return the new texts.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class TroubleWatch:
             found = self._away(client.client_id, client.name, trouble, now_us)
             found += self._slow(client, now_us)
             if client.endpoint in ports:
-                found = [told for text in found for told in self._callers.say(text, now_us)]
+                found = [line for text in found for line in self._callers.say(text, now_us)]
             texts += found
         return texts
 

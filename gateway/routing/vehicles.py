@@ -1,4 +1,4 @@
-"""Which systems are ours, and what a new client is told of them at once."""
+"""Which systems are ours, and which frames greet a new client at once."""
 
 from typing import Final
 
@@ -35,15 +35,15 @@ class OwnVehicles:
 
     @property
     def has_newcomers(self) -> bool:
-        """Whether any newcomer waits."""
+        """Whether a newcomer waits."""
         return bool(self._newcomers)
 
     def note(self, frame: bytes, message_id: int, now_us: int) -> bool:
-        """Note a frame of ours, for greetings if it belongs there; tell if its vehicle is new."""
+        """Note a frame of ours, maybe for greetings; return whether its vehicle is new."""
         origin = origin_of(frame)
         is_new = not self.is_own(origin, now_us)
         if is_new:
-            # What an earlier playback said of this system holds no more.
+            # What an earlier playback sent of this system is outdated.
             self._frames[origin] = {}
         if is_new or message_id in GREETING:
             self._seen_us[origin] = now_us
@@ -61,7 +61,7 @@ class OwnVehicles:
         return [origin[0] for origin in self._seen_us if self.is_own(origin, now_us)]
 
     def await_greeting(self, client_id: int) -> None:
-        """Let a newcomer be greeted by every vehicle."""
+        """Queue a newcomer for the greetings of every vehicle."""
         for origin in self._frames:
             self._newcomers.setdefault(origin, []).append(client_id)
 
@@ -74,7 +74,7 @@ class OwnVehicles:
                 del self._newcomers[origin]
 
     def greet(self, frame: bytes) -> tuple[list[int], list[tuple[bytes, int]]]:
-        """Return who waits for the sender of a frame, and what to tell them before it.
+        """Return who waits for the sender of a frame, and the frames to send them first.
 
         Returns
         -------

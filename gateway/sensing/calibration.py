@@ -31,11 +31,11 @@ _Rows = tuple[
     tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share]
 ]
 _FLAT: Final = 1e-3
-"""Determinant of a matrix that leaves no three axes to tell apart."""
+"""Determinant below which a matrix counts as singular."""
 
 
 class NodeCalibration(Settings, frozen=True):
-    """How one IMU node errs and how it is mounted.
+    """The sensor errors of one IMU node, and how it is mounted.
 
     A calibrated vector is `R @ M @ (s - b)`: `s` in SI and sensor axes, `b` the bias, `M` the
     scale and misalignment, `R` the mounting rotation into body FRD.
@@ -85,7 +85,7 @@ class NodeCalibration(Settings, frozen=True):
     ] = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse matrices that cannot be what they are said to be."""
+        """Refuse matrices that are no rotations, or have no inverse."""
         for name in ("mounting", "mag_mounting"):
             if not is_rotation(getattr(self, name)):
                 raise ValueError(f"{name} must be a rotation: orthogonal rows of length one")
@@ -126,7 +126,7 @@ def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
 
 
 def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
-    """Scale HMC5883L counts to uT in sensor axes; None where an axis overflowed."""
+    """Scale HMC5883L counts to uT in sensor axes; None if an axis overflowed."""
     if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw:
         return None
     scale = UT_PER_GAUSS / lsb_per_gauss
@@ -134,7 +134,7 @@ def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
 
 
 def temperature_from_counts(raw: int) -> float:
-    """Convert the MPU6050's temperature word to deg C."""
+    """Convert the MPU6050's temperature register to deg C."""
     return raw / 340.0 + 36.53
 
 

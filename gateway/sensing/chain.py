@@ -32,7 +32,7 @@ from gateway.units import US_PER_S
 IntArray = NDArray[np.int64]
 
 GAP_US: Final = 500_000
-"""Longer silence: the past says nothing about now, and the filters start afresh."""
+"""After a longer gap the filters are reset."""
 RATE_WINDOW: Final = 64
 """Samples over which the sample rate is averaged; time stamps jitter by the radio's retries."""
 RETUNE_RATIO: Final = 0.1
@@ -59,7 +59,7 @@ class SensingSettings(Settings, frozen=True):
         float,
         setting(
             "Cutoff of the angular rate's first-order high-pass; 0 for none. It takes the steady "
-            "rate of a long turn away like a bias. Only the paper's estimator listens to it.",
+            "rate of a long turn away like a bias. Only the paper's estimator uses it.",
             "Hz",
             ge=0.0,
             le=10.0,
@@ -90,7 +90,7 @@ def pressure_altitude_m(pressure_pa: float) -> float:
 
 
 class SensorChain:
-    """Calibrates and filters the samples of one aircraft; never raises on data.
+    """Calibrate and filter the samples of one aircraft; never raises on data.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class SensorChain:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past but not the settings."""
+        """Clear the filters' state but keep the settings."""
         self._rate_hz = self._settings.nominal_rate_hz
         self._lowpass = VectorFilter(self._design_lowpass, self._rate_hz)
         self._highpass = VectorFilter(self._design_highpass, self._rate_hz)
@@ -117,12 +117,12 @@ class SensorChain:
         self._window: tuple[int, int] = (0, 0)
 
     def snapshot(self) -> bytes:
-        """Write down all that is remembered."""
+        """Return the whole state as bytes."""
         memory = (self._rate_hz, self._lowpass.state, self._highpass.state)
         return msgspec.msgpack.encode((*memory, self._last_us, self._window))
 
     def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot; raises ValueError if it is none."""
+        """Restore a snapshot; raises ValueError if it is invalid."""
         rate_hz, lowpass, highpass, self._last_us, self._window = msgspec.msgpack.decode(
             snapshot, type=_Memory
         )
@@ -133,7 +133,7 @@ class SensorChain:
 
     @property
     def rate_hz(self) -> float:
-        """The sample rate that the filters are designed for now."""
+        """Sample rate for which the filters are designed now."""
         return self._rate_hz
 
     def imu(self, raw: ImuRaw) -> ImuSample:
@@ -147,7 +147,7 @@ class SensorChain:
         Returns
         -------
         ImuSample
-            Calibrated SI values and their filtered twins.
+            Calibrated SI values, unfiltered and filtered.
         """
         mag = None
         if raw.flags & ImuFlags.MAG_NEW and not raw.flags & ImuFlags.MAG_ABSENT:
@@ -171,7 +171,7 @@ class SensorChain:
         temperature_degc: float,
         flags: ImuFlags,
     ) -> ImuSample:
-        """Filter a sample that is calibrated already, such as one of somebody else's log.
+        """Filter a sample that is calibrated already, such as one of another program's log.
 
         Parameters
         ----------
@@ -185,12 +185,12 @@ class SensorChain:
         temperature_degc : float
             NaN if not known.
         flags : ImuFlags
-            Tells what is filtered already.
+            What is filtered already.
 
         Returns
         -------
         ImuSample
-            The same values with their filtered twins.
+            The same values, unfiltered and filtered.
         """
         self._track_rate(time_us)
         accel_lowpass, gyro_highpass = accel_b_mps2, gyro_b_radps
@@ -212,7 +212,7 @@ class SensorChain:
     def filter_log(
         self, time_us: IntArray, accel_b_mps2: FloatArray, gyro_b_radps: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Filter a whole log; bit for bit what `imu_si` gives for samples that are not filtered.
+        """Filter a whole log; bit-identical to `imu_si` for samples that are not filtered.
 
         Parameters
         ----------
@@ -224,7 +224,7 @@ class SensorChain:
         Returns
         -------
         accel, gyro : ndarray, shape (n, 3)
-            Behind the low-pass and the high-pass.
+            After the low-pass and the high-pass.
         """
         accel, gyro = np.empty_like(accel_b_mps2), np.empty_like(gyro_b_radps)
         begin = 0
@@ -268,13 +268,13 @@ class SensorChain:
         return design_highpass(self._settings.gyro_highpass_hz, rate_hz)
 
     def _track_rate(self, time_us: int) -> None:
-        """Measure the sample rate; start afresh after a gap, design anew when it has changed."""
+        """Measure the sample rate; reset the filters after a gap, redesign them if it changed."""
         rate_hz = self._measured(time_us)
         if rate_hz is not None:
             self._begin_anew(rate_hz)
 
     def _begin_anew(self, rate_hz: float) -> None:
-        """Design the filters for another rate, or forget their past where it is the same."""
+        """Redesign the filters for another rate, or reset them if it is the same."""
         if rate_hz == self._rate_hz:
             self._lowpass.reset()
             self._highpass.reset()
@@ -284,7 +284,7 @@ class SensorChain:
         self._highpass.retune(rate_hz)
 
     def _measured(self, time_us: int) -> float | None:
-        """Return the rate to begin anew with: another one, or after a gap the same; else None."""
+        """Return the rate to restart with: another one, or after a gap the same; else None."""
         last, self._last_us = self._last_us, time_us
         if last is None:
             return None
@@ -303,7 +303,7 @@ class SensorChain:
 
 
 def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:
-    """Pass a finite vector through; hold the last output in place of one that is not."""
+    """Filter a finite vector; repeat the last output for one that is not finite."""
     if math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2]):
         return vector_filter.step(v)
     return v if vector_filter.state is None else vector_filter.state[1]

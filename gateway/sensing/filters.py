@@ -1,7 +1,8 @@
 """The paper's filters on vectors of three: second-order low-pass and first-order high-pass.
 
 One compiled step serves the live sample and the offline array, so both give the same bits. The
-filters start as if the first sample had stood for ever, so they have no start-up transient.
+filters start as if the first sample had been constant for ever, so they have no start-up
+transient.
 """
 
 import math
@@ -25,8 +26,8 @@ FilterState = tuple[Delays, Vec3]
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
 SLOWEST_HIGHPASS_HZ: Final = 1e-6
-"""A time constant of 44 hours: no flight can tell a slower one from none, while rounding would put
-its pole on the unit circle, where it has no gain at rest any more."""
+"""A time constant of 44 hours: a slower one makes no difference in any flight, while rounding
+would put its pole on the unit circle, where its gain at 0 Hz is undefined."""
 
 
 def design_lowpass(
@@ -49,7 +50,7 @@ def design_lowpass(
     Returns
     -------
     tuple of 5 floats
-        Coefficients; those of a wire where the cutoff is at or above half the sample rate.
+        Coefficients; those of a pass-through if the cutoff is at or above half the sample rate.
     """
     if cutoff_hz >= 0.5 * rate_hz:
         return PASS_THROUGH
@@ -66,7 +67,7 @@ def design_lowpass(
 
 
 def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
-    """Design a first-order high-pass; a cutoff of `SLOWEST_HIGHPASS_HZ` or less gives a wire.
+    """Design a first-order high-pass; a cutoff of `SLOWEST_HIGHPASS_HZ` or less passes all.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ def gain_at_rest(c: Coefficients) -> float:
 
 @compiled
 def settled(c: Coefficients, x: Vec3, y: Vec3) -> Delays:
-    """Find the delays of a filter at which a constant input `x` gives a constant output `y`."""
+    """Find the filter state at which a constant input `x` gives a constant output `y`."""
     b1, b2, a1, a2 = c[1], c[2], c[3], c[4]
     w0, w1, w2 = b2 * x[0] - a2 * y[0], b2 * x[1] - a2 * y[1], b2 * x[2] - a2 * y[2]
     return (
@@ -151,16 +152,16 @@ class VectorFilter:
         """None before the first sample. May be read and restored."""
 
     def reset(self) -> None:
-        """Forget the past: the next sample starts the filter afresh."""
+        """Reset the filter: the next sample starts it again."""
         self.state = None
 
     def retune(self, rate_hz: float) -> None:
-        """Design anew for another sample rate without a step in the output.
+        """Redesign for another sample rate without a step in the output.
 
         Parameters
         ----------
         rate_hz : float
-            The rate from here on.
+            The new rate.
         """
         self._coefficients = self._design(rate_hz)
         if self.state is not None:
@@ -187,7 +188,7 @@ class VectorFilter:
         return y
 
     def run(self, x: FloatArray) -> FloatArray:
-        """Filter an array; bit for bit what as many calls of `step` give.
+        """Filter an array; bit-identical to that many calls of `step`.
 
         Parameters
         ----------

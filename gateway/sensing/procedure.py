@@ -1,6 +1,6 @@
 """The steps of a calibration: what to measure, and how it changes the node's calibration.
 
-Each step takes the samples that a person's poses made and the calibration so far, and gives the
+Each step takes the samples of the operator's poses and the calibration so far, and returns the
 calibration with its own part replaced. A log runs through the same steps.
 """
 
@@ -49,7 +49,7 @@ def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCa
 def calibrate_accelerometer(
     samples: Sequence[NodeSamples], calibration: NodeCalibration
 ) -> NodeCalibration:
-    """Fit the accelerometer to the poses that the samples hold, each part one or more of them."""
+    """Fit the accelerometer to the poses in the samples, each part one or more of them."""
     poses = [distinct_poses(s.accel, still_windows(s)) for s in samples]
     fit = solve_accelerometer(_distinct(np.vstack([np.empty((0, 3)), *poses])))
     return msgspec.structs.replace(
@@ -76,9 +76,9 @@ def calibrate_magnetometer(
 def calibrate_mounting(
     level: NodeSamples, nose_up: NodeSamples, calibration: NodeCalibration
 ) -> NodeCalibration:
-    """Find the mounting from a level and a nose-up pose; the magnetometer turns along."""
+    """Find the mounting from a level and a nose-up pose; the magnetometer's turns with it."""
     mounting = solve_mounting(_force(level, calibration), _force(nose_up, calibration))
-    # Both chips are on one board: how they stand to each other stays.
+    # Both chips are on one board: their orientation to each other stays.
     between = np.linalg.solve(np.array(calibration.mounting), np.array(calibration.mag_mounting))
     return msgspec.structs.replace(
         calibration, mounting=mounting, mag_mounting=_matrix(np.array(mounting) @ between)
@@ -86,14 +86,14 @@ def calibrate_mounting(
 
 
 def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
-    """Turn the mounting by the small tilt that a level aircraft seems to have."""
+    """Correct the mounting by the small tilt that is measured on a level aircraft."""
     x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
     roll, pitch = np.arctan2(-y, -z), np.arctan2(x, np.hypot(y, z))
     return remove_tilt(calibration, (float(roll), float(pitch), 0.0))
 
 
 def missing_sides(samples: Sequence[NodeSamples]) -> list[str]:
-    """Name the sides that the node was not laid on yet, to tell the person what is still to do."""
+    """Name the sides on which the node was not laid yet, for the operator."""
     means = [distinct_poses(s.accel, still_windows(s)) for s in samples]
     seen = set()
     for mean in np.vstack([np.empty((0, 3)), *means]):
@@ -104,7 +104,7 @@ def missing_sides(samples: Sequence[NodeSamples]) -> list[str]:
 
 
 def is_still(samples: NodeSamples) -> bool:
-    """Return whether the node lay still for at least a moment."""
+    """Return whether the node lay still for at least one window."""
     return bool(still_windows(samples))
 
 

@@ -1,4 +1,4 @@
-"""A remaining error of the calibrated samples, taken into the calibration that made them."""
+"""Remove a remaining error of the calibrated samples by changing their calibration."""
 
 import msgspec
 import numpy as np

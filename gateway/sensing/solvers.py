@@ -1,8 +1,8 @@
-"""Calibration from measurements: what a person's poses and turns tell about a node.
+"""Calibration from measurements: sensor errors from an operator's poses and turns.
 
-Every solver takes uncorrected samples (SI, sensor axes) and gives the parameters of
-`NodeCalibration` together with the residual that tells how well they fit. They serve a log as
-well as the live link.
+Every solver takes uncorrected samples (SI, sensor axes) and returns the parameters of
+`NodeCalibration` together with the residual, which shows how well they fit. They work on a log and
+on the live link.
 
 References
 ----------
@@ -34,13 +34,13 @@ FloatArray = NDArray[np.float64]
 SAME_POSE_DEG: Final = 20.0
 MIN_POSES: Final = 6
 POSES_FOR_SKEW: Final = 9
-"""From so many poses on, axes that are not square to one another can be told."""
+"""With at least this many poses, axes that are not orthogonal can be fitted."""
 MIN_TILT_DEG: Final = 15.0
 MIN_SPREAD: Final = 1.0
 """Least way along every axis, in radii, over which a magnetometer must have been turned."""
 MIN_MAG_SAMPLES: Final = 100
 
-# What is beyond these no sensor of the kind has when it is whole: the poses were wrong.
+# No intact sensor of this kind has larger errors: the poses were wrong.
 MAX_ACCEL_BIAS_MPS2: Final = 2.0
 """Twice what the MPU6050's data sheet allows, for what soldering adds."""
 MAX_ACCEL_SCALE_OFF: Final = 0.15
@@ -55,7 +55,7 @@ MAX_MAG_RESIDUAL: Final = 0.1
 
 
 class CalibrationError(ValueError):
-    """Measurements that do not determine what was asked; the text says what to do."""
+    """Measurements that do not determine the calibration; the text says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +90,11 @@ class NodeSamples:
     gyro: FloatArray
     """Shape (n, 3), rad/s."""
     mag_time_s: FloatArray
-    """Shape (m,), only what was sampled anew."""
+    """Shape (m,), only new samples."""
     mag: FloatArray
     """Shape (m, 3), uT."""
     moving: NDArray[np.bool_]
-    """Shape (n,), where GPS tells that the node moves."""
+    """Shape (n,), where the node moves according to GPS."""
 
 
 def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None) -> NodeSamples:
@@ -105,7 +105,7 @@ def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None
     records : sequence of ImuRaw
         Of one node, in their order.
     moving : sequence of bool, optional
-        Of each record, whether GPS tells that the node moves; by default nothing is known of it.
+        Of each record, whether the node moves according to GPS; by default unknown.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
     Returns
     -------
     ndarray, shape (m, 3)
-        One row per pose; windows that point alike are averaged.
+        One row per pose; windows of the same direction are averaged.
     """
     poses: list[list[FloatArray]] = []
     for window in windows:
@@ -158,7 +158,7 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
 def solve_rest(samples: FloatArray) -> RestFit:
     """Average samples at rest: the bias of a gyroscope, the direction of gravity.
 
-    Whether they are at rest is told by `stillness`.
+    `stillness` decides whether they are at rest.
 
     Parameters
     ----------
@@ -178,8 +178,8 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
     Parameters
     ----------
     poses : ndarray, shape (m, 3)
-        Mean specific force of each pose, m/s2, sensor axes; six or more, one on each side. Nine
-        or more also tell the skew of the axes.
+        Mean specific force of each pose, m/s2, sensor axes; six or more, one on each side. Nine or
+        more also determine the skew of the axes.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
     Raises
     ------
     CalibrationError
-        If poses are missing, or if what they tell can be no sensor's error.
+        If poses are missing, or if the result is too large for a sensor error.
     """
     if len(poses) < MIN_POSES:
         raise CalibrationError(f"{len(poses)} poses where {MIN_POSES} are needed, one on each side")
@@ -221,7 +221,7 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
     Raises
     ------
     CalibrationError
-        If it was not turned enough, or if what was measured can be no field on this Earth.
+        If it was not turned enough, or if the measured field cannot be the Earth's.
     """
     if len(field) < MIN_MAG_SAMPLES:
         raise CalibrationError(f"{len(field)} samples where {MIN_MAG_SAMPLES} are needed")
@@ -279,7 +279,7 @@ def level_residual_deg(mounting: Matrix3, level: Vec3) -> float:
 def _fit_sphere(
     points: FloatArray, radius: float, *, skew: bool, start: FloatArray | None = None
 ) -> SphereFit:
-    """Least squares on the radius; the matrix is symmetric, for a turn leaves no trace in it."""
+    """Fit the radius by least squares; the matrix is symmetric: no rotation is observable."""
     centre = _sphere_centre(points) if start is None else start
     scale = radius / float(np.linalg.norm(points - centre, axis=1).mean())
     guess = np.array([*centre, scale, scale, scale, *([0.0, 0.0, 0.0] if skew else [])])

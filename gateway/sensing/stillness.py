@@ -1,7 +1,7 @@
-"""When a node lay still: what a pose and a gyroscope's bias may be taken from.
+"""When a node lay still, so that a pose and a gyroscope bias may be measured.
 
-A quiet sensor is not enough. In a steady turn the gyroscope is as quiet as on a table, and its mean
-is the turn; the field through the magnetometer turns then, and GPS tells of the way that is made.
+A quiet sensor is not enough. In a steady turn the gyroscope is as quiet as on a table, and its
+mean is the turn rate; but then the magnetic field turns, and GPS shows the movement.
 """
 
 from typing import Final
@@ -19,11 +19,11 @@ STILL_ACCEL_MPS2: Final = 0.3
 MIN_WINDOW_SAMPLES: Final = 5
 
 MAX_GYRO_BIAS_RADPS: Final = 20.0 * RAD_PER_DEG
-"""The MPU6050's own bound of its bias: what turns faster turns."""
+"""The MPU6050's limit of its bias: a larger rate is a rotation."""
 MAX_FORCE_OFF_MPS2: Final = 1.5
 """At rest the specific force is gravity, bias and scale of a sensor never calibrated aside."""
 REST_WINDOWS: Final = 3
-"""So many still windows in a row are a rest: in less a slow turn cannot be told."""
+"""This many still windows in a row are a rest: in fewer a slow turn cannot be detected."""
 MAX_FIELD_DRIFT_UTPS: Final = 0.2
 """The field of a node that turns by 0.6 deg/s at mid latitudes; noise makes a third of it."""
 MIN_FIELD_SAMPLES: Final = 20
@@ -77,7 +77,7 @@ def rest_spans(samples: NodeSamples) -> list[slice]:
 
 
 def gyro_at_rest(samples: NodeSamples) -> FloatArray:
-    """Take the gyroscope's samples at rest, where all that they show is its bias.
+    """Return the gyroscope's samples at rest, which show only its bias.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def _runs(windows: list[slice]) -> list[list[slice]]:
 
 
 def _turns(samples: NodeSamples, span: slice) -> bool:
-    """Return whether the field turned; without a magnetometer nobody knows."""
+    """Return whether the field turned; False without a magnetometer."""
     begin_s, end_s = samples.time_s[span.start], samples.time_s[span.stop - 1]
     within: NDArray[np.bool_] = (samples.mag_time_s >= begin_s) & (samples.mag_time_s <= end_s)
     if int(within.sum()) < MIN_FIELD_SAMPLES:

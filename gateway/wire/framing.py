@@ -6,7 +6,7 @@ the decoder back into step, and no length field can mislead it. The decoder has 
 
 | state     | byte is zero                             | byte is not zero                        |
 | --------- | ---------------------------------------- | --------------------------------------- |
-| gathering | frame complete: check it, start anew     | keep it; at the bound go to `skipping`  |
+| gathering | frame complete: check it, start again    | keep it; at the bound go to `skipping`  |
 | skipping  | one `TOO_LONG` fault, back to gathering  | count it and drop it                    |
 
 The first frame after opening a port is usually cut; it comes out as one fault and nothing more.

@@ -1,4 +1,4 @@
-"""What civil time it is by the GPS receivers of all aircraft, whatever one of them says."""
+"""Civil time from the GPS receivers of all aircraft, robust against a single wrong one."""
 
 from collections import deque
 from statistics import median_low
@@ -11,7 +11,7 @@ ENOUGH: Final = 3
 
 
 class GpsTime:
-    """The place of the gateway clock in civil time: the median of the aircraft's medians."""
+    """Offset of the gateway clock to civil time: the median of the aircraft's medians."""
 
     def __init__(self) -> None:
         self._offsets_us: dict[int, deque[int]] = {}
@@ -19,7 +19,7 @@ class GpsTime:
     def hear(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
         """Note the time of a fix.
 
-        The arrival is taken for the fix itself: late by the latency, so never in the future.
+        The arrival is used as the time of the fix: late by the latency, so never in the future.
 
         Parameters
         ----------
@@ -33,7 +33,7 @@ class GpsTime:
         Returns
         -------
         int or None
-            Civil time of gateway time zero in µs since 1970; None as long as too few have spoken.
+            Civil time of gateway time zero in µs since 1970; None while there are too few fixes.
         """
         heard = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
         heard.append(utc_us - time_us)

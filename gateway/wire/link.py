@@ -1,7 +1,7 @@
 """Bytes of the receiver to raw records on the gateway clock, and the account of what was lost.
 
-One `Link` stands for one serial line. It joins the frame decoder, the payload codec, one clock
-tracker for the receiver and one for each node, and counts everything that does not come through.
+One `Link` handles one serial line. It joins the frame decoder, the payload codec, one clock
+tracker for the receiver and one for each node, and counts everything that is lost.
 """
 
 from collections import Counter, deque
@@ -30,14 +30,14 @@ UINT16_MAX: Final = 65_535
 
 SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
-"""Payloads further back than any retry queue belong to another life of the node."""
+"""Payloads further back than any retry queue belong to another run of the node."""
 RATE_SPAN_US: Final = US_PER_S
 MAX_ARRIVALS: Final = 2048
 """Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
 
 
 class Arrival(Enum):
-    """How a payload's sequence number stands to those before it."""
+    """How a payload's sequence number relates to those before it."""
 
     NEW = "new"
     LATE = "late"
@@ -56,7 +56,7 @@ class SequenceCounter:
         self._seen = 0
 
     def forget(self) -> None:
-        """Start anew after a restart of the sender; the counts stay."""
+        """Reset after a restart of the sender; the counts stay."""
         self._last = None
 
     def count(self, seq: int) -> Arrival:
@@ -84,7 +84,7 @@ class SequenceCounter:
 
     def _begin(self, seq: int) -> Arrival:
         self._last = seq
-        # Numbers before the first one heard are no late arrivals of this life.
+        # Numbers before the first one received are no late arrivals of this run.
         self._seen = (1 << LATE_WINDOW) - 1
         self.received += 1
         return Arrival.NEW
@@ -111,7 +111,7 @@ class Link:
         self._receiver_status: ReceiverStatus | None = None
         self._nodes: dict[NodeId, _Node] = {}
         self._unproven: dict[NodeId, tuple[_Node, RawRecord | None]] = {}
-        """Nodes of which a single payload was heard, and what it said: noise may pass for one."""
+        """Nodes with a single payload so far, and its records: noise may look like one."""
         self._faults: Counter[str] = Counter()
         self._bytes_received = 0
         self._frames = 0
@@ -184,7 +184,7 @@ class Link:
     def _hear(
         self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
     ) -> int:
-        """Count a frame and tell when the receiver heard it, on the gateway clock."""
+        """Count a frame and return when the receiver received it, on the gateway clock."""
         restarts = self._receiver_clock.restarts
         heard_us = self._receiver_clock.observe(frame.receiver_time_us, arrival_us)
         if self._last_frame_seq is not None and self._receiver_clock.restarts == restarts:
@@ -196,7 +196,7 @@ class Link:
     def _take_radio(
         self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
     ) -> list[RawRecord]:
-        """Return what a payload says; a node is believed from the second one that agrees."""
+        """Return a payload's records; a node is accepted from the second one that agrees."""
         header = frame.header
         node = self._nodes.get(header.node)
         if node is not None:
@@ -205,7 +205,7 @@ class Link:
         node, first = self._unproven.pop(header.node, (_Node(), None))
         second = _hear_node(node, frame, heard_us, arrival_us)
         if node.clock.restarts:
-            # Their stamps do not agree with when they came: the first was none, or this one is.
+            # Their stamps do not agree with their arrivals: the first was false, or this one is.
             node = _Node()
             first, second = None, _hear_node(node, frame, heard_us, arrival_us)
         elif node.sequence.received > 1:
@@ -218,7 +218,7 @@ class Link:
 def _hear_node(
     node: _Node, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
 ) -> RawRecord | None:
-    """Count a payload of a node, and tell what it says if it is new."""
+    """Count a payload of a node, and return its record if it is new."""
     header = frame.header
     restarts = node.clock.restarts
     time_us = node.clock.observe(header.node_time_us, heard_us)
@@ -303,7 +303,7 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
 
 
 def _unless_held(value: float, scale: float) -> float:
-    """Scale a 16-bit figure; one that is held at its end says no more than "bad"."""
+    """Scale a 16-bit value; one that is saturated means no more than "bad"."""
     return NAN if value == UINT16_MAX else value * scale
 
 

@@ -1,4 +1,4 @@
-"""What a router must know of each MAVLink message: checksum seed, addressee, name.
+"""What a router must know of each MAVLink message: checksum seed, target, name.
 
 The widest dialect serves here, since frames of any vehicle pass through; what is not in it is
 forwarded unchecked.

@@ -1,8 +1,8 @@
 """Signatures of the frames that leave.
 
-A frame is signed where it leaves, for only there its number and its place in the order are known:
-on the way it may be numbered anew, be overtaken, or be kept for a newcomer, and a receiver drops
-what is stamped earlier than the frame before it.
+A frame is signed where it leaves, because only there its sequence number and its order are known:
+on the way it may be renumbered, be overtaken, or be kept for a newcomer, and a receiver drops a
+frame whose time stamp is earlier than that of the frame before it.
 
 References
 ----------

@@ -1,8 +1,8 @@
 """Cut MAVLink 1 and 2 frames out of bytes without decoding them.
 
 Theory of operation. A frame starts with 0xFD (version 2) or 0xFE (version 1) and a length byte.
-Nothing is escaped, so both values also occur inside frames; only the checksum tells a start from
-an accident. At each candidate the splitter decides:
+Nothing is escaped, so both values also occur inside frames; only the checksum tells a real start
+from a coincidence. At each candidate the splitter decides:
 
 | it sees                                         | it does                                |
 | ----------------------------------------------- | -------------------------------------- |
@@ -107,7 +107,7 @@ def split_datagram(data: bytes) -> list[bytes | SplitFault]:
 def is_frame(data: bytes) -> bool:
     """Return whether bytes are exactly one unsigned version 2 frame of a known message.
 
-    That is what nearly every datagram holds; this is the short way to know it.
+    Nearly every datagram is one; this is the fast check for it.
     """
     if (
         len(data) < OVERHEAD_V2
@@ -124,7 +124,7 @@ def is_frame(data: bytes) -> bool:
 
 
 def key_of(frame: bytes) -> bytes:
-    """Return the header bytes that tell system, component and message, as a dictionary key."""
+    """Return the header bytes with system, component and message, as a dictionary key."""
     return frame[5:10] if frame[0] == START_V2 else frame[3:6]
 
 

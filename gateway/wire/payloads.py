@@ -181,7 +181,7 @@ def encode_payload(header: Header, payload: Payload) -> bytes:
 
 
 def encode_radio(frame_seq: int, pipe: int, receiver_time_us: int, payload: bytes) -> bytes:
-    """Build the content of the serial frame that passes one radio payload on."""
+    """Build the content of the serial frame that carries one radio payload."""
     first = PROTOCOL_VERSION << 4 | FrameKind.RADIO
     return _FRAME_HEADER.pack(first, frame_seq, pipe, receiver_time_us) + payload
 

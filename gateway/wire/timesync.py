@@ -1,4 +1,4 @@
-"""Node clocks to the gateway clock: offset and drift from the packets that arrived soonest.
+"""Node clocks to the gateway clock: offset and drift from the packets with the least delay.
 
 Theory of operation. A packet stamped `t` by a remote clock arrives at `t + offset + delay` on the
 local one, where the delay is never negative but has bursts (retries, buffers, USB polling). The
@@ -30,7 +30,7 @@ BUCKET_US: Final = 250_000
 MAX_BUCKETS: Final = 120
 """30 s: long enough to average quantisation, short enough to follow a warming resonator."""
 MIN_SKEW_SPAN_US: Final = 2_000_000
-"""Below this span, a burst of retries would pass for drift."""
+"""Below this span, a burst of retries would look like drift."""
 MAX_SKEW: Final = 0.01
 """Ceramic resonators drift by up to 0.5 %; twice that is not a clock."""
 RESTART_JUMP_US: Final = 1_500_000
@@ -62,11 +62,11 @@ class ClockTracker:
 
     @property
     def skew_ppm(self) -> float:
-        """How much faster than the local clock the remote one runs."""
+        """How much faster than the local clock the remote one runs, in parts per million."""
         return (1.0 / (1.0 + self._skew) - 1.0) * 1e6
 
     def observe(self, remote_u32: int, arrival_us: int) -> int:
-        """Take in one packet and tell its time on the local clock.
+        """Take in one packet and return its time on the local clock.
 
         Parameters
         ----------

@@ -167,7 +167,7 @@ def test_lists() -> None:
         ("udp:h:1?rate=ATTITUDE:5e-324", "Hz"),
         ("udp:h:1?deny=99999999", "message id"),
         ("udp:h:1?pack=1500", "1100"),
-        ("udp:h:1?trusted=no&trusted=yes", "'trusted' is there twice"),
+        ("udp:h:1?trusted=no&trusted=yes", "'trusted' is given twice"),
         ("udp:h:1?name=x;trusted=no", "joined by &"),
         ("udp:h:1?name=%0a", "cannot be shown"),
         ("udp:h:1?trusted=maybe", "yes or no"),

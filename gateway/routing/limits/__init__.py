@@ -1,1 +1,1 @@
-"""How much anybody may cause, and how much a narrow link is sent."""
+"""Limits: how much work each client may cause, and how much a narrow link is sent."""

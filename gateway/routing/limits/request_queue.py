@@ -1,13 +1,14 @@
-"""Whose request is answered next, and how much answering anybody may cause.
+"""Which request is answered next, and how many bytes of answers each client may cause.
 
-Theory of operation. Requests wait in a queue for each client, bounded, and are taken in turns: one
-that asks a thousand times a second waits for itself. Answers are paid for: each client has a purse
-of bytes that fills at a steady rate, a request costs what reading it costs, each byte of an answer
-costs one, and nothing is taken from a client that is in debt. All untrusted clients share a single
-small purse, for whoever is turned away comes back under another address.
+Theory of operation. Requests wait in a bounded queue for each client and are taken in turn: a
+client that asks a thousand times a second delays only itself. Answers are limited by a token
+bucket for each client, in bytes, which fills at a steady rate: a request costs what reading it
+costs, each byte of an answer costs one, and nothing is taken from a client that is in debt. All
+untrusted clients share a single small bucket, because one that is turned away could come back
+under another address.
 
 What a ground station does in a session (a parameter list, files of metadata, a mission of two
-thousand items) fits into a full purse; only then does its rate count.
+thousand items) fits into a full bucket; the rate matters only after that.
 """
 
 from collections import deque
@@ -18,7 +19,7 @@ from gateway.records import Incoming
 from gateway.units import US_PER_S
 
 REQUEST_COST: Final = 200
-"""Bytes: to decode a request and build its answer takes as long as to send so many."""
+"""Bytes: decoding a request and building its answer takes as long as sending this many."""
 CLIENT_RATE: Final = 80_000
 """Bytes a second: 400 requests, a few percent of a processor."""
 CLIENT_BURST: Final = 400_000
@@ -26,7 +27,7 @@ STRANGERS_RATE: Final = 20_000
 STRANGERS_BURST: Final = 200_000
 """The start of three ground stations on tablets."""
 MAX_WAITING: Final = 64
-"""Requests of a client; whoever waits for answers has one or two."""
+"""Requests of a client; one that waits for its answers has one or two."""
 
 
 @dataclass(slots=True)
@@ -55,7 +56,7 @@ class _Line:
 
 
 class RequestQueue:
-    """Requests of all clients, taken in turns and within each client's means."""
+    """Requests of all clients, taken in turn and within each client's quota."""
 
     def __init__(self) -> None:
         self._lines: dict[int, _Line] = {}
@@ -79,7 +80,7 @@ class RequestQueue:
         return True
 
     def take(self, now_us: int) -> Incoming | None:
-        """Return the request that is served now; None if nothing waits that is paid for."""
+        """Return the request to serve now; None if none waits from a client with quota left."""
         for line in self._turns.values():
             line.purse.fill(now_us)
             if line.purse.level > 0:
@@ -93,12 +94,12 @@ class RequestQueue:
         return min((line.purse.wait_us() for line in self._turns.values()), default=None)
 
     def charge(self, client_id: int, size: int) -> None:
-        """Let a client pay for bytes that were sent because of it."""
+        """Charge a client for bytes that were sent because of it."""
         if line := self._lines.get(client_id):
             line.purse.level -= size
 
     def forget(self, client_id: int) -> None:
-        """Drop what waits of a client that has gone; what strangers owe, they owe together."""
+        """Drop the requests of a client that has gone; the strangers' common debt stays."""
         self._lines.pop(client_id, None)
         self._turns.pop(client_id, None)
 

@@ -6,11 +6,12 @@ bisection, divided by the kind's importance:
 
     rate = offered * min(1, factor * importance), at least `FLOOR_HZ`
 
-Answers that somebody waits for, heartbeats and texts are never thinned; what they took is taken off
-the width first. If even the floors do not fit they are all lowered alike, so nothing starves.
+Answers that a client waits for, heartbeats and texts are never thinned; their bytes are subtracted
+from the width first. If even the floors do not fit they are all lowered alike, so nothing starves.
 
-A radio tells in RADIO_STATUS how full its own buffer is, since the air carries less than the serial
-line: the share of the width that is used goes down while the buffer fills and up again slowly.
+A radio reports in RADIO_STATUS how full its own buffer is, since the air carries less than the
+serial line: the share of the width that is used goes down while the buffer fills and up again
+slowly.
 
 A link of a few bytes a second gets HIGH_LATENCY2 alone, which carries a whole vehicle in 54 bytes.
 """
@@ -63,7 +64,7 @@ Key = bytes
 
 
 class Width:
-    """What one link of a known width is sent.
+    """The rates of the messages on one link of a known width.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ class Width:
 def _parts(
     kinds: Mapping[Key, tuple[int, float, float]], least: Mapping[Key, float], room: float
 ) -> dict[Key, float]:
-    """Return which part of each kind is sent so that all of them fill the room."""
+    """Return which share of each kind is sent so that together they fill the room."""
 
     def at(factor: float) -> dict[Key, float]:
         return {
