@@ -135,7 +135,7 @@ class LogAnswers:
                 course.add(time_us, frame)
                 self._kept += 1
 
-    def tells(self, system: int, message_id: int) -> bool:
+    def has_message(self, system: int, message_id: int) -> bool:
         """Return whether a vehicle sent a message at all."""
         return (system, message_id) in self._told
 
@@ -214,9 +214,9 @@ class VehicleAnswers:
         self.played_as = played_as
         self._position_us = position_us
 
-    def tells(self, message_id: int) -> bool:
+    def has_message(self, message_id: int) -> bool:
         """Return whether the vehicle sent a message at all."""
-        return self._log.tells(self._system_id, message_id)
+        return self._log.has_message(self._system_id, message_id)
 
     def frames(self, message_id: int) -> list[bytes]:
         """Return the frames that answer a request for a message; none if there is no answer."""

@@ -13,7 +13,7 @@ from gateway.vehicle.stored import StoredPlaces
 
 @dataclass(frozen=True, slots=True)
 class SettingsChange:
-    """A section of this vehicle's settings has a new, already checked value: take it live."""
+    """A section of this vehicle's settings has a new, already checked value: apply it live."""
 
     vehicle_id: int
     section: str
@@ -26,7 +26,7 @@ class SettingsChange:
 
 @dataclass(frozen=True, slots=True)
 class SaveSettings:
-    """Write what differs from the settings file to storage."""
+    """Store what differs from the settings file."""
 
     vehicle_id: int
     sections: tuple[tuple[str, Settings], ...]
@@ -48,7 +48,7 @@ class RecordingRequest:
 
 
 class CalibrationKind(StrEnum):
-    """Which error of which sensor was measured."""
+    """The sensor error that was measured."""
 
     GYRO = "gyro"
     ACCEL = "accel"
@@ -80,7 +80,7 @@ Action = (
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
-    """A message before it is encoded: to the one who asked, or to all."""
+    """A message before it is encoded: to the client that asked, or to all."""
 
     message: Any
     client_id: int | None = None
@@ -101,5 +101,5 @@ class Request:
     """Whether the client may change state: trusted, and signed where a key is set."""
 
     def reply(self, message: Any) -> Reply:
-        """Answer the one who asked."""
+        """Answer the client that asked."""
         return Reply(message, self.client_id)

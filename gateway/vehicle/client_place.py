@@ -1,4 +1,4 @@
-"""Places that clients send, in the frames in which they may send them."""
+"""Positions that clients send, in any MAV_FRAME that is accepted."""
 
 import math
 from typing import Final
@@ -21,17 +21,17 @@ GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
 
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
-    """Return whether a latitude and a longitude can be."""
+    """Return whether a latitude and a longitude are valid."""
     return abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0
 
 
 def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
-    """Turn a height of a frame into one above mean sea level.
+    """Convert a height in a MAV_FRAME to one above mean sea level.
 
     Parameters
     ----------
     height_m : float
-        Height as sent; NaN where the client does not care.
+        Height as sent; NaN if the client does not specify it.
     frame : int
         A MAV_FRAME of `GLOBAL_FRAMES`.
     home_alt_m : float

@@ -1,8 +1,8 @@
 """Messages of the standard that pymavlink's `common` dialect lacks.
 
-Clients ask for them all the same, and one of them, PROTOCOL_VERSION, decides whether
-QGroundControl speaks MAVLink 2. Each is laid out as the standard's generator does it: larger
-fields first, and a CRC seeded by the definition.
+Clients request them all the same, and one of them, PROTOCOL_VERSION, decides whether
+QGroundControl uses MAVLink 2. Each is laid out as the standard's generator does it: larger fields
+first, and a CRC seeded by the definition.
 """
 
 import struct

@@ -41,8 +41,8 @@ class Encoder:
         Parameters
         ----------
         message : MAVLink_message
-            Any message of the dialect. A number beyond its field is saturated, so that no
-            measurement however wild can stop the telemetry.
+            Any message of the dialect. A number beyond its field's range is saturated, so that no
+            measurement can stop the telemetry.
         client_id : int, optional
             The one client it answers.
 
@@ -52,7 +52,7 @@ class Encoder:
         """
         # Not message.id: HIGHRES_IMU and others have a field of that name.
         message_id = message.get_msgId()
-        # The payload is pymavlink's work; what it puts around takes it six times as long as us.
+        # pymavlink packs the payload; header and checksum would take it six times as long as here.
         message._pack = self._frame  # noqa: SLF001
         try:
             frame = message.pack(message_id)

@@ -1,4 +1,4 @@
-"""Where home is: the first good fix of a flight, unless somebody sets it."""
+"""Where home is: the first good fix of a flight, unless an operator sets it."""
 
 import math
 from dataclasses import dataclass
@@ -59,13 +59,13 @@ HAS_PLACE = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
 
 
 def is_3d(fix: GpsFix) -> bool:
-    """Return whether the receiver vouches for a three-dimensional fix."""
+    """Return whether the receiver reports a three-dimensional fix."""
     return fix.fix_ok and fix.fix_type in HAS_PLACE
 
 
 def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
     """Return whether a fix may set home; an accuracy that is not known does not forbid it."""
-    # Some receivers vouch for latitude 0, longitude 0 before they know better.
+    # Some receivers report latitude 0, longitude 0 as valid before the first fix.
     somewhere = (fix.lat_dege7, fix.lon_dege7) != (0, 0) and math.isfinite(fix.alt_amsl_m)
     accurate = fix.satellites >= satellites and not fix.h_acc_m > accuracy_m
     return is_3d(fix) and somewhere and accurate

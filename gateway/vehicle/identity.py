@@ -1,4 +1,4 @@
-"""Who the vehicle is and what it understands, for the questions of a ground station's start."""
+"""Identity and capabilities of the vehicle, which a ground station requests when it connects."""
 
 from typing import Any, Final
 
@@ -54,7 +54,7 @@ def autopilot_version(system_id: int, firmware: int = 0) -> Any:
 
 
 def protocol_version() -> Any:
-    """Encode PROTOCOL_VERSION: both versions are read, version 2 is spoken."""
+    """Encode PROTOCOL_VERSION: both versions are read, version 2 is sent."""
     return ProtocolVersion(200, 100, 200, b"", b"")
 
 

@@ -38,7 +38,7 @@ class Mark:
         self.place, self.of = place, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
-        """Mark the first place among stored items; none there unmarks what they had marked.
+        """Mark the first place among stored items; without one, clear a mark that they had set.
 
         Parameters
         ----------
@@ -57,7 +57,7 @@ class Mark:
             self.put(None)
 
     def way(self, state: NavState) -> tuple[float, float] | None:
-        """Measure the way from the vehicle to the mark.
+        """Measure distance and bearing from the vehicle to the mark.
 
         Parameters
         ----------
@@ -78,11 +78,11 @@ class Mark:
         return way if math.isfinite(sum(way)) else None
 
     def nav_controller_output(self, state: NavState | None) -> Any:
-        """Encode the way to the mark; None while there is nothing to tell.
+        """Encode distance and bearing to the mark; None without a mark or a position.
 
         The desired heading is the bearing; bearings are -180 to 180, as autopilots send them.
-        Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed's
-        error is 0, for none is desired; clients print it as an integer, which no NaN survives.
+        Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed error
+        is 0, since none is desired; clients print it as an integer, so NaN would fail.
         """
         way = None if state is None else self.way(state)
         if state is None or self.place is None or way is None:
@@ -102,7 +102,7 @@ class Mark:
 
 
 def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
-    """Measure the way between two places.
+    """Measure distance and bearing between two places.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Frames of clients to checked requests; whatever is wrong with one, it is counted and dropped."""
+"""Frames of clients to checked requests; invalid ones are counted and dropped."""
 
 from collections import Counter
 from typing import Any, Final
@@ -20,12 +20,12 @@ BAD_SIGNATURE: Final = "bad signature"
 
 
 class RequestReader:
-    """Decode frames, check who sent them and whom they are for.
+    """Decode frames and check their sender and target.
 
     Parameters
     ----------
     system_id : int
-        The system that requests must be meant for.
+        The target system of the requests.
     """
 
     def __init__(self, system_id: int) -> None:
@@ -49,7 +49,7 @@ class RequestReader:
         Returns
         -------
         Request or None
-            None for what is broken, unknown, forged, or meant for somebody else.
+            None if it is damaged, unknown, forged, or for another system.
         """
         frame = incoming.frame
         message = self._decode(frame)
@@ -74,7 +74,7 @@ class RequestReader:
         )
 
     def _decode(self, frame: bytes) -> Any:
-        """Decode a frame, or name what is wrong with it."""
+        """Decode a frame, or return what is wrong with it."""
         if not _is_whole(frame):
             return "malformed"
         try:

@@ -1,4 +1,4 @@
-"""A recorded vehicle as a MAVLink system: it answers what its log tells, and declines the rest.
+"""A recorded vehicle as a MAVLink system: it answers from its log, and declines the rest.
 
 | asked                                | answered                                                |
 | ------------------------------------ | ------------------------------------------------------- |
@@ -7,8 +7,8 @@
 | MISSION_REQUEST_LIST and its items   | the recorded items; MISSION_ACK unsupported without     |
 | an upload, MISSION_CLEAR_ALL         | MISSION_ACK denied                                      |
 | REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded message; unsupported if it was never sent  |
-| SET_MESSAGE_INTERVAL                 | thins what is played to the one who asks                |
-| any other command, SET_MODE          | denied: what is over cannot be changed                  |
+| SET_MESSAGE_INTERVAL                 | thins what is played to the client that asks            |
+| any other command, SET_MODE          | denied: the past cannot be changed                      |
 | files                                | FTP's "file not found"                                  |
 | PING, TIMESYNC                       | answered                                                |
 """
@@ -58,9 +58,9 @@ RecordedAction = Outgoing | ClientInterval
 
 
 class Answers(Protocol):
-    """What a log tells of one vehicle, as of the moment that is played."""
+    """What a log holds of one vehicle, as of the moment that is played."""
 
-    def tells(self, message_id: int) -> bool:
+    def has_message(self, message_id: int) -> bool:
         """Return whether the vehicle sent a message at all."""
         ...
 
@@ -69,7 +69,7 @@ class Answers(Protocol):
         ...
 
     def mission(self, kind: int) -> Sequence[bytes] | None:
-        """Return the frames of the items of a mission; None if the log tells of none."""
+        """Return the frames of the items of a mission; None if the log has none."""
         ...
 
     def parameters(self) -> Mapping[str, bytes]:
@@ -85,7 +85,7 @@ class RecordedVehicle:
     system_id : int
         Its MAVLink system id, as it is played.
     answers : Answers
-        What its log tells.
+        What its log holds.
     """
 
     def __init__(self, system_id: int, answers: Answers) -> None:
@@ -112,7 +112,7 @@ class RecordedVehicle:
         }
 
     def handle(self, incoming: Incoming, now_us: int) -> list[RecordedAction]:
-        """Answer one frame of a client; one that is not for this vehicle is left alone.
+        """Answer one frame of a client; ignore one that is not for this vehicle.
 
         Parameters
         ----------
@@ -219,9 +219,9 @@ class RecordedVehicle:
         return [command.ack(ACCEPTED), *(Outgoing(f, message_id, client_id) for f in frames)]
 
     def _thin(self, command: Command) -> list[Answer]:
-        """Grant a rate as far as what was recorded reaches; 0 and -1 mean what they always do."""
+        """Grant a rate up to the recorded one; 0 means the default and -1 none, as in MAVLink."""
         message_id, wish = whole(command.params[0]), command.params[1]
-        if not self._answers.tells(message_id):
+        if not self._answers.has_message(message_id):
             return [command.ack(UNSUPPORTED)]
         kept = message_id != HEARTBEAT or 0 <= wish <= KEEPS_CLIENTS_US
         if not math.isfinite(wish) or not kept:

@@ -1,12 +1,12 @@
-"""MAVLink 2 signing: who may change things over a network that anybody may send on.
+"""MAVLink 2 signing: authenticate clients on a network where anybody may send.
 
 A signature is the first 48 bits of SHA-256 over key and frame; a time stamp in units of 10 us
 since 2015 inside it makes every frame unique, so that a recorded one cannot be sent again. A
 stream is one link of one component. Its stamp must grow; a stream not heard before must not be
 more than a minute behind our own clock.
 
-The check is our own rather than pymavlink's: that one takes over the stamp of a stream before it
-has checked the signature, so a single forged frame would lock the true sender out.
+The check is our own, not pymavlink's: that one stores the time stamp of a stream before it has
+checked the signature, so a single forged frame would lock the true sender out.
 
 References
 ----------
@@ -45,7 +45,7 @@ class SigningClock:
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
     def hear_gps(self, unix_us_at_zero: int) -> None:
-        """Take the time that GPS tells, where the machine's differs by more than the latency."""
+        """Use GPS time if the machine's differs from it by more than the latency."""
         offset_us = unix_us_at_zero - EPOCH_2015_US
         if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
             self._offset_us = offset_us
@@ -65,7 +65,7 @@ class Verifier:
     clock : SigningClock
         Of the gateway.
     book : StampBook, optional
-        What was taken before; notes what is taken from here on.
+        The time stamps accepted so far; updated with every accepted frame.
     """
 
     def __init__(self, key: bytes, clock: SigningClock, book: StampBook | None = None) -> None:

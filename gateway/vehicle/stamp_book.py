@@ -1,9 +1,9 @@
-"""The newest signing stamp of every stream, kept over restarts and changes of the passphrase.
+"""The newest signing time stamp of every stream, kept over restarts and passphrase changes.
 
-Without it a recorded command could be sent again once the gateway has forgotten that it heard it.
-What is to be kept runs ahead of what was heard by `RESERVE_TICKS`, so that a busy stream is written
-every few seconds only: after a sudden end a stream is heard again once its stamps have passed the
-reserve, which is a moment after the restart.
+Without it a recorded command could be replayed after a restart of the gateway. The stored stamps
+are ahead of the received ones by `RESERVE_TICKS`, so that a busy stream is written only every few
+seconds: after a crash a stream is accepted again once its stamps have passed the reserve, a few
+seconds after the restart.
 """
 
 import hashlib
@@ -23,17 +23,17 @@ Stamps = dict[str, dict[str, int]]
 
 
 def mark_of(key: bytes) -> str:
-    """Name a key without telling it."""
+    """Return an identifier of a key that does not reveal it."""
     return hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
 
 
 class StampBook:
-    """The stamps that one vehicle has taken.
+    """The time stamps that one vehicle has accepted.
 
     Parameters
     ----------
     kept : mapping, optional
-        What `to_keep` gave in an earlier run.
+        What `to_keep` returned in an earlier run.
     """
 
     def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
@@ -54,7 +54,7 @@ class StampBook:
         return len(self._newest.get(mark, {})) < MAX_STREAMS
 
     def note(self, mark: str, stream: Stream, stamp: int) -> None:
-        """Note a stamp that was taken."""
+        """Note an accepted stamp."""
         streams = self._newest.pop(mark, {})
         # The key that was used last comes last.
         self._newest[mark] = streams
@@ -67,12 +67,12 @@ class StampBook:
             self.is_due = True
 
     def to_keep(self) -> Stamps:
-        """Return what is to be written now, so that nothing taken so far is taken again."""
+        """Return what to write now, so that no frame accepted so far is accepted again."""
         self.is_due = False
         return _texts(self._kept)
 
     def exact(self) -> Stamps:
-        """Return the stamps without the reserve, for an orderly end."""
+        """Return the stamps without the reserve, for a clean shutdown."""
         return _texts(self._newest)
 
 

@@ -1,7 +1,6 @@
-"""What a vehicle keeps when the gateway ends: its missions, its mark, and an operator's home.
+"""What a vehicle keeps over a restart: its missions, its mark, and an operator's home.
 
-One JSON text an aircraft. A number that is not known is written as NaN, which is Python's way
-and that of most readers.
+One JSON text per aircraft. An unknown number is written as NaN, as Python and most readers do.
 """
 
 import json
@@ -27,7 +26,7 @@ KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 
 
 class StoredPlaces(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All places of one vehicle that outlive the gateway."""
+    """All places of one vehicle that are kept over a restart."""
 
     version: Literal[1] = 1
     home: Place | None = None
@@ -43,7 +42,7 @@ class StoredPlaces(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 def encode_places(places: StoredPlaces) -> str:
-    """Write places as a text that `decode_places` reads back equal."""
+    """Encode places as a text that `decode_places` reads back equal."""
     return json.dumps(msgspec.to_builtins(places), indent=1) + "\n"
 
 
@@ -62,7 +61,8 @@ def decode_places(text: str) -> StoredPlaces:
     Raises
     ------
     ValueError
-        If it is none, or holds what no ground station could have stored; the text says what.
+        If it is not such a text, or holds what no ground station could have stored; the error says
+        what.
     """
     try:
         places = msgspec.convert(json.loads(text), StoredPlaces)

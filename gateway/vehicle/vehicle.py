@@ -52,19 +52,19 @@ OWN_SECTION: Final = "vehicle"
 HOME_SECTION: Final = "home"
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
-"""All hear that somebody was refused: enough to be warned, too little to be drowned by it."""
+"""A refusal is announced to all at most this often: enough as a warning, without a flood."""
 
 
 class Service(Protocol):
-    """What answers one family of messages."""
+    """A service that answers one group of messages."""
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Names of the messages it takes."""
+        """Names of the messages it handles."""
         ...
 
     def changes_state(self, request: Request) -> bool:
-        """Return whether only an allowed client may ask this."""
+        """Return whether only a trusted client may send this request."""
         ...
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
@@ -72,14 +72,14 @@ class Service(Protocol):
         ...
 
     def refuse(self, request: Request) -> list[Answer]:
-        """Answer a client that is not allowed to ask this."""
+        """Answer a client that may not send this request."""
         ...
 
 
 class Vehicle:
     """The MAVLink side of one aircraft.
 
-    All methods return what is to be done, in order: mostly frames to send. None raises on data.
+    All methods return actions in order, mostly frames to send. None raises on data.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Vehicle:
         stamps: StampBook | None = None,
         stored: StoredPlaces | None = None,
     ) -> None:
-        """Begin with nothing known.
+        """Start without any data.
 
         Parameters
         ----------
@@ -109,9 +109,9 @@ class Vehicle:
         clock : SigningClock, optional
             Civil time; needed for signing only.
         stamps : StampBook, optional
-            The signing stamps that were taken before.
+            The signing time stamps accepted before.
         stored : StoredPlaces, optional
-            What was kept of an earlier run.
+            What was kept from an earlier run.
         """
         self.system_id = system_id
         self.vehicle_id = system_id if vehicle_id is None else vehicle_id
@@ -124,10 +124,10 @@ class Vehicle:
         self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
         self.signing_key: bytes | None = None
-        """What frames of this vehicle are signed with as they leave the gateway, if at all."""
+        """The key that signs this vehicle's frames as they leave the gateway, if any."""
         self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
-        # On its own, so that strangers cannot use up what is kept for events.
+        # Separate, so that strangers cannot use up the quota of other events.
         self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
         self.places = PlaceService(
             self.vehicle_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
@@ -164,7 +164,7 @@ class Vehicle:
         self._route(commands)
 
     def _route(self, commands: CommandService) -> None:
-        """Tell who takes which message, and who is polled."""
+        """Register which service handles which message, and which are polled."""
         services: tuple[Service, ...] = (
             commands,
             self._intervals,
@@ -194,7 +194,7 @@ class Vehicle:
         return self.telemetry.motion.landed_state == IN_AIR
 
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
-        """Take in what the estimator made of one IMU sample."""
+        """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
         found = self._replies(self.telemetry.on_state(state, sample))
         found += self._replies(self._announcements.on_flags(state.flags, now_us))
@@ -234,7 +234,7 @@ class Vehicle:
         return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
-        """Answer one frame of a client; one that is not for this vehicle is left alone.
+        """Answer one frame of a client; ignore one that is not for this vehicle.
 
         Parameters
         ----------
@@ -263,13 +263,13 @@ class Vehicle:
         return self._finish(answers)
 
     def introduction(self) -> list[Action]:
-        """Encode what a ground station's start asks for, whoever asks: version and parameters."""
+        """Encode version and parameters, which every ground station requests at its start."""
         asked = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, MAVLINK_MSG_ID_PROTOCOL_VERSION)
         known = [message for number in asked for message in self._build(number, 0)]
         return self._finish([*self._replies(known), *self._parameters.values()])
 
     def poll(self, now_us: int) -> list[Action]:
-        """Do what is due by time."""
+        """Return the actions that are due by time."""
         self.telemetry.calibrating = self._calibrator.busy
         found = self._replies(self.telemetry.poll(now_us))
         found += self._replies(self._announcements.poll(now_us))
@@ -308,11 +308,11 @@ class Vehicle:
         return self._finish(self.places.put_mark(place, now_us))
 
     def say(self, text: StatusText, now_us: int) -> list[Action]:
-        """Tell all an event of the gateway, such as a recording that stopped."""
+        """Announce an event of the gateway, such as a recording that stopped."""
         return self._finish(self._replies(self._announcements.say(text, now_us)))
 
     def take_settings(self, section: str, settings: Settings) -> list[Action]:
-        """Take over a section that was changed elsewhere, and tell the parameters that differ."""
+        """Apply a section that was changed elsewhere, and send the parameters that differ."""
         if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
             self._reconfigure(settings)
         return self._finish(self._parameters.take(section, settings))
@@ -335,7 +335,7 @@ class Vehicle:
         self._sign_by(settings.signing_passphrase)
 
     def _sign_by(self, passphrase: str) -> None:
-        """Sign and check by another key; what the present one has seen guards against replays."""
+        """Sign and check with another key; the old one's stamps are kept against replays."""
         key = key_from_passphrase(passphrase) if passphrase else None
         if key == self.signing_key:
             return
@@ -346,7 +346,7 @@ class Vehicle:
         return [Reply(message) for message in messages]
 
     def _finish(self, answers: Iterable[Answer]) -> list[Action]:
-        """Encode what is still a message, and take over what concerns the vehicle itself."""
+        """Encode the messages, and apply the actions that concern the vehicle itself."""
         actions: list[Action] = []
         if self.telemetry.home is not self._told_home:
             self._told_home = self.telemetry.home

@@ -1,4 +1,4 @@
-"""What the operator may choose about the vehicle that ground stations see."""
+"""Settings of the vehicle that ground stations see."""
 
 from typing import Annotated, Literal
 
@@ -78,8 +78,8 @@ class VehicleSettings(Settings, frozen=True):
     supply_low_v: Annotated[
         float,
         setting(
-            "A node whose supply falls below this is told to the ground stations, as its radio and "
-            "sensors fail soon after; 0 tells none.",
+            "A node whose supply falls below this is announced as STATUSTEXT, as its radio and "
+            "sensors fail soon after; 0 disables this.",
             "V",
             ge=0.0,
             le=12.0,

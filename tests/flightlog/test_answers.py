@@ -153,4 +153,4 @@ def test_what_was_not_told_is_not_known(day: Day) -> None:
     assert answers.parameters() == {}
     assert answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == []
     assert answers.mission(MISSION) is None
-    assert not answers.tells(mavlink.MAVLINK_MSG_ID_PARAM_VALUE)
+    assert not answers.has_message(mavlink.MAVLINK_MSG_ID_PARAM_VALUE)

@@ -39,7 +39,7 @@ class Told:
     def pack(self, message: Any) -> bytes:
         return bytes(message.pack(self.mav))
 
-    def tells(self, message_id: int) -> bool:
+    def has_message(self, message_id: int) -> bool:
         return message_id in (*self.kept, mavlink.MAVLINK_MSG_ID_ATTITUDE, 0)
 
     def frames(self, message_id: int) -> list[bytes]:

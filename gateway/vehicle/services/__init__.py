@@ -1,1 +1,1 @@
-"""What the vehicle answers: one service a file."""
+"""The vehicle's MAVLink services, one per file."""

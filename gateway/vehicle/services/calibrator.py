@@ -1,4 +1,4 @@
-"""Calibration on command: measure what the calibrated samples still have wrong.
+"""Calibration on command: measure the remaining error of the calibrated samples.
 
 | command            | what the operator does                   | what is measured                |
 | ------------------ | ---------------------------------------- | ------------------------------- |
@@ -8,11 +8,11 @@
 | param5 = 1, accel  | rest it on each of its six sides in turn | middle of the extremes, by axis |
 | param2 = 1, mag    | turn it about all axes, up to a minute   | centre of the sphere            |
 
-None is done in flight, where nothing is at rest. What is further off than any whole sensor of the
-kind is refused, for it was the aircraft that moved.
+None is done in flight, where nothing is at rest. An error larger than any intact sensor of the
+kind has is refused: then the aircraft moved.
 
 Progress goes out as COMMAND_ACK (in progress) and as the `[cal]` texts that ground stations read;
-the result is an action, for the calibration belongs to another stage.
+the result is an action, because the calibration belongs to another stage.
 """
 
 import math
@@ -57,8 +57,8 @@ MOST: Final = {
     CalibrationKind.LEVEL: (30.0 * RAD_PER_DEG, "it was not level"),
     CalibrationKind.MAG: (200.0, "iron or a current is near"),
 }
-"""Greatest error along an axis, and what it comes of if it seems greater. The first two are what
-the MPU6050's data sheet allows, with twice as much for the accelerometer after soldering."""
+"""Greatest error along an axis, and the likely cause of a greater one. The first two are the
+limits of the MPU6050's data sheet, doubled for the accelerometer because of soldering."""
 FIELD_UT: Final = (15.0, 100.0)
 """Strength of the Earth's field, a scale that is off by a third included."""
 MAX_FIELD_RESIDUAL: Final = 0.1
@@ -102,7 +102,7 @@ class Calibrator:
     vehicle_id : int
         Whose sensors they are.
     in_flight : callable
-        Tells whether it flies.
+        Whether it flies.
     """
 
     def __init__(self, vehicle_id: int, in_flight: Callable[[], bool]) -> None:
@@ -162,7 +162,7 @@ class Calibrator:
         return [] if run.six_sides else self._announce(run, 100 * passed_us // length_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Give up in the end."""
+        """End a calibration that takes too long."""
         if self._run is None or now_us < self._run.deadline_us:
             return []
         return self._fail("timed out")
@@ -271,7 +271,7 @@ def fit_sphere(points: NDArray[np.float64]) -> tuple[Vec3, float]:
 
 
 def _field_turns(run: _Run) -> bool:
-    """Return whether the field turned while all was quiet; without a magnetometer nobody knows."""
+    """Return whether the field turned during rest; False without a magnetometer."""
     if len(run.mag) < MIN_FIELD_SAMPLES:
         return False
     times_s = (np.array(run.mag_times_us) - run.mag_times_us[0]) / US_PER_S

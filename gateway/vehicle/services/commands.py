@@ -1,4 +1,4 @@
-"""MAV_CMDs: each acknowledged once, to the one who asked, and most of them carried out."""
+"""MAV_CMDs: each acknowledged once, to its sender, and most of them carried out."""
 
 import math
 from collections.abc import Callable
@@ -29,12 +29,12 @@ REFUSALS: Final = {
     mavlink.MAV_CMD_DO_SET_MODE: "A tracker has no modes to switch",
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
 }
-"""Commands that are understood and not done, and why."""
+"""Commands that are understood but denied, and why."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """COMMAND_LONG or COMMAND_INT, told alike."""
+    """COMMAND_LONG or COMMAND_INT, in one form."""
 
     request: Request
     number: int
@@ -62,7 +62,7 @@ class Command:
 
     @property
     def extra(self) -> tuple[float, float]:
-        """Parameters 5 and 6, where they are no place."""
+        """Parameters 5 and 6, if they are not a position."""
         message = self.request.message
         if message.get_type() == "COMMAND_INT":
             return (float(message.x), float(message.y))
@@ -70,15 +70,15 @@ class Command:
 
 
 Outcome = tuple[int, list[Answer]]
-"""Result of a command, and what goes out behind its acknowledgement."""
+"""Result of a command, and what is sent after its acknowledgement."""
 
 Handler = Callable[[Command, int], Outcome]
 Explain = Callable[[str, int], list[Answer]]
-"""Tells all a text at a time: why something was refused."""
+"""Announces a text to all at a time: why something was refused."""
 
 
 def read_command(request: Request) -> Command:
-    """Take a command out of either message."""
+    """Read a command from either message."""
     message = request.message
     params = (message.param1, message.param2, message.param3, message.param4)
     if message.get_type() == "COMMAND_LONG":
@@ -92,12 +92,12 @@ def read_command(request: Request) -> Command:
 
 
 def whole(value: float) -> int:
-    """Read an integer parameter; what is no number is 0."""
+    """Read an integer parameter; NaN is 0."""
     return round(value) if math.isfinite(value) else 0
 
 
 class CommandService:
-    """Dispatch commands by number; what nobody handles is UNSUPPORTED."""
+    """Dispatch commands by number; one without a handler is UNSUPPORTED."""
 
     types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
 
@@ -108,7 +108,7 @@ class CommandService:
         knows: Callable[[int], bool],
         explain: Explain,
     ) -> None:
-        """Start with what needs no other service.
+        """Start with the commands that need no other service.
 
         Parameters
         ----------
@@ -117,9 +117,9 @@ class CommandService:
         build : callable
             Builds the messages of an id at a time; an empty list if there is nothing yet.
         knows : callable
-            Tells whether a message of that id is ever sent.
+            Whether a message of that id is ever sent.
         explain : callable
-            Tells all why something was refused.
+            Announces to all why something was refused.
         """
         self._intervals = intervals
         self._build = build
@@ -178,7 +178,7 @@ class CommandService:
         if not self._knows(message_id):
             return UNSUPPORTED, []
         messages = self._build(message_id, now_us)
-        # What a stranger asks for is nobody else's business, and may not fill anybody's radio.
+        # The answer to an untrusted client must not load the links of others.
         everybody = whole(command.height_m) == RESPOND_TO_ALL and command.request.may_change
         answers: list[Answer] = [
             Reply(m, None if everybody else command.request.client_id) for m in messages

@@ -1,8 +1,8 @@
 """MAVLink FTP, for reading only: the component metadata and nothing else.
 
-Everything else is refused by the error that the protocol has for it, with the session, the
-sequence number and the opcode of the request echoed: a client that gets a proper refusal goes on
-at once, one that gets none tries again for a quarter of a minute.
+Everything else is refused with the protocol's own error, with the session, the sequence number and
+the opcode of the request echoed: a client that gets a proper refusal goes on at once, one that
+gets none retries for a quarter of a minute.
 
 References
 ----------
@@ -31,18 +31,18 @@ MAX_REMEMBERED: Final = 512
 """Clients whose last answer is kept."""
 BURST: Final = 10
 BURST_INTERVAL_US: Final = 10_000
-"""Of these so many packets, whoever and however many wait for them."""
+"""Between batches of this many packets, for all clients together."""
 MIN_BURST_DATA: Final = 64
 """A burst of single bytes would cost both sides sixty times as much."""
 
 ACK: Final = 128
 _SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
-"""What stands before the path in a URI of the component metadata."""
+"""The part before the path in a URI of the component metadata."""
 NAK: Final = 129
 
 
 class Opcode(IntEnum):
-    """What clients ask for."""
+    """The requests of the protocol."""
 
     NONE = 0
     TERMINATE_SESSION = 1
@@ -144,12 +144,12 @@ class _Burst:
 
 
 class FtpService:
-    """Files of one vehicle, made anew whenever they are opened.
+    """Files of one vehicle, generated each time they are opened.
 
     Parameters
     ----------
     files : mapping of str to callable
-        Absolute paths, and what makes their content.
+        Absolute paths, and the functions that generate their content.
     """
 
     types = ("FILE_TRANSFER_PROTOCOL",)
@@ -171,7 +171,7 @@ class FtpService:
         }
 
     def changes_state(self, _request: Request) -> bool:
-        """Tell that files can only be read."""
+        """Return False: files can only be read."""
         return False
 
     def refuse(self, _request: Request) -> list[Answer]:
@@ -179,7 +179,7 @@ class FtpService:
         return []
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
-        """Answer one request; a request that comes again gets the same answer again."""
+        """Answer one request; a repeated request gets the same answer again."""
         packet = decode_packet(bytes(request.message.payload))
         known = self._last.get(request.client_id)
         if known is not None and known[0] == packet and packet.opcode != Opcode.BURST_READ_FILE:
@@ -195,7 +195,7 @@ class FtpService:
         return [reply]
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send the next packets of the bursts, in turns."""
+        """Send the next packets of the bursts, in turn."""
         if not self._bursts or now_us < self._due_us:
             return []
         answers: list[Answer] = []
@@ -219,7 +219,7 @@ class FtpService:
         self._bursts.pop(number, None)
 
     def _carry_out(self, request: Request, packet: Packet) -> tuple[int, bytes]:
-        """Carry out a request; the session and the data of the answer."""
+        """Carry out a request; return the session and the data of the answer."""
         if packet.opcode == Opcode.OPEN_FILE_RO:
             return self._open(request, packet)
         if packet.opcode in WRITING:
@@ -237,7 +237,7 @@ class FtpService:
         return number, struct.pack("<I", len(content))
 
     def _make_room(self, request: Request) -> None:
-        """Close sessions that were left open: one's own, or a stranger's for a trusted client."""
+        """Close sessions left open: the client's own, or for a trusted client a stranger's."""
         own = [n for n, s in self._sessions.items() if s.client_id == request.client_id]
         if len(own) >= MAX_SESSIONS_OF_ONE:
             self._drop(own[0])
@@ -291,7 +291,7 @@ class FtpService:
         return self.poll(now_us)
 
     def _continue_burst(self, number: int) -> Reply:
-        """Take the next packet of a burst, which then goes behind the others."""
+        """Build the next packet of a burst, which then queues behind the others."""
         burst = self._bursts.pop(number)
         content, packet = self._sessions[number].content, burst.packet
         size = min(max(packet.size or MAX_DATA, MIN_BURST_DATA), MAX_DATA)
@@ -327,7 +327,7 @@ class FtpService:
 
 
 def crc32(content: bytes) -> int:
-    """Compute the CRC-32 that MAVLink FTP means: no initial value, no final inversion."""
+    """Compute the CRC-32 of MAVLink FTP: no initial value, no final inversion."""
     return ~binascii.crc32(content, 0xFFFFFFFF) & 0xFFFFFFFF
 
 

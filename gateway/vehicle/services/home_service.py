@@ -1,4 +1,4 @@
-"""Home as parameters: three numbers that change one at a time, and who set them."""
+"""Home as parameters: three coordinates that change one at a time, and who set them."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -15,11 +15,11 @@ NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl
 
 
 class HomeService:
-    """Sets home, forgets it, and knows which home is to outlive the gateway.
+    """Set and forget home, and decide which home is kept over a restart.
 
-    A home that the GPS measured is that of one day's field and is measured anew at every start; one
-    that an operator set is kept. A command keeps it at once, a parameter when the parameters are
-    stored.
+    A home that the GPS measured is measured again at every start, which may be at another field;
+    one that an operator set is kept. A command keeps it at once, a parameter when the parameters
+    are stored.
     """
 
     def __init__(self, telemetry: Telemetry) -> None:
@@ -30,26 +30,26 @@ class HomeService:
 
     @property
     def home(self) -> Home | None:
-        """The home that holds now."""
+        """The present home."""
         return self._telemetry.home
 
     def put(self, place: Place, now_us: int) -> list[Answer]:
-        """Set home by an operator's wish, and tell it."""
+        """Set home for an operator, and send HOME_POSITION."""
         self._entered.clear()
         return [Reply(m) for m in self._telemetry.set_home(Home(place, now_us, "operator"))]
 
     def restore(self, place: Place) -> None:
-        """Begin with the home that was kept."""
+        """Start with the home that was kept."""
         self.kept = place
         self._telemetry.set_home(Home(place, 0, "operator"))
 
     def keep(self) -> None:
-        """Let the present home outlive the gateway if an operator set it; else none does."""
+        """Keep the present home over a restart if an operator set it; else keep none."""
         home = self.home
         self.kept = home.place if home is not None and home.source == "operator" else None
 
     def parameters(self) -> HomeParameters:
-        """Tell home as parameters."""
+        """Return home as parameters."""
         home = self.home
         if home is None:
             return HomeParameters()
@@ -57,7 +57,7 @@ class HomeService:
         return HomeParameters(source=home.source, **numbers)
 
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Carry out the change of one parameter.
+        """Apply the change of one parameter.
 
         Parameters
         ----------
@@ -83,7 +83,8 @@ class HomeService:
         part, home = NUMBERS[key], self.home
         if home is not None:
             if _same(value, getattr(home.place, part)):
-                # A parameter is less exact than home; a list sent back must not round it.
+                # A parameter is less precise than home; a list that is written back must not round
+                # it.
                 return []
             return self.put(replace(home.place, **{part: value}), now_us)
         self._entered.add(key)

@@ -1,8 +1,8 @@
-"""Rates that single clients wish for: each client's own, and nobody else's.
+"""Message rates that a client requests for itself alone.
 
-A wish for fewer messages thins what goes to all, at the hub. A wish for more gets the client a
-stream of its own, beside the common one, which the hub then keeps from it. That costs the gateway
-work, so only clients that may change things get it.
+A request for fewer messages thins the common stream at the hub. A request for more gives the
+client a separate stream instead of the common one. That costs CPU time, so only clients that may
+change things get it.
 """
 
 from collections.abc import Iterable
@@ -53,7 +53,7 @@ ALL_GROUPS: Final = tuple(message for group in DATA_STREAMS.values() for message
 
 
 class IntervalService:
-    """Who gets which message how often."""
+    """Which client gets which message how often."""
 
     types = ("REQUEST_DATA_STREAM",)
 
@@ -64,7 +64,7 @@ class IntervalService:
         self._fast: dict[tuple[int, int], Stream] = {}
 
     def changes_state(self, _request: Request) -> bool:
-        """Tell that a client's own rates are nobody else's business."""
+        """Return False: a client's own rates change nothing for others."""
         return False
 
     def refuse(self, _request: Request) -> list[Answer]:
@@ -74,8 +74,8 @@ class IntervalService:
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
         """Thin a group of messages by REQUEST_DATA_STREAM, which has no answer.
 
-        It only ever thins: its rate is meant for whole groups, and raising everything in them
-        would be no kindness.
+        It only ever thins: its rate is for whole groups, and raising everything in them would
+        flood the client.
         """
         message = request.message
         group = ALL_GROUPS if message.req_stream_id == 0 else ()
@@ -91,12 +91,12 @@ class IntervalService:
         return answers
 
     def set_interval(self, request: Request, message_id: int, interval_us: float) -> list[Answer]:
-        """Take one client's wish.
+        """Apply one client's requested rate.
 
         Parameters
         ----------
         request : Request
-            Who wishes it.
+            The client's request.
         message_id : int
         interval_us : float
             As in MAV_CMD_SET_MESSAGE_INTERVAL: 0 for the settings' rate, -1 for none.
@@ -109,7 +109,7 @@ class IntervalService:
         Raises
         ------
         ValueError
-            If the message is never streamed, or the wish cannot be granted.
+            If the message is never streamed, or the rate cannot be granted.
         """
         stream = self._telemetry.streams.get(message_id)
         if stream is None:
@@ -129,7 +129,7 @@ class IntervalService:
         return self._take(request.client_id, message_id, wish)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
-        """Return how often a client gets a message, as MESSAGE_INTERVAL says it.
+        """Return how often a client gets a message, as in MESSAGE_INTERVAL.
 
         Returns
         -------
@@ -142,17 +142,17 @@ class IntervalService:
         return self._wishes.get((client_id, message_id), stream.interval_us)
 
     def forget_client(self, client_id: int) -> None:
-        """Forget the wishes of a client that has gone."""
+        """Forget the rates of a client that has gone."""
         for table in (self._wishes, self._fast):
             for key in [key for key in table if key[0] == client_id]:
                 del table[key]
 
     def on_state(self, time_us: int) -> list[Answer]:
-        """Send what an IMU sample carries to those who wished for more."""
+        """Send the messages of an IMU sample to the clients that requested more."""
         return self._due(STATE_MESSAGES, time_us, Stream.offer) if self._fast else []
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send what no sample carries to those who wished for more."""
+        """Send the timed messages to the clients that requested more."""
         if not self._fast:
             return []
         timed = [m for _, m in self._fast if m not in STATE_MESSAGES]

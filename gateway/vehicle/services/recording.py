@@ -1,4 +1,4 @@
-"""Recording on command: acknowledged when the recorder has done it, not when it was asked.
+"""Recording on command: acknowledged when the recorder has started, not when it was asked to.
 
 | command       | recorder                        | answer                                   |
 | ------------- | ------------------------------- | ---------------------------------------- |
@@ -7,9 +7,9 @@
 | LOGGING_STOP  | any                             | ACCEPTED; FAILED to all who wait         |
 |               | has opened its files            | ACCEPTED to all who wait                 |
 |               | cannot open them                | FAILED to all who wait, and why as text  |
-|               | has told nothing for 10 s       | FAILED to all who wait                   |
+|               | has not reported for 10 s       | FAILED to all who wait                   |
 
-A start that failed stays an order: the recorder tries again by itself, and tells when it can.
+A start that failed stays pending: the recorder retries by itself, and announces when it succeeds.
 """
 
 from typing import Final
@@ -31,16 +31,16 @@ from gateway.vehicle.services.commands import (
 
 PATIENCE_US: Final = 10 * US_PER_S
 MAX_WAITING: Final = 16
-"""Ground stations that may wait for one recorder."""
+"""Ground stations that may wait for the recorder."""
 
 
 class RecordingService:
-    """Starts and stops the recording.
+    """Start and stop the recording.
 
     Parameters
     ----------
     explain : callable
-        Tells all why something was refused.
+        Announces to all why something was refused.
     """
 
     def __init__(self, explain: Explain) -> None:
@@ -51,17 +51,17 @@ class RecordingService:
         self._due_us: int | None = None
 
     def register(self, commands: CommandService) -> None:
-        """Offer the commands that are carried out here."""
+        """Register the commands that are carried out here."""
         commands.register(mavlink.MAV_CMD_LOGGING_START, self._start)
         commands.register(mavlink.MAV_CMD_LOGGING_STOP, self._stop)
 
     def update(self, trouble: str, now_us: int, *, recording: bool) -> list[Answer]:
-        """Note what the recorder does.
+        """Note the state of the recorder.
 
         Parameters
         ----------
         trouble : str
-            Why it cannot record although it should; empty if nothing hinders it.
+            Why it cannot record although it should; empty if there is no problem.
         now_us : int
             Gateway clock.
         recording : bool
@@ -81,7 +81,7 @@ class RecordingService:
         return []
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Give up in the end."""
+        """Report a failure when the recorder does not answer in time."""
         if self._due_us is None or now_us < self._due_us:
             return []
         return self._end(FAILED) + self._explain("Cannot record: no answer of the disk", now_us)
@@ -91,7 +91,7 @@ class RecordingService:
         return self._due_us
 
     def forget_client(self, client_id: int) -> None:
-        """Answer no more to a client that has gone."""
+        """Forget the requests of a client that has gone."""
         self._waiting.pop(client_id, None)
         self._due_us = self._due_us if self._waiting else None
 

@@ -1,4 +1,4 @@
-"""PING and TIMESYNC: a client measures the way and sets its clock against ours."""
+"""PING and TIMESYNC: a client measures the round trip and its clock's offset to ours."""
 
 from typing import Final
 
@@ -10,12 +10,12 @@ NS_PER_US: Final = 1000
 
 
 class TimingService:
-    """Answer PING and TIMESYNC requests; their answers are left alone."""
+    """Answer PING and TIMESYNC requests; ignore answers to others."""
 
     types = ("PING", "TIMESYNC")
 
     def changes_state(self, _request: Request) -> bool:
-        """Tell that nothing here changes state."""
+        """Return False: nothing here changes state."""
         return False
 
     def refuse(self, _request: Request) -> list[Answer]:

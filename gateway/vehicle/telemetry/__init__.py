@@ -1,1 +1,1 @@
-"""What the vehicle sends without being asked."""
+"""The vehicle's telemetry."""

@@ -1,4 +1,4 @@
-"""Messages that programs outside the package add to what every vehicle sends."""
+"""Messages that other packages add to every vehicle's telemetry."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class NewestRecords:
 
 @dataclass(frozen=True, slots=True)
 class AddedMessage:
-    """One message, how often it is sent, and what makes it."""
+    """One message, its rate, and the function that builds it."""
 
     message_id: int
     rate_hz: float
@@ -33,16 +33,16 @@ ADDED_MESSAGES: Final[dict[int, AddedMessage]] = {}
 def add_message(
     message_id: int, rate_hz: float, build: Callable[[NewestRecords], Any]
 ) -> AddedMessage:
-    """Let every vehicle that is made from now on send one more message.
+    """Add a message to every vehicle created from now on.
 
     Parameters
     ----------
     message_id : int
         Of the `common` dialect, so that recordings and routers know it.
     rate_hz : float
-        How often it is sent; a client may ask for another rate, as of any message.
+        How often it is sent; a client may request another rate, as for any message.
     build : callable
-        Makes it from the newest records.
+        Builds it from the newest records.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The events of one aircraft, as texts: link, nodes, GPS and what the estimator says of itself."""
+"""The events of one aircraft, as texts: link, nodes, GPS and the estimator's flags."""
 
 from collections.abc import Iterable
 from typing import Any, Final
@@ -45,11 +45,11 @@ FLAG_TEXTS: Final = (
         StatusText(INFO, "Estimator well again"),
     ),
 )
-"""A flag of the estimator, what is told when it rises, and what when it falls."""
+"""A flag of the estimator, the text when it rises, and the text when it falls."""
 
 
 class Announcements:
-    """What is told of one aircraft."""
+    """The announcements of one aircraft."""
 
     def __init__(self, health: Health) -> None:
         self._health = health
@@ -72,26 +72,26 @@ class Announcements:
         return found
 
     def on_fix(self, now_us: int) -> list[Any]:
-        """Return whether GPS fixes come."""
+        """Announce whether GPS fixes arrive."""
         fixed = self._health.has_fix(now_us)
         text = StatusText(INFO, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_boards(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
-        """Return how the boards fare, where that changed."""
+        """Announce changes in the state of the boards."""
         found = []
         for one in findings:
             found += self._announcer.track(one.topic, one.is_bad, one.text, now_us, initially=False)
         return found
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
-        """Announce the receiver's and the nodes' coming and going."""
+        """Announce that the receiver or a node was lost or is back."""
         text = StatusText(CRITICAL, f"Receiver lost: {report.port}")
         if report.connected:
             text = StatusText(INFO, f"Receiver connected: {report.port}")
         found = self._announcer.track("link", report.connected, text, now_us)
         if not report.connected:
-            # Without the receiver every node is silent; that need not be said.
+            # Without the receiver every node is silent; that need not be announced.
             return found
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
@@ -105,7 +105,7 @@ class Announcements:
         return found + self._on_restarts(now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Any]:
-        """Tell a single event."""
+        """Announce a single event."""
         return self._announcer.say(text, now_us)
 
     def poll(self, now_us: int) -> list[Any]:

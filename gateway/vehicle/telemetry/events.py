@@ -1,11 +1,11 @@
-"""What happens to the vehicle, told as STATUSTEXT and never as a flood.
+"""Events of the vehicle, announced as STATUSTEXT at a limited rate.
 
 Theory of operation. Every topic ("link", "GPS fix", a flag of the estimator) has a state, and only
-a change of state is told. After telling one, the topic is held for `HOLD_US`; what it does
-meanwhile is not lost but folded: at the end of the hold its state is told if it differs from the
-one told last. A flapping topic thus costs at most one text in `HOLD_US`, and the last text always
-tells the truth. Single events that have no state go through `say`, at most `BUCKET` at once
-and one more every `REFILL_US`.
+a change of state is announced. After that the topic is held for `HOLD_US`; changes in the meantime
+are merged: at the end of the hold its state is announced if it differs from the last one
+announced. A flapping topic thus costs at most one text in `HOLD_US`, and the last text is always
+right. Single events that have no state go through `say`, at most `BUCKET` at once and one more
+every `REFILL_US`.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ MAX_TEXT_BYTES: Final = 4 * TEXT_BYTES
 
 @dataclass(frozen=True, slots=True)
 class StatusText:
-    """A text and how grave it is."""
+    """A text and its severity."""
 
     severity: int
     text: str
@@ -52,7 +52,7 @@ class Announcer:
     bucket : int, optional
         Most single events at once.
     refill_us : int, optional
-        Time after which one more may be told.
+        Time after which one more may be announced.
     """
 
     def __init__(self, bucket: int = BUCKET, refill_us: int = REFILL_US) -> None:
@@ -65,7 +65,7 @@ class Announcer:
     def track(
         self, topic: str, state: object, text: StatusText, now_us: int, *, initially: object = None
     ) -> list[Any]:
-        """Note the present state of a topic, and tell it if it changed.
+        """Note the present state of a topic, and announce it if it changed.
 
         Parameters
         ----------
@@ -74,11 +74,11 @@ class Announcer:
         state : object
             Any value; compared by equality.
         text : StatusText
-            What to tell of this state.
+            The text for this state.
         now_us : int
             Gateway clock.
         initially : object, optional
-            The state in which a new topic begins, and of which nothing is told.
+            The state in which a new topic begins, which is not announced.
 
         Returns
         -------
@@ -89,7 +89,7 @@ class Announcer:
         return self._announce(known, now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Any]:
-        """Tell a single event, unless there were too many recently."""
+        """Announce a single event, unless there were too many recently."""
         self._refill(now_us)
         if self._tokens == 0:
             return []
@@ -103,7 +103,7 @@ class Announcer:
         ]
 
     def next_due_us(self) -> int | None:
-        """Return when `poll` has something to tell."""
+        """Return when `poll` has something to announce."""
         pending = (t.held_until_us for t in self._topics.values() if t.state != t.announced)
         return min(pending, default=None)
 
@@ -126,14 +126,14 @@ class Announcer:
 
 
 def chunks(text: StatusText, number: int = 1) -> list[Any]:
-    """Encode a text as one STATUSTEXT, or as several that a reader puts together.
+    """Encode a text as one STATUSTEXT, or as several chunks.
 
     Parameters
     ----------
     text : StatusText
         ASCII; cut at `MAX_TEXT_BYTES`.
     number : int, optional
-        Tells a long text from the one before, 1 to 65535.
+        Id of a long text, different from the one before, 1 to 65535.
 
     Returns
     -------
@@ -143,7 +143,7 @@ def chunks(text: StatusText, number: int = 1) -> list[Any]:
     if len(data) <= TEXT_BYTES:
         # Id 0 means a text of one chunk.
         return [mavlink.MAVLink_statustext_message(text.severity, data)]
-    # A reader takes a chunk that is not full for the last one.
+    # A receiver takes a chunk that is not full for the last one.
     starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
     return [
         mavlink.MAVLink_statustext_message(

@@ -1,8 +1,8 @@
 """Physical values to the numbers of MAVLink fields: scaled, saturated, and never raising.
 
 A MAVLink integer field often reserves its greatest value for "unknown". Each function here takes
-what to send in that case, and keeps a value that is too large one short of that mark, so that
-"very much" is never read as "not known".
+the value to send in that case, and saturates one below it, so that a too large value is never read
+as "not known".
 """
 
 import math
@@ -26,7 +26,7 @@ def whole(value: float, low: int, high: int, unknown: int) -> int:
     low, high : int
         Ends of the field, `unknown` excluded.
     unknown : int
-        What the message definition sends for a value that is not known.
+        What the message definition specifies for an unknown value.
 
     Returns
     -------
@@ -52,12 +52,12 @@ def uint16(value: float, unknown: int = UINT16_MAX) -> int:
 
 
 def int16(value: float, unknown: int = 0) -> int:
-    """Fit a signed 16-bit field; most of them have no mark for unknown."""
+    """Fit a signed 16-bit field; most of them have no value for unknown."""
     return whole(value, -INT16_MAX - 1, INT16_MAX - (unknown == INT16_MAX), unknown)
 
 
 def int32(value: float, unknown: int = 0) -> int:
-    """Fit a signed 32-bit field; most of them have no mark for unknown."""
+    """Fit a signed 32-bit field; most of them have no value for unknown."""
     return whole(value, -INT32_MAX - 1, INT32_MAX - (unknown == INT32_MAX), unknown)
 
 

@@ -1,4 +1,4 @@
-"""Which sensors live and hold, as SYS_STATUS, RADIO_STATUS and texts tell it."""
+"""Which sensors are present and healthy, for SYS_STATUS, RADIO_STATUS and texts."""
 
 from typing import Any, Final
 
@@ -45,7 +45,7 @@ BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 
 
 class Health:
-    """What was heard last of every sensor of one aircraft, and whether it is well."""
+    """When every sensor of one aircraft was last heard, and whether it is healthy."""
 
     def __init__(self, vehicle_id: int, silent_s: float, supply_low_v: float = 0.0) -> None:
         self.vehicle_id = vehicle_id
@@ -90,7 +90,7 @@ class Health:
         self._fix = fix
 
     def on_node_status(self, status: NodeStatus) -> list[Finding]:
-        """Note what a node tells of itself; returns how its board fares."""
+        """Note a node's report about itself; return the state of its board."""
         failed = 0
         for bit, sensors in NODE_SENSORS:
             if status.sensors_failed & status.sensors_present & bit:
@@ -103,7 +103,7 @@ class Health:
         return self.boards.take(status, self.node_name(status.node.node_id))
 
     def on_link(self, report: LinkReport) -> list[Finding]:
-        """Note the state of the radio links to this aircraft's nodes; returns how they fare."""
+        """Note the state of the radio links to this aircraft's nodes; return its findings."""
         self._nodes = tuple(
             link for link in report.nodes if link.node.vehicle_id == self.vehicle_id
         )
@@ -116,7 +116,7 @@ class Health:
         return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
-        """Return whether a sensor was heard of lately."""
+        """Return whether a sensor was heard recently."""
         seen = self._seen_us.get(sensor)
         return seen is not None and now_us - seen <= self.silent_us
 
@@ -135,7 +135,7 @@ class Health:
         Returns
         -------
         tuple of 3 ints
-            Present (ever heard of, and not said to be absent), enabled, healthy.
+            Present (ever heard, and not reported absent), enabled, healthy.
         """
         present = 0
         healthy = 0
@@ -155,7 +155,7 @@ class Health:
             if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID:
                 healthy |= 0 if self._nav_flags & BAD_FOR_AHRS else AHRS
         present |= LOGGING | PREARM
-        # There is no fence, so none is breached; MAVProxy cries breach without this bit.
+        # There is no fence, so none is breached; MAVProxy reports a breach without this bit.
         healthy |= GEOFENCE
         enabled = present if self.recording else present & ~LOGGING
         healthy |= LOGGING if self.recording else 0
@@ -165,7 +165,7 @@ class Health:
         return present, enabled, healthy
 
     def sys_status(self, now_us: int) -> Any:
-        """Encode SYS_STATUS; the boards' supplies are told by BATTERY_STATUS.
+        """Encode SYS_STATUS; the boards' supplies are in BATTERY_STATUS.
 
         The four error counts are the nodes' bus errors, failed and repeated radio sends, and the
         receiver's overruns.
@@ -202,7 +202,7 @@ class Health:
         )
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:
-        """Name the nodes that were heard once and are silent now."""
+        """Return the nodes that were heard once and are silent now."""
         return frozenset(
             link.node.node_id
             for link in self._nodes
@@ -210,20 +210,20 @@ class Health:
         )
 
     def node_name(self, node_id: int) -> str:
-        """Name a node by what it carries, as far as it has told."""
+        """Name a node by its sensors, as far as it has reported them."""
         return f"{self._roles.get(node_id, 'Node')} {node_id}"
 
     def restarts(self) -> dict[int, int]:
-        """Return how often each node has started anew."""
+        """Return how often each node has restarted."""
         return {link.node.node_id: link.restarts for link in self._nodes}
 
     def known_nodes(self) -> frozenset[int]:
-        """Name the nodes that were ever heard."""
+        """Return the nodes that were ever heard."""
         return frozenset(link.node.node_id for link in self._nodes if link.received)
 
 
 def node_role(sensors_present: int) -> str:
-    """Name what a node is by the sensors that it carries."""
+    """Name a node's role by its sensors."""
     if sensors_present & NODE_IMU:
         return "IMU node"
     return "GPS node" if sensors_present & NODE_GPS else "Node"

@@ -35,10 +35,10 @@ UNKNOWN_PERCENT: Final = -1
 def high_latency2(
     kind: int, state: NavState | None, fix: GpsFix | None, health: Health, now_us: int
 ) -> Any:
-    """Encode all that there is to say in 42 bytes.
+    """Encode the state of the vehicle in 42 bytes.
 
-    A place has no "unknown" in this message: it is 0, 0 before the first fix, and the flag of a
-    failed GPS says so. Nothing measures wind, airspeed or throttle.
+    A position has no "unknown" in this message: it is 0, 0 before the first fix, and the GPS
+    failure flag is set. Nothing measures wind, airspeed or throttle.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def high_latency2(
     fix : GpsFix, optional
         The newest.
     health : Health
-        Tells which sensors live.
+        State of the sensors.
     now_us : int
         Gateway clock.
 

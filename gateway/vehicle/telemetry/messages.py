@@ -1,7 +1,7 @@
 """Records to MAVLink messages: every unit, sign and "unknown" of the message definitions.
 
-Where a definition has no mark for "unknown", the choice is told in the function that makes it.
-Floats that are not known are NaN throughout, which is MAVLink's own rule.
+Where a definition has no value for "unknown", the function that builds the message documents the
+choice. Unknown floats are NaN throughout, which is MAVLink's own rule.
 """
 
 import math
@@ -92,7 +92,7 @@ def attitude(state: NavState) -> Any:
 
 
 def has_position(state: NavState) -> bool:
-    """Return whether there is a place to report, be it dead-reckoned and old."""
+    """Return whether there is a position to report, even if dead-reckoned and old."""
     return math.isfinite(state.lat_deg + state.lon_deg + state.alt_amsl_m)
 
 
@@ -100,9 +100,9 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
     """Encode the fused position; for states that have one.
 
     Latitude, longitude and heights have no "unknown" in this message, and 0, 0 is a place; so
-    nothing is sent before the first position, and the estimate from then on, however it is
-    supported: ESTIMATOR_STATUS tells how well it holds. Velocities have no "unknown" either and
-    are zero in the rare state that has a place but no velocity.
+    nothing is sent before the first position, and the estimate always from then on:
+    ESTIMATOR_STATUS reports its quality. Velocities have no "unknown" either and are zero in the
+    rare state that has a position but no velocity.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
 def vfr_hud(state: NavState) -> Any:
     """Encode speed, heading, height and climb.
 
-    Nothing measures the airspeed: its field carries the ground speed, as ArduPilot's does without
-    such a sensor, because clients print it as an integer, which no NaN survives. Throttle is 0, for
-    a tracker drives nothing. The heading is the yaw of ATTITUDE, and like it always sent.
+    No airspeed is measured: its field carries the ground speed, as ArduPilot's does without such a
+    sensor, because clients print it as an integer, where NaN fails. Throttle is 0, since a tracker
+    has no motor control. The heading is the yaw of ATTITUDE, and like it always sent.
     """
     north, east, down = state.vel_n_mps
     speed = math.hypot(north, east)
@@ -153,8 +153,8 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
     """Encode the calibrated sensors.
 
     HIGHRES_IMU rather than SCALED_IMU: its floats keep the sensors' resolution, it carries the
-    barometer, and `fields_updated` tells which values are new, where SCALED_IMU would have to
-    send a plausible zero for an absent magnetometer.
+    barometer, and `fields_updated` marks the new values, where SCALED_IMU would have to send a
+    plausible zero for an absent magnetometer.
 
     Parameters
     ----------
@@ -200,8 +200,9 @@ def scaled_pressure(sample: BaroSample) -> Any:
 def gps_raw_int(fix: GpsFix) -> Any:
     """Encode a fix.
 
-    The receiver tells the position's DOP alone, whose square is the sum of those of HDOP and VDOP;
-    it is parted by the accuracies, which grow with them. An extension field that is not known is 0.
+    The receiver reports only the position's DOP, whose square is the sum of those of HDOP and
+    VDOP; it is divided by the accuracies, which are proportional to them. An extension field that
+    is not known is 0.
     """
     north, east, _ = fix.vel_n_mps
     speed = math.hypot(north, east)
@@ -227,7 +228,7 @@ def gps_raw_int(fix: GpsFix) -> Any:
 
 
 def dilutions(fix: GpsFix) -> tuple[float, float]:
-    """Tell HDOP and VDOP; NaN without a fix, or where the receiver does not tell enough."""
+    """Return HDOP and VDOP; NaN without a fix, or if the receiver does not report enough."""
     accuracy_m = math.hypot(fix.h_acc_m, fix.v_acc_m)
     if not is_3d(fix) or not accuracy_m > 0.0:
         return NAN, NAN
@@ -235,7 +236,7 @@ def dilutions(fix: GpsFix) -> tuple[float, float]:
 
 
 def gps_absent(now_us: int) -> Any:
-    """Tell that no GPS node is heard, so that a last good fix does not stay on the screen."""
+    """Encode "no GPS", so that the last good fix of a silent node does not stay on screen."""
     return mavlink.MAVLink_gps_raw_int_message(
         time_usec=now_us,
         fix_type=mavlink.GPS_FIX_TYPE_NO_GPS,
@@ -251,7 +252,7 @@ def gps_absent(now_us: int) -> Any:
 
 
 def estimator_status(state: NavState) -> Any:
-    """Encode what the estimator vouches for; it computes none of the test ratios."""
+    """Encode which states the estimator considers valid; it computes no test ratios."""
     flags = 0
     for ours, theirs in ESTIMATOR_FLAGS:
         if state.flags & ours:
@@ -280,5 +281,5 @@ def home_position(home: Home) -> Any:
 
 
 def system_time(now_us: int, unix_us: int | None) -> Any:
-    """Encode the clocks; the Unix time is 0 until a GPS fix has told it."""
+    """Encode the clocks; the Unix time is 0 until a GPS fix provides it."""
     return mavlink.MAVLink_system_time_message(unix_us or 0, boot_ms(now_us))

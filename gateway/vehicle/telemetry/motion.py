@@ -41,12 +41,12 @@ class Motion:
         self._since_us = 0
 
     def update(self, state: NavState, ground_alt_m: float) -> None:
-        """Judge one navigation state.
+        """Update the landed state from one navigation state.
 
         Parameters
         ----------
         state : NavState
-            What the estimator believes; without a valid velocity nothing changes.
+            The estimate; without a valid velocity nothing changes.
         ground_alt_m : float
             Height of the ground above mean sea level, NaN while it is not known.
         """

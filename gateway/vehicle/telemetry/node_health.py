@@ -1,8 +1,7 @@
-"""How the boards themselves fare: supply, radio, sensor bus, overruns; told when it gets worse.
+"""State of the boards: supply, radio, sensor bus, overruns; announced when it gets worse.
 
 A node reports once a second what it counted since its start. Most faults of cheap boards show here
-first: a supply that sags when the radio sends, a cable that breaks the sensors' bus, an antenna
-that was lost.
+first: a supply that sags when the radio sends, a broken cable to the sensors, a lost antenna.
 
 | topic  | gets worse                                     | is well again                        |
 | ------ | ---------------------------------------------- | ------------------------------------ |
@@ -25,7 +24,7 @@ HYSTERESIS_V: Final = 0.1
 QUIET_REPORTS: Final = 10
 FAILED_SHARE: Final = 0.1
 WORD: Final = 0xFFFF
-"""The nodes' counters have 16 bits, and begin anew."""
+"""The nodes' counters have 16 bits, and wrap."""
 CELLS: Final = 10
 MV: Final = 1e3
 
@@ -41,7 +40,7 @@ class Finding:
 
 @dataclass(slots=True)
 class _Trouble:
-    """A topic that is bad from one report on, and well again after a row of quiet ones."""
+    """A topic that turns bad with one report, and good again after several without errors."""
 
     quiet: int = QUIET_REPORTS
 
@@ -68,7 +67,7 @@ class NodeHealth:
     vehicle_id : int
         Whose nodes.
     supply_low_v : float
-        A lower supply is told, in V; 0 for none.
+        A lower supply is announced, in V; 0 disables this.
     """
 
     def __init__(self, vehicle_id: int, supply_low_v: float) -> None:
@@ -83,7 +82,7 @@ class NodeHealth:
 
     @property
     def firmware(self) -> int:
-        """Version of the first node as MAVLink packs it; 0 before it has told."""
+        """Firmware version of the first node as MAVLink packs it; 0 before it has reported."""
         for status in self.statuses:
             major, minor = status.firmware_version
             return major << 24 | minor << 16
@@ -97,19 +96,19 @@ class NodeHealth:
         status : NodeStatus
             The node's newest.
         name : str
-            What the node is called in texts.
+            Name of the node in texts.
 
         Returns
         -------
         list of Finding
-            The state of each topic, for one who tells changes.
+            The state of each topic, to announce changes.
         """
         known = self._nodes.get(status.node.node_id)
         if known is None:
             known = self._nodes[status.node.node_id] = _Node(status)
         before, known.status = known.status, status
         if status.node_time_us < before.node_time_us:
-            # It has started anew, and so have its counters.
+            # It has restarted, and so have its counters.
             before = status
         errors = status.bus_errors - before.bus_errors & WORD
         failed = status.radio_failed - before.radio_failed & WORD
@@ -132,7 +131,7 @@ class NodeHealth:
         ]
 
     def take_link(self, report: LinkReport, names: dict[int, str]) -> list[Finding]:
-        """Note what the receiver had no room for."""
+        """Note the payloads for which the receiver had no room."""
         if report.receiver is None:
             return []
         found = []

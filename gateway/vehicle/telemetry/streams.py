@@ -1,8 +1,8 @@
 """When each message is due: at its own interval, on the clock of the samples that carry it.
 
-Theory of operation. A message about the attitude is worth most at the moment its sample arrives,
-so no timer sends it: every sample is offered to its stream, and the stream takes the samples
-nearest to a grid of its own interval. Three things could spoil that:
+Theory of operation. A message about the attitude is most useful when its sample arrives, so no
+timer sends it: every sample is offered to its stream, and the stream takes the samples nearest to
+a grid of its own interval. Three effects could disturb that:
 
 - *Drift.* The grid advances by the interval, not from the sample that was sent, so 50 Hz out of
   60 Hz samples stays 50 Hz.
@@ -10,7 +10,7 @@ nearest to a grid of its own interval. Three things could spoil that:
   and now and then skip or double one. The grid therefore leans a sixteenth of the way towards
   each sample it takes. Where the sample rate is within 3 % of a multiple the grid locks on, and
   every n-th sample is sent; elsewhere the pulls cancel out over a period.
-- *Bursts.* After a gap, or where samples come slower than the interval, the grid starts anew
+- *Bursts.* After a gap, or where samples come slower than the interval, the grid restarts
   at the sample, so a sample is sent once at most.
 
 Messages that no sample carries (HEARTBEAT and the like) run on the same grid by `tick`.
@@ -31,7 +31,7 @@ MAX_PERIOD_US: Final = US_PER_S
 
 
 def interval_us(rate_hz: float) -> int:
-    """Turn a rate into an interval; a rate of 0 into `OFF`."""
+    """Convert a rate to an interval; a rate of 0 to `OFF`."""
     return round(US_PER_S / rate_hz) if rate_hz > 0.0 else OFF
 
 
@@ -46,16 +46,16 @@ class Stream:
 
     @property
     def due_us(self) -> int | None:
-        """When the message is due next; None while it is off or has not begun."""
+        """When the message is due next; None while it is off or has not started."""
         return None if self.interval_us == OFF else self._due_us
 
     def change(self, interval: int) -> None:
-        """Take on a new interval, counted from the next sample."""
+        """Set a new interval, counted from the next sample."""
         self.interval_us = interval
         self._due_us = None
 
     def offer(self, time_us: int) -> bool:
-        """Ask whether the sample of this time is to be sent.
+        """Return whether the sample of this time is to be sent.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class Stream:
         return True
 
     def tick(self, now_us: int) -> bool:
-        """Ask whether a message that no sample carries is due.
+        """Return whether a message that no sample carries is due.
 
         Parameters
         ----------

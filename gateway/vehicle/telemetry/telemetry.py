@@ -1,4 +1,4 @@
-"""What the vehicle tells without being asked, each message at its own rate.
+"""The telemetry of a vehicle, each message at its own rate.
 
 Every message has one builder, which works from the newest records; the streams and the answer to
 a request for a single message share it.
@@ -28,7 +28,7 @@ STATE_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_VFR_HUD,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
 )
-"""Carried by IMU samples; the quaternion first, for its latency is the one that is seen."""
+"""Carried by IMU samples; the quaternion first, because its latency is the visible one."""
 
 TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -44,13 +44,13 @@ TIMED_MESSAGES: Final = (
 )
 
 HEARTBEAT_HZ: Final = 1.0
-"""Clients take a vehicle for lost by the absence of heartbeats at this very rate."""
+"""Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
 
 Builder = Callable[[int], Any]
 
 
 class Telemetry:
-    """The newest records of one aircraft, and the messages they become."""
+    """The newest records of one aircraft, and the messages built from them."""
 
     def __init__(self, settings: VehicleSettings, health: Health) -> None:
         self.settings = settings
@@ -94,7 +94,7 @@ class Telemetry:
         self._take_added()
 
     def add(self, message_id: int, builder: Builder) -> None:
-        """Let another service build a message that is sent by time."""
+        """Add a timed message that another service builds."""
         self._builders[message_id] = builder
 
     def _take_added(self) -> None:
@@ -113,7 +113,7 @@ class Telemetry:
         return message_id in self._builders
 
     def reconfigure(self, settings: VehicleSettings) -> None:
-        """Take on changed settings; only the rates that differ begin anew."""
+        """Apply changed settings; only the rates that differ restart."""
         self.settings = settings
         self.motion.takeoff_speed_mps = settings.takeoff_speed_mps
         self.motion.takeoff_height_m = settings.takeoff_height_m
@@ -123,14 +123,14 @@ class Telemetry:
 
     @property
     def armed(self) -> bool:
-        """Whether the armed bit is set, by the operator's rule."""
+        """Whether the armed bit is set, by the setting `armed_when`."""
         rule = self.settings.armed_when
         flying = self.motion.landed_state == IN_AIR and rule.startswith("flying")
         recording = self.health.recording and rule.endswith("recording")
         return flying or recording or rule == "always"
 
     def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
-        """Take in a navigation state and its IMU sample, and tell what is due."""
+        """Take in a navigation state and its IMU sample, and return the messages due."""
         self.state, self._sample = state, sample
         self._updated |= messages.IMU_UPDATED
         if sample.mag_b_ut is not None:
@@ -143,14 +143,14 @@ class Telemetry:
         return self._build_all(due, state.time_us)
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
-        """Take in a barometer sample, and tell it if due."""
+        """Take in a barometer sample, and return its message if due."""
         self._baro = sample
         self._updated |= messages.PRESSURE_UPDATED
         stream = self.streams[mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE]
         return [messages.scaled_pressure(sample)] if stream.offer(sample.time_us) else []
 
     def on_gps(self, fix: GpsFix) -> list[Any]:
-        """Take in a GPS fix, tell it if due, and set home by the first good one."""
+        """Take in a GPS fix, return its messages if due, and set home at the first good one."""
         self.fix = fix
         if fix.utc_us is not None:
             self._unix_offset_us = fix.utc_us - fix.time_us
@@ -165,7 +165,7 @@ class Telemetry:
         return found
 
     def on_node_status(self, status: NodeStatus) -> list[Any]:
-        """Tell a node's supply with its report, if that is due."""
+        """Return a node's supply message, if due."""
         common_us = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS].interval_us
         stream = self._batteries.setdefault(status.node.node_id, Stream(common_us))
         if stream.interval_us != common_us:
@@ -174,7 +174,7 @@ class Telemetry:
         return [] if message is None else [message]
 
     def set_home(self, home: Home) -> list[Any]:
-        """Take on a home, and tell it at once."""
+        """Set home, and return HOME_POSITION at once."""
         self.home = home
         self._reference_alt_m = home.place.alt_amsl_m
         return [messages.home_position(home)]
@@ -184,7 +184,7 @@ class Telemetry:
         self.home = None
 
     def poll(self, now_us: int) -> list[Any]:
-        """Return what is due by time."""
+        """Return the timed messages that are due."""
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)
@@ -195,7 +195,7 @@ class Telemetry:
         return found
 
     def next_due_us(self) -> int:
-        """Return when `poll` has something to tell; the heartbeat never stops."""
+        """Return when `poll` has something to send; the heartbeat never stops."""
         due = (self.streams[m].due_us for m in self._timed if self.streams[m].interval_us > 0)
         return min(0 if time_us is None else time_us for time_us in due)
 
@@ -257,7 +257,7 @@ class Telemetry:
         return high_latency2(self._type, self.state, self.fix, self.health, now_us)
 
     def _heartbeat(self, now_us: int) -> Any:
-        # Somebody else flies the aircraft by hand; the gateway only watches.
+        # The aircraft is flown by radio control; the gateway only watches.
         base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -284,7 +284,7 @@ class Telemetry:
 
 
 def _intervals(settings: VehicleSettings) -> dict[int, int]:
-    """Give the interval of every message; a rate's setting is named as its message."""
+    """Return the interval of every message; a rate's setting is named after its message."""
     found = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: interval_us(HEARTBEAT_HZ)}
     for name, rate in msgspec.structs.asdict(settings.rates).items():
         message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"

@@ -53,7 +53,7 @@ CHANGING: Final = frozenset(
 )  # fmt: skip
 
 Changed = Callable[[int, int], list[Answer]]
-"""Called with the kind that was stored, cleared or moved on, and the time."""
+"""Called with the mission type that was stored, cleared or advanced, and the time."""
 
 
 @dataclass(slots=True)
@@ -95,7 +95,7 @@ class MissionService:
         }
 
     def changes_state(self, request: Request) -> bool:
-        """Return whether the request would store, clear or move on."""
+        """Return whether the request would store, clear or change the current item."""
         return request.message.get_type() in CHANGING
 
     def refuse(self, request: Request) -> list[Answer]:
@@ -112,7 +112,7 @@ class MissionService:
         return handler(request, now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Ask again for an item that did not come; at last give up."""
+        """Request a missing item again; finally cancel the upload."""
         upload = self._upload
         if upload is None or now_us < upload.due_us:
             return []
@@ -133,7 +133,7 @@ class MissionService:
                 self._upload = self._finished = None
 
     def set_current(self, sequence: int, now_us: int) -> list[Answer] | None:
-        """Move on to an item; None if there is no such item."""
+        """Make an item the current one; None if there is no such item."""
         if not 0 <= sequence < len(self.items[MISSION]):
             return None
         self.current = sequence
@@ -244,7 +244,7 @@ class MissionService:
         return answers
 
     def _end(self, request: Request, _now_us: int) -> list[Answer]:
-        """Take a client's MISSION_ACK: the end of its download, or of its own upload."""
+        """Handle a client's MISSION_ACK: the end of its download, or of its own upload."""
         upload = self._upload
         if upload is not None and upload.request.client_id == request.client_id:
             self._upload = None

@@ -1,4 +1,4 @@
-"""Items of missions, fences and rally points: read, checked, and written back as they came."""
+"""Items of missions, fences and rally points: read, checked, and returned unchanged."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ FENCE: Final[int] = mavlink.MAV_MISSION_TYPE_FENCE
 RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
 
 MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
-"""More than a flight has, and little enough memory for every aircraft."""
+"""More than a flight needs, with little memory for each aircraft."""
 
 FENCE_COMMANDS: Final = frozenset(
     {
@@ -66,7 +66,7 @@ class Item:
     z: float
 
     def place(self, home_alt_m: float) -> Place | None:
-        """Return where it is, if it is anywhere: 0, 0 means "here" to autopilots, not the gulf."""
+        """Return its position, or None; 0, 0 means "here" to autopilots."""
         placed = self.command in PLACED_COMMANDS and self.frame in GLOBAL_FRAMES
         if not placed or (self.x, self.y) == (0, 0):
             return None
@@ -75,7 +75,7 @@ class Item:
 
 
 def read_item(message: Any) -> Item:
-    """Take an item out of MISSION_ITEM_INT or MISSION_ITEM.
+    """Read an item from MISSION_ITEM_INT or MISSION_ITEM.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def read_item(message: Any) -> Item:
     Returns
     -------
     Item
-        Unchecked. A float that no integer can hold becomes one that no check lets pass.
+        Unchecked. A float beyond the integer range becomes a value that every check refuses.
     """
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
@@ -120,7 +120,7 @@ def write_item(item: Item, sequence: int, kind: int, target: tuple[int, int], cu
 
 
 def check_item(item: Item, kind: int) -> int:
-    """Judge an item of an upload.
+    """Check an item of an upload.
 
     Parameters
     ----------

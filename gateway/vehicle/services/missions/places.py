@@ -36,18 +36,18 @@ USE_CURRENT: Final = 1
 
 
 class PlaceService:
-    """Set home, set and clear the mark, and keep them and the missions.
+    """Set home, set and clear the mark, and store them and the missions.
 
     Parameters
     ----------
     vehicle_id : int
         Id in the radio payloads.
     telemetry : Telemetry
-        Knows where the vehicle is, and tells home and the way to the mark.
+        Knows where the vehicle is, and sends home and the way to the mark.
     say : callable
-        Tells all an event.
+        Announces an event to all.
     stored : StoredPlaces
-        What was kept last time.
+        The places kept from the last run.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class PlaceService:
         )
 
     def register(self, commands: CommandService) -> None:
-        """Offer the commands that are carried out here."""
+        """Register the commands that are carried out here."""
         commands.register(mavlink.MAV_CMD_DO_SET_HOME, self._set_home)
         commands.register(mavlink.MAV_CMD_DO_SET_ROI, self._set_roi)
         commands.register(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, self._set_roi_location)
@@ -82,7 +82,7 @@ class PlaceService:
         commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
 
     def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
-        """Tell once how far it is to a home that was kept: it may be that of another field."""
+        """Announce once how far a kept home is: it may be that of another field."""
         home = self.home.kept
         if home is None or not self._home_untold or not is_3d(fix):
             return []
@@ -92,7 +92,7 @@ class PlaceService:
         return self._explain(text, now_us)
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
-        """Mark a place, or none, and tell all."""
+        """Mark a place, or none, and announce it."""
         self.mark.put(place)
         text = "Mark cleared"
         if place is not None:
@@ -100,7 +100,7 @@ class PlaceService:
         return [self._save(), *self._explain(text, now_us)]
 
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Carry out the change of a parameter of home; ValueError refuses it."""
+        """Apply the change of a parameter of home; ValueError refuses it."""
         return self.home.change(settings, key, now_us)
 
     def store(self) -> list[Answer]:
@@ -136,7 +136,7 @@ class PlaceService:
         return [self._save()]
 
     def _place(self, command: Command) -> Place | None:
-        """Read the place of a command; None if it is none."""
+        """Read the position of a command; None if it is invalid."""
         if command.frame not in GLOBAL_FRAMES:
             return None
         if not is_on_earth(command.lat_deg, command.lon_deg):

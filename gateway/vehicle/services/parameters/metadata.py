@@ -43,11 +43,11 @@ class Metadata:
         )
 
     def general(self) -> bytes:
-        """Give the file that names the others."""
+        """Return the file that lists the others."""
         return self._general
 
     def parameters(self) -> bytes:
-        """Give the parameters' file."""
+        """Return the parameters' file."""
         return self._parameters
 
     def announcement(self, now_us: int) -> Any:

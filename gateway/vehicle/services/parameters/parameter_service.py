@@ -1,8 +1,8 @@
-"""The parameter protocol: list, read, set, and every answer that goes missing asked for again.
+"""The parameter protocol: list, read, set.
 
-The list goes to the one who asked, a few at a time, so that a client's receive buffer and a slow
-link survive it, and in turns where several have asked, so that the gateway does; a change goes to
-all, so that every ground station's table stays true.
+The list goes to the client that asked, a few at a time, so that it does not overflow the client's
+receive buffer or a slow link, and to several clients in turn, to bound the gateway's load; a
+change goes to all, so that every ground station's table stays up to date.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from gateway.vehicle.services.parameters.parameters import Parameter, ParameterT
 
 BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
-"""Of these so many, whoever and however many wait for them."""
+"""Between batches of this many, for all clients together."""
 MAX_LISTENERS: Final = 512
 BY_NAME: Final = -1
 
@@ -35,14 +35,14 @@ FORBIDDEN: Final = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 
 
 class OwnSection(Protocol):
-    """Parameters that are no settings: the vehicle itself carries out what is set."""
+    """Parameters that are not settings: the vehicle itself applies a change."""
 
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Carry out the change of one of them; ValueError refuses it."""
+        """Apply the change of one of them; ValueError refuses it."""
         ...
 
     def store(self) -> list[Answer]:
-        """Let the present values outlive the gateway."""
+        """Keep the present values over a restart."""
         ...
 
 
@@ -56,7 +56,7 @@ class ParameterService:
     table : ParameterTable
         All of them.
     own : mapping of str to OwnSection, optional
-        Sections of the table that are no settings. They have no defaults to go back to.
+        Sections of the table that are not settings. They have no defaults.
     """
 
     types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
@@ -76,7 +76,7 @@ class ParameterService:
         return bool(request.message.get_type() == "PARAM_SET")
 
     def refuse(self, request: Request) -> list[Answer]:
-        """Return the value that stays."""
+        """Return the unchanged value."""
         parameter = self._named(request.message.param_id)
         if parameter is None:
             return [self._error(request, UNKNOWN)]
@@ -94,7 +94,7 @@ class ParameterService:
         return self.poll(now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send the next few of the lists that are under way, in turns."""
+        """Send the next few parameters of the requested lists, in turn."""
         if not self._lists or now_us < self._due_us:
             return []
         answers: list[Answer] = []
@@ -116,9 +116,9 @@ class ParameterService:
         self._lists.pop(client_id, None)
 
     def store(self, command: Command, _now_us: int) -> Outcome:
-        """Carry out MAV_CMD_PREFLIGHT_STORAGE: write, or go back to the defaults.
+        """Carry out MAV_CMD_PREFLIGHT_STORAGE: store, or restore the defaults.
 
-        The calibration of the sensors is no tuning: only its own reset touches it.
+        The defaults leave the sensors' calibration alone: it has its own reset.
         """
         asked = whole(command.params[0])
         sections = {k: v for k, v in self.table.sections.items() if k not in self._own}
@@ -136,15 +136,15 @@ class ParameterService:
         return ACCEPTED, answers + self._changed_since(before)
 
     def param_value(self, parameter: Parameter) -> Reply:
-        """Tell all the present value of a parameter."""
+        """Send the present value of a parameter to all."""
         return Reply(self._value(parameter))
 
     def values(self) -> list[Answer]:
-        """Tell all of them."""
+        """Send all of them to all."""
         return [self.param_value(parameter) for parameter in self.table.parameters]
 
     def take(self, section: str, settings: Any) -> list[Answer]:
-        """Take over a section that was changed elsewhere, and tell what differs."""
+        """Apply a section that was changed elsewhere, and send what differs."""
         before = self._numbers()
         self.table.sections[section] = settings
         return self._changed_since(before)
@@ -168,7 +168,7 @@ class ParameterService:
             answers = self._carry_out(parameter, settings, now_us)
         except ValueError:
             self.table.sections[parameter.section] = before
-            # The error first: a client that sees only the old value would try again.
+            # The error first: a client that sees only the old value would retry.
             return [self._error(request, BAD_VALUE), self.param_value(parameter)]
         return [*answers, self.param_value(parameter)]
 

@@ -1,8 +1,8 @@
 """The settings as a table of MAVLink parameters: names, numbers, ranges, and one change at a time.
 
-Every parameter travels as MAV_PARAM_TYPE_REAL32, switches and choices too (0, 1, 2 ...): a float
-is the only encoding on which the clients agree, since MAVProxy undoes the byte-wise encoding of
-integers for PX4 alone. An integer that a client encodes byte-wise is understood all the same.
+Every parameter is sent as MAV_PARAM_TYPE_REAL32, switches and choices too (0, 1, 2 ...): a float
+is the only encoding on which the clients agree, since MAVProxy decodes byte-wise integers only for
+PX4. An integer that a client encodes byte-wise is understood all the same.
 """
 
 import math
@@ -77,18 +77,18 @@ class Parameter:
     """The setting; of a rotation with its angles in place of its matrix."""
 
     def to_number(self, value: Any) -> float:
-        """Turn the setting's value into the parameter's."""
+        """Convert the setting's value to the parameter's."""
         if self.field.choices:
             return float(self.field.choices.index(value))
         return float(value if self.axis is None else value[self.axis])
 
     def from_number(self, number: float, old: Any) -> Any:
-        """Turn a parameter's value into the setting's.
+        """Convert a parameter's value to the setting's.
 
         Raises
         ------
         ValueError
-            If the number is none, or out of what is allowed; the text says what is.
+            If the number is not finite or out of range; the error gives the range.
         """
         if not math.isfinite(number):
             raise ValueError("not a number")
@@ -137,7 +137,7 @@ class ParameterTable:
             )
         )
         self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
-        # As they were set: a matrix alone would tell others, where the pitch is a right angle or
+        # As they were set: a matrix alone would give others, where the pitch is a right angle or
         # only some of the three have been set yet.
         self.index = {p.name: n for n, p in enumerate(self.parameters)}
         if len(self.index) < len(self.parameters):
@@ -171,7 +171,7 @@ class ParameterTable:
         return tree
 
     def reset(self, section: str) -> Settings:
-        """Give every parameter of a tree its default; what is no parameter stays as it is.
+        """Set every parameter of a tree to its default; other settings stay as they are.
 
         Returns
         -------
