@@ -1,8 +1,8 @@
-"""What a recording tells of that which ground stations ask: parameters, mission, home, version.
+"""Answers to ground stations' requests out of a recording: parameters, mission, home, version.
 
-A tlog holds the answers that the vehicle gave on that day. They are gathered while the file is
-indexed, each with the time from which it held, so that a player can give them again: as of the
-moment that is played, and from the first on for what the vehicle told only later.
+A tlog holds the answers that the vehicle gave in flight. They are collected while the file is
+indexed, each with the time from which it was valid, so that a player can give them again: as of
+the moment that is played, or the first one for what the vehicle sent only later.
 
 | what                         | where from                                                 |
 | ---------------------------- | ---------------------------------------------------------- |
@@ -50,7 +50,7 @@ _ACK: Final = struct.Struct("<BBBB")
 _CLEAR: Final = struct.Struct("<BBB")
 
 _SAME: Final = {HOME_POSITION_ID: 52}
-"""How much of the payload must be equal for nothing new; behind it stands when it was sent."""
+"""How much of the payload must be equal to be no change; the rest is the time of sending."""
 _KEPT: Final = frozenset(
     {
         PARAM_VALUE_ID, GPS_GLOBAL_ORIGIN_ID, AUTOPILOT_VERSION_ID, HOME_POSITION_ID,
@@ -74,13 +74,13 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Course(Generic[Value]):
-    """A value that changes: since when each of its values holds."""
+    """A value that changes: since when each of its values is valid."""
 
     times: list[int] = field(default_factory=list)
     values: list[Value] = field(default_factory=list)
 
     def add(self, time_us: int, value: Value) -> None:
-        # Other people's clocks fall; what was told later holds later.
+        # Clocks of other recorders may go back; a value recorded later is valid later.
         self.times.append(max(time_us, self.times[-1]) if self.times else time_us)
         self.values.append(value)
 
@@ -90,20 +90,20 @@ class _Course(Generic[Value]):
 
 @dataclass(slots=True)
 class _Transfer:
-    """A mission on its way: an upload waits for the vehicle's ACK, a download for its items."""
+    """A mission in transfer: an upload waits for the vehicle's ACK, a download for its items."""
 
     count: int
     items: dict[int, bytes] = field(default_factory=dict)
 
 
 class LogAnswers:
-    """What one recording, of however many parts, tells of its vehicles."""
+    """The answers in one recording, of any number of parts."""
 
     def __init__(self) -> None:
         self._frames: dict[tuple[int, int, bytes], _Course[bytes]] = {}
         self._missions: dict[tuple[int, int], _Course[Items]] = {}
         self._transfers: dict[tuple[int, int, bool], _Transfer] = {}
-        self._told: set[tuple[int, int]] = set()
+        self._seen: set[tuple[int, int]] = set()
         self._kept = 0
 
     def note(self, batch: Batch, stations: Set[int]) -> None:
@@ -118,15 +118,15 @@ class LogAnswers:
         """
         systems = batch.origins >> 8
         pairs = np.unique(systems << 32 | batch.message_ids)
-        self._told |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
+        self._seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
         for i in np.flatnonzero(np.isin(batch.message_ids, _READ)).tolist():
             if self._kept < MAX_KEPT:
                 self.note_frame(batch.frame(i), int(batch.time_us[i]), stations)
 
     def note_frame(self, frame: bytes, time_us: int, stations: Set[int] = frozenset()) -> None:
-        """Take in one frame: an answer, a part of a mission, or what is left aside."""
+        """Take in one frame: an answer or a part of a mission; others are ignored."""
         message_id, (system, component) = message_id_of(frame), origin_of(frame)
-        self._told.add((system, message_id))
+        self._seen.add((system, message_id))
         if message_id in _MISSION:
             self._note_mission(frame, time_us, is_station(system << 8 | component, stations))
         elif message_id in _KEPT and component == AUTOPILOT:
@@ -137,16 +137,16 @@ class LogAnswers:
 
     def has_message(self, system: int, message_id: int) -> bool:
         """Return whether a vehicle sent a message at all."""
-        return (system, message_id) in self._told
+        return (system, message_id) in self._seen
 
     def frames_at(self, system: int, message_id: int, time_us: int) -> Iterator[bytes]:
-        """Yield what a vehicle last told until a time, or first told after it."""
+        """Yield the frames that a vehicle sent last before a time, or else first after it."""
         for (sender, kind, _), course in self._frames.items():
             if (sender, kind) == (system, message_id):
                 yield course.at(time_us)
 
     def mission_at(self, system: int, kind: int, time_us: int) -> Items | None:
-        """Return the items of a mission, a fence or rally points; None if nothing tells of them."""
+        """Return the items of a mission, a fence or rally points; None if none are recorded."""
         course = self._missions.get((system, kind))
         return None if course is None else course.at(time_us)
 
@@ -192,18 +192,18 @@ class LogAnswers:
 
 
 class VehicleAnswers:
-    """What one vehicle of a recording would answer now, under the number that it is played by.
+    """The answers of one vehicle of a recording at the played moment, under its played id.
 
     Parameters
     ----------
     log : LogAnswers
         Of its recording.
     system_id : int
-        Its number in the recording.
+        Its system id in the recording.
     played_as : int
-        Its number as it is played.
+        Its system id in playback.
     position_us : callable
-        Tells the recording's time that is being played.
+        Returns the recording's time that is being played.
     """
 
     def __init__(
@@ -224,38 +224,38 @@ class VehicleAnswers:
         return [readdress(frame, self.played_as) for frame in found]
 
     def mission(self, kind: int) -> Items | None:
-        """Return the frames of the items of a mission; None if the recording tells of none."""
+        """Return the frames of the items of a mission; None if the recording has none."""
         return self._log.mission_at(self._system_id, kind, self._position_us())
 
     def parameters(self) -> dict[str, bytes]:
-        """Return the parameters by name, in their order, numbered so that the list is whole.
+        """Return the parameters by name, in their order, numbered so that the list is complete.
 
         Returns
         -------
         dict of str to bytes
             PARAM_VALUE frames; each value has its recorded bits, whatever its type.
         """
-        told = [
+        values = [
             _VALUE.unpack(payload_of(frame, _VALUE.size)) for frame in self.frames(PARAM_VALUE_ID)
         ]
         # Answers to a setting carry no index (65535); they come last.
-        told.sort(key=lambda value: (value[2], value[3]))
+        values.sort(key=lambda value: (value[2], value[3]))
         found: dict[str, bytes] = {}
-        for number, (value, _, _, name, kind) in enumerate(told):
-            payload = _VALUE.pack(value, len(told), number, name, kind)
+        for number, (value, _, _, name, kind) in enumerate(values):
+            payload = _VALUE.pack(value, len(values), number, name, kind)
             found[_text_of(name)] = _encode(PARAM_VALUE_ID, self.played_as, payload)
         return found
 
 
 def _encode(message_id: int, system_id: int, payload: bytes) -> bytes:
-    """Build a frame of an autopilot; its number is its sender's business."""
+    """Build a frame of an autopilot; its sender sets the sequence number."""
     head = bytes((len(payload), 0, 0, 0, system_id, AUTOPILOT)) + message_id.to_bytes(3, "little")
     crc: int = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(head + payload))
     return bytes((START_V2,)) + head + payload + crc.to_bytes(2, "little")
 
 
 def _key_of(frame: bytes) -> bytes:
-    """Tell frames of one message apart that stand for different things."""
+    """Tell frames of one message apart that hold different items."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
         return bytes(_VALUE.unpack(payload_of(frame, _VALUE.size))[3])

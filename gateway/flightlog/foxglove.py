@@ -1,4 +1,4 @@
-"""What Foxglove and PlotJuggler show of a flight: messages by the schemas that Foxglove publishes.
+"""A flight for Foxglove and PlotJuggler: messages in the schemas that Foxglove publishes.
 
 | topic                              | schema                    | made of                         |
 | ---------------------------------- | ------------------------- | ------------------------------- |
@@ -10,8 +10,8 @@
 | `/log`                             | foxglove.Log              | STATUSTEXT                      |
 | `/mavlink/SYSTEM/COMPONENT/NAME`   | mavlink.NAME              | every message, field by field   |
 
-Frame `map` is east, north, up of the first position that a vehicle tells; `vehicle_N` is forward,
-left, up: with these its pictures stand upright in Foxglove's 3D panel.
+Frame `map` is east, north, up from the first position that a vehicle reports; `vehicle_N` is
+forward, left, up: with these the view is upright in Foxglove's 3D panel.
 """
 
 import math
@@ -126,7 +126,7 @@ def schema_of_message(message: Any) -> dict[str, Any]:
 
 
 def fields_of_message(message: Any) -> dict[str, Any]:
-    """Lay a decoded message out as JSON; a number that is none becomes null."""
+    """Convert a decoded message to JSON; NaN and infinity become null."""
     return {name: _plain(getattr(message, name)) for name in message.fieldnames}
 
 
@@ -150,12 +150,12 @@ class Shown:
 
 @dataclass(slots=True)
 class _Vehicle:
-    """What was heard of one vehicle by now."""
+    """The newest data of one vehicle."""
 
     q_nb: Quat = (1.0, 0.0, 0.0, 0.0)
     has_attitude: bool = False
     has_quaternion: bool = False
-    """It tells its attitude as a quaternion too: the angles are then left out."""
+    """It sends its attitude as a quaternion too: the angles are then left out."""
     place: Any = None
     """The newest GLOBAL_POSITION_INT."""
     accuracy_m: tuple[float, float] | None = None
@@ -167,7 +167,7 @@ class _Vehicle:
 
 
 class FoxgloveView:
-    """Turns the messages of all vehicles into what Foxglove's panels show."""
+    """Convert the messages of all vehicles to those of Foxglove's panels."""
 
     def __init__(self) -> None:
         self.origin: tuple[float, float, float] | None = None
@@ -188,7 +188,7 @@ class FoxgloveView:
         Parameters
         ----------
         system_id, component_id : int
-            Its sender; the panels show what its autopilot says.
+            Its sender; the panels show messages of the autopilot.
         message : MAVLink_message
             Decoded.
         time_us : int

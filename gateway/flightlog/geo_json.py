@@ -1,4 +1,4 @@
-"""Tracks as GeoJSON (RFC 7946), with times where togeojson and those who read it look for them."""
+"""Tracks as GeoJSON (RFC 7946), with times as in togeojson."""
 
 import json
 import math
@@ -12,12 +12,12 @@ HALF_TURN_DEG = 180.0
 
 
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight: a line a vehicle with `coordTimes`, its home, marks and events as points.
+    """Write a flight: a line per vehicle with `coordTimes`, its home, marks and events as points.
 
     Parameters
     ----------
     name : str
-        What the map calls the flight.
+        Name of the flight on the map.
     vehicles : iterable of VehicleTrack
         Each with its points in the order of their times.
 
@@ -43,7 +43,7 @@ def _features(vehicle: VehicleTrack) -> Iterator[dict[str, Any]]:
     coordinates: Any = lines
     coord_times: Any = times
     if len(parts) == 1:
-        # A line has two ends, even of one point.
+        # A line must have two points, even a track of one.
         single = len(parts[0]) == 1
         kind, coordinates = ("Point", lines[0][0]) if single else ("LineString", lines[0])
         coord_times = times[0]
@@ -70,7 +70,7 @@ def _parts(points: list[TrackPoint]) -> list[list[TrackPoint]]:
 
 
 def _crossing(before: TrackPoint, after: TrackPoint) -> TrackPoint:
-    """Find where the way between two points meets the antimeridian, on the side of the first."""
+    """Find where the line between two points crosses the antimeridian, on the side of the first."""
     edge_deg = math.copysign(HALF_TURN_DEG, before.lon_deg)
     way_deg = (after.lon_deg - before.lon_deg) % (2.0 * HALF_TURN_DEG)
     east_deg = way_deg - 2.0 * HALF_TURN_DEG if way_deg > HALF_TURN_DEG else way_deg

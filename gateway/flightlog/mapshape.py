@@ -1,4 +1,4 @@
-"""Tracks for maps: all vehicles of a flight with what happened, as KML and GPX."""
+"""Tracks for maps: all vehicles of a flight with their events, as KML and GPX."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class TrackPoint:
 
 
 class PlaceKind(StrEnum):
-    """What a single place on the map stands for."""
+    """Kind of a single place on the map."""
 
     HOME = "home"
     MARK = "mark"
@@ -69,12 +69,12 @@ LAST_US: Final = 253_402_300_799 * US_PER_S
 
 
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight as KML 2.2: a folder a vehicle, its track with times and attitude, its places.
+    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and places.
 
     Parameters
     ----------
     name : str
-        What the map calls the flight.
+        Name of the flight on the map.
     vehicles : iterable of VehicleTrack
         Each with its points in the order of their times.
 
@@ -110,7 +110,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
     yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in vehicle.points)
     yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in vehicle.points)
     if any(point.attitude_deg is not None for point in vehicle.points):
-        # Heading, tilt, roll; an empty element stands for "not known here".
+        # Heading, tilt, roll; an empty element means "not known here".
         yield from (f"<gx:angles>{_kml_angles(p)}</gx:angles>\n" for p in vehicle.points)
     yield "</gx:Track></Placemark>\n"
 
@@ -139,8 +139,8 @@ def _kml_angles(point: TrackPoint) -> str:
 def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     """Write a flight as GPX 1.1; see `to_kml`.
 
-    Places are waypoints. GPX knows no attitude: it stands among the extensions of each point, in a
-    namespace of its own, which other programs step over.
+    Places are waypoints. GPX has no attitude: it is in the extensions of each point, in a separate
+    namespace, which other programs ignore.
     """
     vehicles = list(vehicles)
     yield (

@@ -1,4 +1,4 @@
-"""How people write a moment of a recording: `1:20`, `80`, `+10`, `2026-06-11T14:25:30Z`."""
+"""Moments of a recording as text: `1:20`, `80`, `+10`, `2026-06-11T14:25:30Z`."""
 
 import re
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ def parse_moment(text: str) -> Moment:
     ----------
     text : str
         Seconds, `minutes:seconds` or `hours:minutes:seconds` from the start; with a sign, from
-        here; or a date and time as ISO 8601 has it, in UTC where it names no zone.
+        here; or a date and time in ISO 8601, in UTC unless it names a zone.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def civil_time(unix_us: float) -> datetime | None:
 
 
 def place_in(moment: Moment, first_us: int) -> int:
-    """Turn a moment into a recording's own time, given that of its begin."""
+    """Convert a moment to a recording's own time, given that of its start."""
     if moment.time_us is not None:
         return moment.time_us
     return first_us + round((moment.offset_s or 0.0) * US_PER_S)

@@ -1,12 +1,12 @@
-"""When each recorded frame is due again.
+"""Playback timing: when each recorded frame is due.
 
 Theory of operation. While it plays, one line ties the gateway clock to the recording:
 
     due = anchor_now + (time - anchor_time) / speed
 
-Whatever changes the course of time (pause, speed, seek, a skipped gap, a clock that jumps within
-the recording) sets a new anchor and nothing else. Frames come in the order of their times over all
-tracks. At infinite speed everything is due at once and the owner's batch size sets the pace.
+Pause, speed, seek, a skipped gap and a clock that jumps within the recording only set a new
+anchor. Frames come in the order of their times over all tracks. At infinite speed everything is
+due at once and the owner's batch size sets the pace.
 
 | state   | resume, seek, step, speed               | end of the range reached            |
 | ------- | --------------------------------------- | ----------------------------------- |
@@ -28,11 +28,11 @@ GREATEST_SPEED: Final = 100.0
 AS_FAST_AS_POSSIBLE: Final = math.inf
 END_OF_TIME_US: Final = 1 << 64
 CLOCK_JUMP_US: Final = 86_400 * US_PER_S
-"""A longer silence is no silence but a clock that was set; it is never waited for."""
+"""A longer gap means that a clock was set; it is skipped."""
 
 
 class PlayState(StrEnum):
-    """What a player does."""
+    """State of a player."""
 
     PLAYING = "playing"
     PAUSED = "paused"
@@ -45,7 +45,7 @@ def check_speed(speed: float) -> float:
     Raises
     ------
     ValueError
-        If it is another.
+        If it is outside.
     """
     if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
         raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")
@@ -53,7 +53,7 @@ def check_speed(speed: float) -> float:
 
 
 class Player:
-    """Plays recordings together.
+    """Play several recordings together.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Player:
     max_gap_us : int, optional
         Longest silence to keep; None keeps all.
     loop : bool
-        Start anew at the end.
+        Restart at the end.
     """
 
     def __init__(
@@ -97,12 +97,12 @@ class Player:
 
     @property
     def end_us(self) -> int:
-        """End of the range; may move while a recording that is played comes into being."""
+        """End of the range; may move while a table is being fused during playback."""
         return max(t.last_us for t in self._tracks) if self._end_us is None else self._end_us
 
     @property
     def speed(self) -> float:
-        """How much faster than it happened."""
+        """Factor to recorded time."""
         return self._speed
 
     @property
@@ -111,19 +111,19 @@ class Player:
         return self._last_us
 
     def set_speed(self, speed: float, now_us: int) -> None:
-        """Go on faster or slower from here; raises ValueError as `check_speed`."""
+        """Change the speed from here on; raises ValueError like `check_speed`."""
         here_us = self._time_at(now_us)
         self._speed = check_speed(speed)
         self._anchor = (now_us, here_us)
 
     def pause(self, now_us: int) -> None:
-        """Hold."""
+        """Pause."""
         if self.state is PlayState.PLAYING:
             self._anchor = (now_us, self._time_at(now_us))
             self.state = PlayState.PAUSED
 
     def resume(self, now_us: int) -> None:
-        """Go on from where it was held; from the start after the end."""
+        """Resume; after the end, from the start."""
         if self.state is PlayState.ENDED:
             self.seek(self.begin_us, now_us)
         elif self.state is PlayState.PAUSED:
@@ -143,7 +143,7 @@ class Player:
         Returns
         -------
         list of bytes
-            At most `count` frames, after what a seek has left to tell.
+            At most `count` frames, after the frames that a seek has left to send.
         """
         self.pause(now_us)
         frames, self._context = self._context, []
@@ -156,11 +156,11 @@ class Player:
         return frames
 
     def prepare(self, time_us: int) -> bool:
-        """Do a little of what a seek to a time needs; tells whether it can be made at once."""
+        """Do a part of the work for a seek; return whether it can be made at once now."""
         return all(track.prepare(time_us) for track in self._tracks)
 
     def seek(self, time_us: int, now_us: int) -> None:
-        """Move to a time of the recordings, held within the range; a pause stays a pause."""
+        """Move to a time of the recordings, limited to the range; a paused player stays paused."""
         time_us = min(max(time_us, self.begin_us), self.end_us)
         self._context = self._seek_tracks(time_us)
         self._anchor = (now_us, time_us)
@@ -169,7 +169,7 @@ class Player:
             self.state = PlayState.PLAYING
 
     def next_due_us(self) -> int | None:
-        """Return when `poll` is to be called next; None while nothing will be due by itself."""
+        """Return when `poll` is to be called next; None while nothing will be due."""
         if self._context:
             return self._anchor[0]
         if self.state is not PlayState.PLAYING:
@@ -185,12 +185,12 @@ class Player:
         now_us : int
             Gateway clock.
         limit : int
-            At most so many of the recordings' frames, so that others get their turn.
+            Most frames of the recordings, so that others get their turn.
 
         Returns
         -------
         list of bytes
-            In order; after a seek, first what a ground station must know.
+            In order; after a seek, first the frames that a ground station needs.
         """
         frames, self._context = self._context, []
         if self.state is not PlayState.PLAYING:
@@ -250,7 +250,7 @@ class Player:
         return anchor_now_us + math.ceil((time_us - anchor_time_us) / self._speed)
 
     def _skip_silence(self, track: Track, now_us: int) -> None:
-        """Set a new anchor where the next frame is too far away, or the recorded clock fell."""
+        """Set a new anchor if the next frame is too far away, or the recorded clock went back."""
         time_us = track.peek_us() or 0
         silence_us = time_us - self._last_us
         longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us

@@ -1,7 +1,7 @@
-"""How much of a recording each client may fill with what it says and what it is answered.
+"""Limit how much of a recording each client fills with its requests and their answers.
 
-A client decides how often it asks; without a bound, one of them fills the disk. What it says beyond
-the bound is answered all the same, but not kept.
+A client decides how often it asks; without a limit, one of them could fill the disk. Requests
+beyond the limit are answered all the same, but not recorded.
 """
 
 from typing import Final
@@ -13,11 +13,11 @@ TRUSTED_BPS: Final = 64_000
 STRANGERS_BPS: Final = 4_000
 """Bytes a second for all others together."""
 BURST_S: Final = 16
-"""What was not used is kept for so long: a ground station asks much as it comes, then little."""
+"""Length of a burst: a ground station asks much when it connects, then little."""
 
 
 class _Bucket:
-    """Fills steadily up to a bound, and is drawn from."""
+    """A token bucket."""
 
     def __init__(self, rate_bps: int, now_us: int) -> None:
         self._rate_bps = rate_bps
@@ -35,7 +35,7 @@ class _Bucket:
 
 
 class RecordingBudget:
-    """What may still be recorded of each client; one that was never noted is a stranger."""
+    """What may still be recorded of each client; one that was never noted is untrusted."""
 
     def __init__(self) -> None:
         self._strangers = _Bucket(STRANGERS_BPS, 0)

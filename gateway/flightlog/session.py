@@ -1,7 +1,7 @@
-"""When to record, into which part, and what to do when the disk does not want to.
+"""When to record, into which part, and what to do when the disk fails.
 
-Theory of operation. The session never touches a file: it tells its owner what to do and is told
-what came of it.
+Theory of operation. The session never touches a file: it returns actions to its owner, which
+reports their outcome.
 
 | state     | event                              | becomes   | actions                           |
 | --------- | ---------------------------------- | --------- | --------------------------------- |
@@ -15,11 +15,11 @@ what came of it.
 | blocked   | retry is due and there is space    | opening   | open the next part                |
 | blocked   | not wanted any more                | idle      | announce                          |
 
-* Only once a part: the part that this opens is not corrected again. Clocks that disagree for ever
-would else rewrite the session for ever.
+* Only once per part: the part that this opens is not corrected again. Otherwise clocks that
+disagree permanently would rewrite the session again and again.
 
-What is wanted: a user's start or stop counts until the user says otherwise; without one the mode
-of the settings decides.
+Whether a recording is wanted: a user's start or stop counts until the next one; without one the
+mode in the settings decides.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ RESUME_LEAST_MB: Final = 1.0
 """And this in any case: some ten seconds of recording."""
 MAX_NAME: Final = 100
 NEWEST: Final = "last"
-"""What people call the newest recording, whatever its name."""
+"""Name that always means the newest recording."""
 PART_DIGITS: Final = 2
 
 
@@ -86,7 +86,7 @@ class RecordingSettings(Settings, frozen=True):
 
 
 class SessionState(StrEnum):
-    """Where the recording stands."""
+    """State of the recording."""
 
     IDLE = "idle"
     OPENING = "opening"
@@ -109,7 +109,7 @@ class ClosePart:
 
 @dataclass(frozen=True, slots=True)
 class Announce:
-    """Tell the user."""
+    """Announce to the user."""
 
     is_trouble: bool
     text: str
@@ -117,7 +117,7 @@ class Announce:
 
 @dataclass(frozen=True, slots=True)
 class Rename:
-    """Give the files of a session, all closed, the name of the time at which it truly began."""
+    """Rename the files of a session, all closed, after the true time of its start."""
 
     session: str
     to_session: str
@@ -152,7 +152,7 @@ def check_name(name: str) -> str:
     Raises
     ------
     ValueError
-        If a file must not be named so, or the name means another recording.
+        If the name is not allowed for a file, or has another meaning.
     """
     if name == NEWEST:
         raise ValueError(f"{name!r} is no name for a recording: it always means the newest")
@@ -166,7 +166,7 @@ def check_name(name: str) -> str:
 
 
 class Session:
-    """Decides when files are opened and closed.
+    """Decide when files are opened and closed.
 
     Parameters
     ----------
@@ -198,17 +198,17 @@ class Session:
         return mode == "always" or (mode == "in_flight" and self._in_flight)
 
     def start(self) -> None:
-        """Take a user's order to record; what was blocked is tried anew, without delay."""
+        """Start on a user's request; a blocked recording is retried at once."""
         self._asked = True
         if self.state is SessionState.BLOCKED:
             self.state = SessionState.IDLE
 
     def stop(self) -> None:
-        """Take a user's order to stop; holds until the next order, or the next flight."""
+        """Stop on a user's request, until the next request or the next flight."""
         self._asked = False
 
     def set_in_flight(self, in_flight: bool) -> None:
-        """Note take-off or landing; a flight that begins ends an earlier order to stop."""
+        """Note take-off or landing; a take-off cancels an earlier request to stop."""
         if in_flight and not self._in_flight and self._asked is False:
             self._asked = None
         self._in_flight = in_flight
@@ -222,7 +222,7 @@ class Session:
         return []
 
     def failed(self, reason: str, now_us: int) -> list[SessionAction]:
-        """Note that files could not be opened or written; they are tried again later."""
+        """Note that files could not be opened or written; this is retried later."""
         closing: list[SessionAction] = [ClosePart()] if self.state is SessionState.RECORDING else []
         if self.state is SessionState.OPENING:
             self.part -= 1
@@ -235,7 +235,7 @@ class Session:
     def poll(
         self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False
     ) -> list[SessionAction]:
-        """Do what is due.
+        """Return the actions that are due.
 
         Parameters
         ----------
@@ -246,14 +246,14 @@ class Session:
         part_bytes : int
             Size of the largest file that is open.
         free_bytes : int
-            Space left on the disk; 0 if that cannot be told.
+            Space left on the disk; 0 if unknown.
         jumped : bool
             Whether civil time has turned out to differ from that of the open files.
 
         Returns
         -------
         list of SessionAction
-            To be done in this order.
+            To be carried out in this order.
         """
         match self.state:
             case SessionState.IDLE if self.wanted:

@@ -1,4 +1,4 @@
-"""What a recording holds, found in one pass: time, vehicles, rates, gaps, distance, damage."""
+"""Summary of a recording in one pass: time, vehicles, rates, gaps, distance, damage."""
 
 import math
 import struct
@@ -17,7 +17,7 @@ from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import START_V2
 
 GAP_US: Final = 2 * US_PER_S
-"""Every vehicle sends a heartbeat a second: a longer silence is one."""
+"""Every vehicle sends a heartbeat a second: a longer silence is a gap."""
 MAX_GAPS: Final = 1000
 STEP_US: Final = US_PER_S // 2
 """Positions nearer in time than this are not summed: at rest their noise would be a distance."""
@@ -30,7 +30,7 @@ _POSITION: Final = struct.Struct("<Iii")
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A silence."""
+    """A gap in the data."""
 
     time_us: int
     """When it began, in the recording's own time."""
@@ -39,7 +39,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """How often something came."""
+    """Count and rate of one kind of record."""
 
     name: str
     count: int
@@ -76,18 +76,18 @@ class FileInfo:
     header: TableHeader | None = None
     marks: tuple[TableMark, ...] = ()
     remarks: tuple[str, ...] = ()
-    """What its reader found to say of it."""
+    """Remarks of its reader for the user."""
 
 
 @dataclass(slots=True)
 class GroundWay:
-    """Sums up the way between positions."""
+    """Sum up the distance between positions."""
 
     distance_m: float = 0.0
     last: tuple[int, float, float] | None = None
 
     def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
-        """Go on to a position, unless it is too near the last one in time or place."""
+        """Add a position, unless it is too near the last one in time or place."""
         if self.last is not None:
             if 0 <= time_us - self.last[0] < STEP_US:
                 return
@@ -100,7 +100,7 @@ class GroundWay:
 
 @dataclass(slots=True)
 class _Gaps:
-    """Finds silences."""
+    """Find gaps."""
 
     last_us: int | None = None
     found: list[Gap] = field(default_factory=list)
@@ -123,7 +123,7 @@ class _Gaps:
 
 
 class TlogSummary:
-    """Sums up a tlog, batch by batch."""
+    """Summarise a tlog, batch by batch."""
 
     def __init__(self) -> None:
         self._index = TlogIndex()
@@ -150,7 +150,7 @@ class TlogSummary:
             self._add_position(batch, i)
 
     def result(self, size: int) -> FileInfo:
-        """Return what was found in a file of that size."""
+        """Return the summary of a file of that size."""
         index = self._index
         duration_s = ((index.last_us or 0) - (index.first_us or 0)) / US_PER_S
         return FileInfo(
@@ -194,7 +194,7 @@ class TlogSummary:
 
 
 class TableSummary:
-    """Sums up a table, event by event."""
+    """Summarise a table, event by event."""
 
     def __init__(self) -> None:
         self._header: TableHeader | None = None
@@ -220,7 +220,7 @@ class TableSummary:
                     self._damaged_bytes += event.size
 
     def result(self, size: int) -> FileInfo:
-        """Return what was found in a file of that size."""
+        """Return the summary of a file of that size."""
         duration_s = ((self._last_us or 0) - (self._first_us or 0)) / US_PER_S
         vehicle = VehicleInfo(
             system_id=self._header.vehicle_id if self._header else 1,

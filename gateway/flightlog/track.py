@@ -1,4 +1,4 @@
-"""One recording that is being played: a place in a tlog that moves on and can be sought."""
+"""One recording that is being played: a position in a tlog that advances and can seek."""
 
 from collections.abc import Iterator, Mapping
 from itertools import chain
@@ -24,7 +24,7 @@ BLOCK_BYTES: Final = 1 << 18
 """Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
 
 CONTEXT_RECORDS: Final = 20 * STRIDE
-"""How far back a seek looks for what a ground station must know: a minute and more."""
+"""How far back a seek looks for frames that a ground station needs: a minute and more."""
 CONTEXT_IDS: Final = (0, 1, 22, 24, 30, 31, 33, 49, 74, 148, 242, 245)
 """HEARTBEAT, SYS_STATUS, PARAM_VALUE, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
 HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
@@ -34,24 +34,24 @@ PARAM_NAME: Final = slice(18, 34)
 
 
 class Source(Protocol):
-    """A tlog that is there, or comes into being as it is wanted."""
+    """A tlog that exists, or is generated as it is read."""
 
     @property
     def index(self) -> TlogIndex:
-        """Of what there is by now."""
+        """Index of the part that exists so far."""
         ...
 
     @property
     def last_us(self) -> int:
-        """Time of its end, as far as that is known; 0 if there is nothing."""
+        """Time of its end, as far as known; 0 if it is empty."""
         ...
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to so many bytes; nothing at the end."""
+        """Read up to `size` bytes; nothing at the end."""
         ...
 
     def prepare(self, until_us: int) -> bool:
-        """Do a little of what reading up to a time needs; tells whether that is all done."""
+        """Do a part of the work for reading up to a time; return whether it is done."""
         ...
 
 
@@ -63,11 +63,11 @@ class Track:
     source : Source
         The tlog.
     shift_us : int
-        Added to every time, to lay several recordings over one another.
+        Added to every time, to play several recordings together.
     system_ids : mapping of int to int
-        Senders to put in place of recorded ones; others keep theirs.
+        New system ids by recorded ones; other senders keep theirs.
     with_commands : bool
-        Play too what stations said and what else asks something of a vehicle.
+        Play messages of stations and other requests to a vehicle too.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Track:
         return self._source.last_us + self._shift_us
 
     def prepare(self, time_us: int) -> bool:
-        """Do a little of what a seek to a time needs; tells whether it can be made at once."""
+        """Do a part of the work for a seek; return whether it can be made at once now."""
         return self._source.prepare(time_us - self._shift_us)
 
     def peek_us(self) -> int | None:
@@ -176,7 +176,7 @@ class Track:
 
 
 def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:
-    """Return which frames replace one another; each parameter stands for itself."""
+    """Return a key, equal for frames that replace one another; each parameter has its own."""
     message_id = message_id_of(frame)
     name = frame[PARAM_NAME] if message_id == PARAM_VALUE_ID else b""
     return (*origin_of(frame), message_id, name)

@@ -1,4 +1,4 @@
-"""Any recording summed up: what `mavgate info` tells of it."""
+"""Summary of any recording, for `mavgate info`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from gateway.flights.reading import (
 
 
 def describe(file: Path, options: ReadOptions) -> FileInfo:
-    """Sum up a recording.
+    """Summarise a recording.
 
     Parameters
     ----------

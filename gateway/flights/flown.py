@@ -1,4 +1,4 @@
-"""Any recording as a flight that the simulated receiver sends once more."""
+"""Any recording as a flight that the simulated receiver sends again."""
 
 import logging
 import math
@@ -42,7 +42,7 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     Returns
     -------
     RecordedFlight
-        Calibrated samples in body axes, so it wants no calibration.
+        Calibrated samples in body axes, so it needs no calibration.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
 
 
 def _cells(rows: Iterable[TableRow], aircraft: AircraftSettings) -> list[list[float]]:
-    """Lay rows out in the order of `COLUMNS`; what came between two samples is in the later."""
+    """Return rows in the order of `COLUMNS`; records between two samples are in the later one."""
     chain = SensorChain(aircraft.sensing, aircraft.calibration)
     found: list[list[float]] = []
     cells = [math.nan] * len(COLUMNS)

@@ -1,4 +1,4 @@
-"""Fused states as the lines of a table that holds nothing else."""
+"""Fused states as the lines of a table without other columns."""
 
 import math
 from collections.abc import Iterator
@@ -13,12 +13,12 @@ LINES: Final = 2000
 
 
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
-    """Write a table of states alone; what is not known is left blank.
+    """Write a table of states only; unknown values are left blank.
 
     Parameters
     ----------
     header : TableHeader
-        Tells how they were fused.
+        Head of the table: how they were fused.
     time_us : ndarray, shape (N,)
         Of the IMU samples.
     states : ndarray, shape (N, NAV_COLUMNS)

@@ -1,4 +1,4 @@
-"""How long a recording is and what flew, from the ends of its files alone."""
+"""Length and vehicles of a recording, from the ends of its files only."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,12 +18,12 @@ END_BYTES: Final = 1 << 16
 
 
 class Glance(msgspec.Struct, frozen=True):
-    """What the ends of a recording's files tell."""
+    """Length and vehicles of a recording."""
 
     duration_s: float | None
-    """None where no file tells."""
+    """None if no file gives it."""
     vehicles: tuple[int, ...]
-    """System ids; of a very long recording those that were there at its ends."""
+    """System ids; of a very long recording those seen at its ends."""
 
 
 def glance(files: Sequence[Path]) -> Glance:
@@ -32,7 +32,7 @@ def glance(files: Sequence[Path]) -> Glance:
     Parameters
     ----------
     files : sequence of Path
-        All that belong to it; one that cannot be read, or holds nothing, tells nothing.
+        All files of it; one that cannot be read, or is empty, is ignored.
     """
     times_us: list[int] = []
     vehicles: set[int] = set()
@@ -55,7 +55,7 @@ def _tlog_span(file: Path) -> tuple[int, int, set[int]]:
         size = file.stat().st_size
         for begin in sorted({0, max(size - END_BYTES, 0)}):
             stream.seek(begin)
-            # The end begins somewhere in a record; the scanner finds the next one.
+            # The end begins within a record; the scanner finds the next one.
             index.add(TlogScanner(begin).feed(stream.read(END_BYTES), final=True))
     if index.first_us is None or index.last_us is None:
         raise ValueError("holds no record")
@@ -75,7 +75,7 @@ def _table_span(file: Path) -> tuple[int, int, set[int]]:
 
 
 def _first_us(file: Path, row: TableRow) -> int:
-    """Return the time of a table's first row; that of its tail stands for a short one's."""
+    """Return the time of a table's first row."""
     with file.open("rb") as stream:
         for line in stream:
             time_us = line.partition(b",")[0]

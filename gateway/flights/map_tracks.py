@@ -1,4 +1,4 @@
-"""What a map shows of a recording: where each vehicle flew, its home, its marks, what happened."""
+"""A recording for maps: track, home, marks and events of each vehicle."""
 
 import math
 import re
@@ -37,14 +37,14 @@ _TEXT: Final = struct.Struct("<B50sHB")
 INFO: Final = 6
 """MAV_SEVERITY_INFO; what is less is for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
-"""How the gateway tells a place that somebody marked."""
+"""The gateway's STATUSTEXT for a marked place."""
 MAX_PLACES: Final = 10_000
 """Of one vehicle; a flood of texts must not fill the memory."""
 
 
 @dataclass(slots=True)
 class _Drawn:
-    """One vehicle while its frames go by."""
+    """One vehicle while its frames are read."""
 
     track: VehicleTrack
     attitude_deg: tuple[float, float, float] | None = None
@@ -59,11 +59,11 @@ class _Drawn:
             return
         points.append(point)
         for time_us, text in self.early:
-            self.tell(time_us, text)
+            self.add_event(time_us, text)
         self.early.clear()
 
-    def tell(self, time_us: int, text: str) -> None:
-        """Put what happened to where the vehicle is."""
+    def add_event(self, time_us: int, text: str) -> None:
+        """Place an event at the vehicle's position."""
         if not self.track.points:
             if len(self.early) < MAX_PLACES:
                 self.early.append((time_us, text))
@@ -85,7 +85,7 @@ class _Drawn:
 
 
 def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:
-    """Yield the positions that one vehicle told; the first that tells one by default."""
+    """Yield the positions that one vehicle reported; by default the first that reports one."""
     for record in records:
         if message_id_of(record.frame) != GLOBAL_POSITION_INT_ID:
             continue
@@ -97,7 +97,7 @@ def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> It
 
 
 def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:
-    """Gather what the vehicles of a tlog told.
+    """Collect the tracks of the vehicles of a tlog.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> li
     Returns
     -------
     list of VehicleTrack
-        Of those that told a position, by their ids.
+        Of those that reported a position, by their ids.
     """
     drawn: dict[int, _Drawn] = {}
     stations: set[int] = set()
@@ -158,25 +158,25 @@ def _take_text(one: _Drawn, frame: bytes, time_us: int) -> None:
             places.append(MapPlace(last.kind, last.name + text, last.at))
         return
     one.text_id = number
-    one.tell(time_us, text)
+    one.add_event(time_us, text)
 
 
 def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[VehicleTrack]:
-    """Gather what a table tells of its aircraft: fused, or its fixes where it has no states.
+    """Collect the track of a table's aircraft: fused, or its fixes if it has no states.
 
     Parameters
     ----------
     table : RecordedTable
         Its rows are used up.
     aircraft : AircraftSettings
-        Tells which fix sets home where the table does not tell home itself.
+        Settings of the fix that sets home if the table has no home.
     """
     zero_us = table.header.unix_us_at_zero or 0
     one = _Drawn(VehicleTrack(f"aircraft {table.header.vehicle_id}"))
     has_home = False
     for row in table.rows:
         if isinstance(row, TableMark):
-            one.tell(zero_us + row.time_us, REMARK + row.text)
+            one.add_event(zero_us + row.time_us, REMARK + row.text)
         elif isinstance(row, FusionState) and row.home is not None and not has_home:
             lat_deg, lon_deg, alt_m, since_us = row.home
             at = TrackPoint(zero_us + since_us, lat_deg, lon_deg, alt_m)
@@ -221,7 +221,7 @@ def _angles(q_nb: Quat) -> tuple[float, float, float] | None:
 
 
 def _finite(roll: float, pitch: float, yaw: float) -> tuple[float, float, float] | None:
-    """Turn angles in rad into degrees; None where one of them is not known."""
+    """Convert angles in rad to degrees; None if one of them is not known."""
     if not math.isfinite(roll + pitch + yaw):
         return None
     return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)

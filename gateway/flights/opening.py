@@ -1,4 +1,4 @@
-"""Recordings opened for the player, and laid out as the vehicles that fly."""
+"""Recordings opened for the player, with the times and ids of their vehicles."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -18,7 +18,7 @@ from gateway.flights.refusion import Refusion, end_of
 
 @dataclass(slots=True)
 class OpenFlight:
-    """One recording, of however many parts, that is open."""
+    """One open recording, of any number of parts."""
 
     sources: list[Source] = field(default_factory=list)
     answers: LogAnswers = field(default_factory=LogAnswers)
@@ -37,7 +37,7 @@ class OpenFlight:
 
     @property
     def vehicles(self) -> list[int]:
-        """System ids of all that send and are no ground station."""
+        """System ids of all senders that are not ground stations."""
         return sorted(
             {
                 origin >> 8
@@ -50,7 +50,7 @@ class OpenFlight:
 
 @dataclass(frozen=True, slots=True)
 class PlayedFlight:
-    """A recording as it is played: when, and under which numbers."""
+    """A recording as it is played: when, and under which system ids."""
 
     tracks: tuple[Track, ...]
     answers: LogAnswers
@@ -63,7 +63,7 @@ class PlayedFlight:
 def open_flights(
     files: Sequence[Path], options: ReadOptions, opened: ExitStack
 ) -> list[OpenFlight]:
-    """Index the tlogs, and begin to fuse what is none; the parts of a recording together.
+    """Index the tlogs, and begin to fuse other files; the parts of a recording together.
 
     Parameters
     ----------
@@ -107,17 +107,17 @@ def open_flights(
 def lay_out(
     flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool = False
 ) -> list[PlayedFlight]:
-    """Give each vehicle its own system id, and recordings of other days the same begin.
+    """Give each vehicle its own system id, and recordings of different days the same start.
 
     Parameters
     ----------
     flights : sequence of OpenFlight
         At least one.
     wished : sequence of int
-        System ids for the first vehicles of the recordings, as far as they reach; the other
-        vehicles of a recording get those that follow.
+        System ids for the first vehicles of the recordings, as many as are given; the other
+        vehicles of a recording get the following ids.
     with_commands : bool
-        Play too what stations said and what else asks something of a vehicle.
+        Play messages of stations and other requests to a vehicle too.
     """
     begin_us, end_us = flights[0].first_us, flights[0].last_us
     used: set[int] = set()

@@ -68,12 +68,12 @@ NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of 
 
 
 class FlightError(Exception):
-    """A file that does not hold what a command needs; the text says what and where."""
+    """A file without the data that a command needs; the text says what and where."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How a command wants its flights."""
+    """How to read and fuse flights."""
 
     current: PipelineSettings
     """The settings of today."""
@@ -89,18 +89,18 @@ class ReadOptions:
 
 @dataclass(slots=True)
 class RecordedTable:
-    """Rows with the head that belongs to them."""
+    """Rows with their head."""
 
     header: TableHeader
     rows: Iterator[Line]
-    """A header among them tells of settings that were changed in flight, a state of what the
-    fusion remembered there, a mark of what somebody remarked."""
+    """A header among them means that settings were changed in flight, a state is the fusion's at
+    that row, a mark an operator's remark."""
     remarks: list[str] = field(default_factory=list)
-    """What the user should know of the file; whole once the rows are read."""
+    """Remarks about the file for the user; complete once the rows are read."""
 
     @property
     def plain_rows(self) -> Iterator[TableRow]:
-        """The rows alone."""
+        """The rows only."""
         return (row for row in self.rows if isinstance(row, TableRow))
 
 
@@ -112,7 +112,7 @@ PARQUET: Final = "Parquet"
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
-    """Let every command that takes a flight read one more format.
+    """Add a format that every command that takes a flight can read.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
 
 
 def import_format(module: str, name: str) -> Any:
-    """Import what reads or writes a format, which needs an extra; raises FlightError if absent."""
+    """Import the module of a format, which needs an extra; raises FlightError if absent."""
     try:
         return import_module(f"gateway.flights.formats.{module}")
     except ModuleNotFoundError as error:
@@ -219,7 +219,7 @@ def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterato
 
 
 def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
-    """Put tables of one aircraft behind one another on the clock of the first.
+    """Join tables of one aircraft on the clock of the first.
 
     Parts of one recording share a clock; other recordings are put in their place by civil time.
 
@@ -250,7 +250,7 @@ def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int:
-    """Return how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    """Return the offset between two clocks; the parts of a recording share one."""
     if None in (header.unix_us_at_zero, first.unix_us_at_zero):
         return 0
     shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
@@ -258,7 +258,7 @@ def _shift_us(header: TableHeader, first: TableHeader) -> int:
 
 
 def shifted(row: Line, shift_us: int) -> Iterator[Line]:
-    """Move a row and all its records in time; a state holds times of its own and is left out."""
+    """Shift a row and all its records in time; a state has its own times and is left out."""
     if not shift_us or isinstance(row, TableHeader):
         yield row
     elif isinstance(row, TableMark):
@@ -332,7 +332,7 @@ def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
     try:
         first = next(rows, None)
     except ValueError as error:
-        raise FlightError(f"{path}: {error}; tell what its columns are: --columns MAP") from error
+        raise FlightError(f"{path}: {error}; name its columns with --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
     return table_of_rows(chain([first], rows), options, options.system_id or 1)
@@ -364,14 +364,14 @@ def table_of_rows(
     vehicle_id: int = 1,
     unix_us_at_zero: int | None = None,
 ) -> RecordedTable:
-    """Give rows of another program the head of a table, with the settings of today.
+    """Give rows of another program the head of a table, with the current settings.
 
     Parameters
     ----------
     rows : iterator of TableRow
         Their values count as calibrated.
     options : ReadOptions
-        Tells the settings of today.
+        Holds the current settings.
     vehicle_id : int
         Of the aircraft.
     unix_us_at_zero : int, optional

@@ -1,4 +1,4 @@
-"""Recorded flights through the pipeline again, as rows or as the frames it would have sent."""
+"""Recorded flights through the pipeline again, to rows or to the frames it would have sent."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -41,22 +41,22 @@ from gateway.records import (
 )
 from gateway.replay import InterpolatedPosition, Replay, header_for, records_of
 
-SETTLES: Final = "what was remembered at the start is left aside: {}; the estimator settles anew"
+SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
 
 class Refusion:
-    """Flights behind one another, to be fused once more.
+    """Flights in sequence, fused again.
 
     Parameters
     ----------
     files : sequence of Path
         Anything that `open_rows` reads, of one aircraft.
     options : ReadOptions
-        Settings, and how positions are told.
+        Settings, and how to read the files.
     smooth : bool
-        Tell the states smoothed from both ends in place of those of the flight.
+        Return smoothed states instead of those of the filter.
 
     Raises
     ------
@@ -84,14 +84,14 @@ class Refusion:
 
     @property
     def remarks(self) -> list[str]:
-        """What the user should know of the states, as far as it was seen by now."""
+        """Remarks about the states for the user, as far as the rows were read."""
         return [
             *(SETTLES.format(reason) for reason in (*self._replay.refused, *self._rows.refused)),
             *self._table.remarks,
         ]
 
     def introduction(self) -> Iterator[bytes]:
-        """Yield the frames that tell who flies here, and by which parameters it is fused."""
+        """Yield the frames with the vehicle's version and the parameters that it is fused with."""
         vehicle = Aircraft(self._table.header.vehicle_id, self._aircraft).vehicle
         for action in vehicle.introduction():
             if isinstance(action, Outgoing):
@@ -106,7 +106,7 @@ class Refusion:
                     yield TlogRecord(stamper.stamp(now_us), action.frame)
 
     def table(self) -> RecordedTable:
-        """Return the rows with the new states, under a head that tells how they were made."""
+        """Return the rows with the new states, under a head that says how they were fused."""
         rows = self._rows.rows(self._table.rows)
         first = next(rows, None)
         old, new = self._table.header, header_for(self._aircraft, self._table.header.vehicle_id)
@@ -135,7 +135,7 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
 
 
 def _records_of(files: Iterable[Path], options: ReadOptions) -> Iterator[Record]:
-    """Read all records once more, before the rows."""
+    """Read all records in an extra pass before the rows."""
     quiet = replace(options, progress=None)
     table = joined_rows([open_rows(file, quiet) for file in files])
     return (record for row in table.plain_rows for record in records_of(row))

@@ -1,8 +1,8 @@
-"""Rows of a table fused again: sensing and estimation alone, many samples at once.
+"""Rows of a table fused again: only sensing and estimation, many samples at once.
 
-Nobody is told of a flight that becomes a table: the vehicle that would make MAVLink of the states
-is left out, and the samples between two heights or fixes run through the estimator together. The
-states are the same, bit for bit, as if every record had come live.
+A flight that becomes a table needs no MAVLink, so the vehicle stage is left out, and the samples
+between two heights or fixes run through the estimator together. The states are the same, bit for
+bit, as if every record had arrived live.
 """
 
 from collections.abc import Iterable, Iterator
@@ -20,7 +20,7 @@ BLOCK: Final = 1000
 
 
 class RowFusion:
-    """Puts new states into rows.
+    """Put new states into rows.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ class RowFusion:
         self._follow = follow
         self._builder = RowBuilder()
         self._waiting: list[TableRow] = []
-        """Rows with a sample; what stands before it in a row was taken already."""
+        """Rows with a sample; their earlier records were processed already."""
         self.refused: list[str] = []
-        """Why states of the file were not gone on from."""
+        """Why states of the file were not restored."""
 
     def rows(self, lines: Iterable[Line]) -> Iterator[Line]:
-        """Yield what a file holds, with the new states."""
+        """Yield the lines of a file, with the new states."""
         for line in lines:
             if not isinstance(line, TableRow):
                 yield from self._fused()
@@ -58,7 +58,7 @@ class RowFusion:
         yield from self._fused()
 
     def _goes_on(self, line: Line) -> bool:
-        """Take what is no row; tell whether it stays in the file."""
+        """Handle a line that is not a row; return whether it stays in the file."""
         if isinstance(line, TableHeader):
             if self._follow:
                 self._aircraft.change(settings_of(line), 0)
@@ -78,6 +78,6 @@ class RowFusion:
             for record in (row.baro, row.gps):
                 if record is not None:
                     yield from self._builder.add(record)
-            # A row that stood without an IMU sample does so again.
+            # A row without an IMU sample stays so.
             yield from self._builder.flush() if sample is None else self._builder.add(next(fused))
         self._waiting.clear()

@@ -1,4 +1,4 @@
-"""Recorded flights smoothed from both ends, in place of what the estimator told as it flew."""
+"""Recorded flights smoothed from both ends, instead of the estimates made in flight."""
 
 from collections.abc import Iterable
 from typing import Any, Final
@@ -62,7 +62,7 @@ def smooth_records(
 
 
 class SmoothedStates:
-    """Puts the smoothed state of its time in place of each state.
+    """Replace each state by the smoothed one of its time.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class SmoothedStates:
         self._time_us, self._states = time_us, states
 
     def __call__(self, state: NavState) -> NavState:
-        """Look the time up; a state of another time stays."""
+        """Return the smoothed state of that time; a state of another time is unchanged."""
         at = int(np.searchsorted(self._time_us, state.time_us))
         if at == len(self._time_us) or self._time_us[at] != state.time_us:
             return state
@@ -87,7 +87,7 @@ class SmoothedStates:
 def gather_samples(
     records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated], aircraft: AircraftSettings
 ) -> tuple[SampleLog, KernelEstimator[Any, Any]]:
-    """Lay a flight's records out as arrays, calibrated, for the Kalman filter, which is fresh."""
+    """Collect a flight's records as calibrated arrays, with a fresh Kalman filter for them."""
     chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
     if not isinstance(estimator, KernelEstimator):
         raise TypeError(f"{SMOOTHED_ESTIMATOR} is {type(estimator)}, which cannot be smoothed")

@@ -1,4 +1,4 @@
-"""Flights written as files: one writer a format, by the ending of the file's name."""
+"""Flights written as files: one writer per format, by the ending of the file's name."""
 
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -45,7 +45,7 @@ Limits = tuple[Moment | None, Moment | None]
 
 
 class FlightToWrite:
-    """Recordings that become one file: as MAVLink or as rows, whichever its format wants.
+    """Recordings that become one file: as MAVLink or as rows, whichever its format needs.
 
     Parameters
     ----------
@@ -56,13 +56,13 @@ class FlightToWrite:
     limits : tuple of Moment or None
         First and last moment.
     title : str
-        What the flight is called in the file.
+        Name of the flight in the file.
     fuse : bool
-        Fuse tables again in place of their recorded states.
+        Fuse tables again instead of using their recorded states.
     smooth : bool
-        Fuse them from both ends.
+        Smooth them from both ends.
     message : str, optional
-        Name of the one MAVLink message that is wanted, where the format holds one kind.
+        Name of the MAVLink message to write, if the format holds only one type.
 
     Raises
     ------
@@ -85,13 +85,13 @@ class FlightToWrite:
         self._limits, self._smooth = limits, smooth
         kinds = {kind_of(file) for file in files}
         self.is_mavlink = kinds == {FileKind.TLOG}
-        """Whether the frames are those that were recorded, and the rows are read out of them."""
+        """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self._refusions: list[Refusion] = []
         self._remarks: list[str] = []
 
     def frames(self) -> Iterator[TlogRecord]:
-        """Yield the MAVLink: as recorded, or what the gateway would send for the rows."""
+        """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
         if not self.is_mavlink:
             return _within(self._sent(), self._limits)
         recorded = recorded_frames(self.files, self.options.progress)
@@ -109,7 +109,7 @@ class FlightToWrite:
         return _trimmed(table, self._limits)
 
     def by_aircraft(self) -> "list[FlightToWrite]":
-        """Split tables by the aircraft that they are of."""
+        """Split tables by aircraft."""
         if len(self.files) == 1:
             return [self]
         files: dict[int, list[Path]] = {}
@@ -125,21 +125,21 @@ class FlightToWrite:
 
     @property
     def remarks(self) -> list[str]:
-        """What the user should know, once all is written."""
+        """Remarks for the user, complete once all is written."""
         fused = (remark for refusion in self._refusions for remark in refusion.remarks)
         return [*self._remarks, *fused]
 
     def remark(self, text: str) -> None:
-        """Let the user know something of what was written."""
+        """Add a remark for the user."""
         self._remarks.append(text)
 
     def fused(self) -> Refusion:
-        """Begin to fuse these files again."""
+        """Return these files fused again."""
         self._refusions.append(Refusion(self.files, self.options, smooth=self._smooth))
         return self._refusions[-1]
 
     def _sent(self) -> Iterator[TlogRecord]:
-        """Yield what the gateway would send for all aircraft, stamped as in one file."""
+        """Yield the frames that the gateway would send for all aircraft, stamped as in one file."""
         streams = [part.fused().frames() for part in self.by_aircraft()]
         stamper = Stamper(0)
         for record in heapq.merge(*streams, key=lambda record: record.time_us):
@@ -154,7 +154,7 @@ WRITERS: Final[dict[str, Write]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Lacks:
-    """What a format cannot hold, in words."""
+    """What a format cannot hold, as text."""
 
     of_tables: str = ""
     of_tlogs: str = ""
@@ -165,7 +165,7 @@ LACKS: Final[dict[str, Lacks]] = {}
 
 
 def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
-    """Let `mavgate convert` write one more format.
+    """Add a format that `mavgate convert` can write.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
     write : callable
         Yields the file's bytes piece by piece.
     lacks : Lacks
-        What of a recording the format cannot hold, which the user is told.
+        What the format cannot hold of a recording; the command tells the user.
 
     Raises
     ------
@@ -225,12 +225,12 @@ def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
             for track in tracks_of_table(table, aircraft_of(table, flight.options))
         ]
     if not found:
-        raise FlightError(f"{flight.title}: nothing to draw, for the flight tells no position")
+        raise FlightError(f"{flight.title}: nothing to draw, since the flight has no position")
     return found
 
 
 def _packaged(module: str, name: str) -> Write:
-    """Return a writer whose packages are imported when it is wanted."""
+    """Return a writer whose packages are imported at its first use."""
 
     def write(flight: FlightToWrite) -> Iterable[bytes]:
         pieces: Iterable[bytes] = import_format(module, name).write(flight)
@@ -277,7 +277,7 @@ def _trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
                 if end is not None and time_us > place_in(end, first_us):
                     return
                 begun = begun or (begin is not None and time_us >= place_in(begin, first_us))
-            # What was changed before the begin still holds, but a state from there does not.
+            # Settings changed before the start still apply, but a state from there does not.
             if begun or isinstance(row, TableHeader):
                 yield row
 

@@ -1,7 +1,7 @@
 """ArduPilot's log messages as records, by the fields that its firmware documents.
 
 IMU, MAG (milligauss, offsets taken off), BARO, GPS with the accuracies of GPA, and what the
-autopilot believed: ATT, POS and the velocities of its Kalman filter (XKF1, of old NKF1). All in
+autopilot estimated: ATT, POS and the velocities of its Kalman filter (XKF1, of old NKF1). All in
 body FRD and NED, in µs since the start. Of several sensors of a kind the first is taken.
 """
 
@@ -33,15 +33,15 @@ LEAP_US: Final = 18 * US_PER_S
 """GPS time is ahead of UTC by so much since 2017."""
 WEEK_US: Final = 604_800 * US_PER_S
 LATE_US: Final = US_PER_S
-"""Messages of one loop are not quite in order; one that is later than this has a torn time."""
+"""Messages of one loop are not quite in order; one later than this has a damaged time."""
 AHEAD_US: Final = 3_600 * US_PER_S
-"""And so has one that leaps ahead by more."""
+"""And so has one that jumps ahead by more."""
 FIX_2D: Final = 2
 SENSOR_NUMBERS: Final = ("I", "C")
-"""Columns that tell which of several sensors, or Kalman filters, a message is of."""
+"""Columns with the number of the sensor, or Kalman filter, of a message."""
 
 Message = Any
-"""With the columns of its format as attributes, in the units that the format tells."""
+"""With the columns of its format as attributes, in the units of the format."""
 
 
 class ArdupilotReader:
@@ -50,19 +50,19 @@ class ArdupilotReader:
     Parameters
     ----------
     vehicle_id : int
-        The aircraft it is taken for.
+        Vehicle id of the records.
     """
 
     def __init__(self, vehicle_id: int) -> None:
         self.dropped = 0
-        """Messages whose time cannot be."""
+        """Messages with an impossible time."""
         self.zero_us: int | None = None
         """The autopilot's time at the records' zero."""
         self._vehicle_id = vehicle_id
         self._newest_us = 0
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
-        """The newest, which waits for its accuracies."""
+        """The newest fix, which waits for its accuracies."""
         self._place: tuple[int, float, float, float] | None = None
         self._motion: tuple[int, Vec3] | None = None
         self._handlers: dict[str, Callable[[Message, int], list[Imported]]] = {
@@ -74,7 +74,7 @@ class ArdupilotReader:
 
     @property
     def names(self) -> set[str]:
-        """Those of the messages that are of use."""
+        """Names of the messages that are used."""
         return set(self._handlers)
 
     def feed(self, name: str, message: Message) -> list[Imported]:
@@ -106,7 +106,7 @@ class ArdupilotReader:
         return [] if fix is None else [fix]
 
     def _time(self, own_us: int) -> int | None:
-        """Put a message on the records' clock, which never falls; None if its time is torn."""
+        """Convert a message's time to the records' growing clock; None if damaged."""
         if self.zero_us is None:
             self.zero_us = own_us
         time_us = own_us - self.zero_us
@@ -170,7 +170,7 @@ class ArdupilotReader:
         return []
 
     def _accuracies(self, m: Message, time_us: int) -> list[Imported]:
-        """Join a fix with what the receiver tells of its accuracy, just behind it."""
+        """Join a fix with the receiver's accuracies, which follow it."""
         fix = self._fix
         if fix is None or fix.time_us != time_us:
             return self.flush()
@@ -193,7 +193,7 @@ class ArdupilotReader:
         return []
 
     def _attitude(self, m: Message, time_us: int) -> list[Imported]:
-        """Take what the autopilot itself believes, to be compared with."""
+        """Take the autopilot's own solution, for comparison."""
         flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
         lat, lon, alt, vel = NAN, NAN, NAN, UNKNOWN_VEC3
         if self._place is not None and time_us - self._place[0] <= VELOCITY_AGE_US:

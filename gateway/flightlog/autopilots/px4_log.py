@@ -2,9 +2,9 @@
 
 IMU: `sensor_combined`. Magnetic field: `vehicle_magnetometer`, in old logs among the former's
 fields. Barometer: `vehicle_air_data`, `sensor_baro`, or the former's heights. GPS:
-`vehicle_gps_position` or `sensor_gps`, with places in 1e-7 degrees or, of late, in degrees. What
-the autopilot believed: `vehicle_attitude`, `vehicle_global_position`, `vehicle_local_position`.
-All are in body FRD and NED already, in µs since the start.
+`vehicle_gps_position` or `sensor_gps`, with positions in 1e-7 degrees or, in newer logs, in
+degrees. What the autopilot estimated: `vehicle_attitude`, `vehicle_global_position`,
+`vehicle_local_position`. All are in body FRD and NED already, in µs since the start.
 """
 
 import heapq
@@ -46,9 +46,9 @@ TOPICS: Final = (
 )
 """All that is read."""
 LEAST_PA: Final = 2000.0
-"""Less is in hPa, as `sensor_baro` had it before PX4 1.14: no aircraft flies as high as that."""
+"""A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
 NOT_THERE: Final = 0x7FFFFFFF
-"""A time relative to the sample's that stands for "no new one"."""
+"""A time relative to the sample's that means "no new one"."""
 EXTRAPOLATED: Final = 8
 ORDER: Final[dict[type, int]] = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
 """Of records of one time: that of a row."""
@@ -70,7 +70,7 @@ class Px4Log:
     topics : mapping of str to mapping of str to ndarray
         Arrays of one length by field, by topic; `timestamp` among them.
     vehicle_id : int
-        The aircraft it is taken for.
+        Vehicle id of the records.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class Px4Log:
 
     def __init__(self, topics: Mapping[str, Topic], vehicle_id: int) -> None:
         self.dropped = 0
-        """Samples without a time that can be."""
+        """Samples with an impossible time."""
         self._topics = {
             name: self._in_order(topic) for name, topic in topics.items() if "timestamp" in topic
         }
@@ -92,7 +92,7 @@ class Px4Log:
 
     @property
     def unix_us_at_zero(self) -> int | None:
-        """Civil time of the records' time zero, by GPS; None where it never told."""
+        """Civil time of the records' time zero, by GPS; None if GPS never had it."""
         found = [
             row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
             for row in self._rows(*_GPS_TOPICS)
@@ -106,7 +106,7 @@ class Px4Log:
         return heapq.merge(*streams, key=lambda record: (record.time_us, ORDER[type(record)]))
 
     def _in_order(self, topic: Topic) -> Topic:
-        """Sort by time, and leave out what has none."""
+        """Sort by time, and leave out rows without one."""
         time_us = topic["timestamp"].astype(np.int64)
         sound = (time_us > 0) & (time_us < MAX_TIME_US)
         self.dropped += int(np.count_nonzero(~sound))
@@ -114,7 +114,7 @@ class Px4Log:
         return {name: column[order] for name, column in topic.items()}
 
     def _rows(self, *names: str) -> Iterator[Row]:
-        """Yield the rows of the first topic that is there."""
+        """Yield the rows of the first topic that the log has."""
         for name in names:
             topic = self._topics.get(name)
             if topic is not None:
@@ -198,7 +198,7 @@ class Px4Log:
         )
 
     def _states(self) -> Iterator[NavState]:
-        """Yield what the autopilot itself believed, to be compared with."""
+        """Yield the autopilot's own solution, for comparison."""
         places = _Newest(self._rows("vehicle_global_position"))
         motions = _Newest(self._rows("vehicle_local_position", "vehicle_global_position"))
         for row in self._rows("vehicle_attitude"):
@@ -225,7 +225,7 @@ class Px4Log:
 
 
 class _Newest:
-    """The newest row of a topic at a time that never falls, unless it is of long ago."""
+    """The newest row of a topic at a time that never goes back, unless it is too old."""
 
     def __init__(self, rows: Iterator[Row]) -> None:
         self._rows = rows

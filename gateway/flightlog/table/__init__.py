@@ -1,1 +1,1 @@
-"""Flights as tables: our CSV, and what is read into the same rows."""
+"""Flights as tables: our CSV, and other formats read into the same rows."""

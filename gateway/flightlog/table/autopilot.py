@@ -1,11 +1,11 @@
-"""Read the flight out of any autopilot's MAVLink, so that it can be fused here.
+"""Read a flight from any autopilot's MAVLink, so that it can be fused here.
 
 The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
 SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
 definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
 
-GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. Heights do not tell it,
-for that of a receiver that finds or loses its fix jumps by any amount.
+GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. It is not derived from
+heights, because a receiver's height jumps when it finds or loses its fix.
 """
 
 import math
@@ -45,7 +45,7 @@ MAG_FIELDS: Final = 0b111 << 6
 UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
 """Later times are civil time, earlier ones count from the start of the autopilot."""
 VELOCITY_AGE_US: Final = US_PER_S // 2
-"""A velocity down that is older is another one by now."""
+"""An older velocity down is not used."""
 
 Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
 
@@ -58,12 +58,12 @@ _IMU_RANK: Final = {
 
 
 class AutopilotReader:
-    """Turn one vehicle's frames into records.
+    """Convert one vehicle's frames to records.
 
     Parameters
     ----------
     system_id : int or None
-        Whose frames; the first system that sends an IMU message by default.
+        The vehicle; by default the first system that sends an IMU message.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -124,12 +124,12 @@ class AutopilotReader:
         Parameters
         ----------
         batch : Batch
-            Behind the last one that was taken.
+            The one after the last.
 
         Returns
         -------
         list of Imported
-            As `feed` gives them, but of the autopilot's states only the last before each sample.
+            As from `feed`, but of the autopilot's states only the last before each sample.
         """
         wanted = np.flatnonzero(np.isin(batch.message_ids, list(self._handlers)))
         found: list[Imported] = []
@@ -153,7 +153,7 @@ class AutopilotReader:
         return found
 
     def _takes(self, message_id: int, system_id: int, component_id: int) -> bool:
-        """Tell whether a message is of the vehicle, and no poorer than others of its kind."""
+        """Return whether a message is of the vehicle, and no poorer than others of its kind."""
         rank = _IMU_RANK.get(message_id, 0)
         if self.system_id is None and rank:
             self.system_id = system_id
@@ -163,7 +163,7 @@ class AutopilotReader:
         return True
 
     def _time(self, message: Any, recorded_us: int) -> int:
-        """Put a message on the records' clock, which never falls."""
+        """Convert a message's time to the records' clock, which never goes back."""
         if hasattr(message, "time_usec"):
             own_us = int(message.time_usec)
         else:
@@ -175,7 +175,7 @@ class AutopilotReader:
             self.unix_us_at_zero = recorded_us
         elapsed_us = own_us - self._zero_us
         if not 0 <= elapsed_us - self._newest_us <= US_PER_S:
-            # Another clock than the IMU's, or a restart: what was recorded then is true.
+            # Another clock than the IMU's, or a restart: use the time of recording.
             elapsed_us = recorded_us - (self.unix_us_at_zero or 0)
         self._newest_us = max(self._newest_us, elapsed_us)
         return self._newest_us
@@ -223,11 +223,11 @@ class AutopilotReader:
         return []
 
     def _newest_place(self, recorded_us: int) -> Any:
-        """Return the newest GLOBAL_POSITION_INT, unless it is of long ago."""
+        """Return the newest GLOBAL_POSITION_INT, unless it is too old."""
         return self._place if abs(recorded_us - self._place_us) <= VELOCITY_AGE_US else None
 
     def _attitude(self, m: Any, recorded_us: int) -> list[Imported]:
-        """Take what the autopilot itself believes, to be compared with."""
+        """Take the autopilot's own solution, for comparison."""
         place = self._newest_place(recorded_us)
         return [_own_state(m, self._time(m, recorded_us), place)]
 
@@ -273,7 +273,7 @@ def _known(value: int, scale: float) -> float:
 
 
 def _own_state(m: Any, time_us: int, place: Any) -> NavState:
-    """Make a state of ATTITUDE and of GLOBAL_POSITION_INT, which may be None."""
+    """Build a state from ATTITUDE and GLOBAL_POSITION_INT, which may be None."""
     flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
     if place is not None:
         flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID

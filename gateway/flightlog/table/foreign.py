@@ -1,4 +1,4 @@
-"""Other people's CSV files as rows, by a map of their columns."""
+"""CSV files of other programs as rows, by a map of their columns."""
 
 import csv
 import math
@@ -20,7 +20,7 @@ from gateway.settings import Settings, setting
 
 EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
 """May be mapped though the table has no such columns: heights become pressures, speed and course
-the velocity where it is not told."""
+the velocity where it is not given."""
 NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 """Without these there is nothing to fuse."""
 SEA_LEVEL_PA: Final = 101_325.0
@@ -38,7 +38,7 @@ class Column(Settings, frozen=True):
 
 
 class ColumnMap(Settings, frozen=True):
-    """Which columns of a foreign file stand for which of ours."""
+    """Which columns of a foreign file correspond to which of ours."""
 
     columns: Annotated[
         dict[str, Column | str],
@@ -46,7 +46,7 @@ class ColumnMap(Settings, frozen=True):
     ]
 
     def __post_init__(self) -> None:
-        """Refuse a map to a column that there is not."""
+        """Refuse a map to an unknown column."""
         unknown = sorted(set(self.columns) - set(COLUMNS) - set(EXTRA_FIELDS))
         if unknown:
             raise ValueError(f"no such column here: {', '.join(unknown)}")
@@ -62,9 +62,9 @@ class ForeignReader:
     column_map : ColumnMap
         What its columns mean.
     vehicle_id : int
-        The aircraft it is taken for.
+        Vehicle id of the rows.
     lenient : bool
-        Whether the file may lack mapped columns, but those needed to fuse it.
+        Whether the file may lack mapped columns, except those needed to fuse it.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class ForeignReader:
                 self.faults += 1
 
     def _check(self, names: set[str]) -> None:
-        """Compare the map with the file's columns; raises ValueError if one is missed."""
+        """Compare the map with the file's columns; raises ValueError if one is missing."""
         found = {ours: theirs for ours, theirs in self._columns.items() if theirs.column in names}
         absent = self._columns.keys() - found.keys()
         if absent & set(NEEDED) or (absent and not self._lenient):
@@ -192,9 +192,9 @@ class ForeignReader:
 
 
 def pressure_at_height(alt_m: float) -> float:
-    """Return the pressure in Pa from which the standard atmosphere makes this height again.
+    """Return the pressure in Pa at this height in the standard atmosphere.
 
-    NaN for a height that has none.
+    NaN for a height beyond its formula.
     """
     if not alt_m < _SCALE_M:
         return NAN
@@ -202,7 +202,7 @@ def pressure_at_height(alt_m: float) -> float:
 
 
 def _velocity(value: Mapping[str, float]) -> Vec3:
-    """Read a fix's velocity, or make its level part of speed and course."""
+    """Read a fix's velocity, or compute its horizontal part from speed and course."""
     north, east, down = _vector(value, "gps_vel_{}_mps", ("north", "east", "down"))
     if not (math.isfinite(north) and math.isfinite(east)):
         speed = value.get("gps_speed_mps", NAN)

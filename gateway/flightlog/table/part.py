@@ -1,4 +1,4 @@
-"""What is gathered for the part of a recording that is being written."""
+"""The data buffered for the part of a recording that is being written."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -20,7 +20,7 @@ from gateway.flightlog.tlog.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
 PENDING_LIMIT: Final = 16 << 20
-"""Bytes that wait for a slow disk: minutes of telemetry. More is given up, not piled up."""
+"""Bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
 TLOG: Final = ".tlog"
 
 
@@ -35,7 +35,7 @@ class _Table:
 
 
 class Part:
-    """Bytes by the end of their file's name, gathered until they are taken to the disk.
+    """Bytes by the ending of their file's name, buffered until they are written to the disk.
 
     Parameters
     ----------
@@ -54,22 +54,22 @@ class Part:
         self.stamper = Stamper(offset_us)
         self.pending: dict[str, bytearray] = {}
         self.size = 0
-        """Bytes that were given, those beyond the limit included."""
+        """Bytes added, those beyond the limit included."""
         self._tables: dict[int, _Table] = {}
 
     def add(self, ending: str, data: bytes) -> None:
-        """Gather bytes for one file, unless too many wait already."""
+        """Buffer bytes for one file, unless too many wait already."""
         if self.size < PENDING_LIMIT:
             self.pending.setdefault(ending, bytearray()).extend(data)
         self.size += len(data)
 
     def take(self) -> dict[str, bytes]:
-        """Hand over what was gathered."""
+        """Return the buffered bytes and clear the buffer."""
         pending, self.pending, self.size = self.pending, {}, 0
         return {ending: bytes(data) for ending, data in pending.items()}
 
     def add_frame(self, frame: bytes, now_us: int) -> None:
-        """Gather a MAVLink frame for the tlog."""
+        """Buffer a MAVLink frame for the tlog."""
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
 
     def has_table(self, vehicle_id: int) -> bool:
@@ -77,43 +77,43 @@ class Part:
         return vehicle_id in self._tables
 
     def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:
-        """Note what will head an aircraft's table.
+        """Set the head of an aircraft's table.
 
         Parameters
         ----------
         header : TableHeader
             Of this part; the recording's name is put in when the table begins.
         state : FusionState, optional
-            What the fusion remembers before the first row, if it has seen anything.
+            State of the fusion before the first row, if it has any.
         """
         self._tables[header.vehicle_id] = _Table(header, state)
 
     def add_flight(
         self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample | NodeStatus
     ) -> None:
-        """Gather what came of an aircraft, for a table that was prepared."""
+        """Buffer a record of an aircraft, for a table that was prepared."""
         if isinstance(record, NodeStatus):
-            # It begins no table: the first row tells what the fusion begins with.
+            # It begins no table: the first row must come first.
             if self._tables[vehicle_id].begun:
                 self.add(table_ending(vehicle_id), encode_node(record).encode())
             return
         self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
 
     def change_settings(self, header: TableHeader) -> None:
-        """Note in a table that was prepared that what comes is fused with other settings."""
+        """Note in a prepared table that the following rows are fused with other settings."""
         table = self._tables[header.vehicle_id]
         self._begin(table)
         self._write(table, table.rows.flush())
         self.add(table_ending(header.vehicle_id), encode_header(header).encode())
 
     def add_mark(self, mark: TableMark) -> None:
-        """Put a remark into every table that has begun."""
+        """Add a remark to every table that has begun."""
         for vehicle_id, table in self._tables.items():
             if table.begun:
                 self.add(table_ending(vehicle_id), encode_mark(mark).encode())
 
     def flush_rows(self) -> None:
-        """Gather also what still waits for an IMU sample to share its row."""
+        """Buffer also the records that still wait for an IMU sample to share its row."""
         for table in self._tables.values():
             self._write(table, table.rows.flush())
 
@@ -132,5 +132,5 @@ class Part:
 
 
 def table_ending(vehicle_id: int) -> str:
-    """Name the end of an aircraft's table."""
+    """Return the file name ending of an aircraft's table."""
     return f"_v{vehicle_id}.csv"

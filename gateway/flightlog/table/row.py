@@ -1,8 +1,8 @@
 """One row of the table: an IMU sample, what arrived before it, and the state it led to.
 
-A row's records were taken in the order barometer, GPS, IMU. Where they came in another order, or
-two of a kind between two IMU samples, rows without an IMU sample stand in between, so that the
-file keeps every record and its place.
+A row's records were processed in the order barometer, GPS, IMU. Where they arrived in another
+order, or two of a kind between two IMU samples, there are rows without an IMU sample in between,
+so that the file keeps every record in order.
 """
 
 from dataclasses import dataclass
@@ -74,12 +74,12 @@ _NO_VECTOR: Final = (None, None, None)
 
 
 MAX_TIME_US: Final = 1 << 53
-"""Three centuries; a clock that says more is broken, and other programs round such a number."""
+"""Three centuries; a larger value is an error, and other programs would round it."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """One row; what is not there is None."""
+    """One row; absent values are None."""
 
     time_us: int
     """Of the IMU sample, or of the newest record where there is none."""
@@ -97,7 +97,7 @@ def row_to_line(row: TableRow) -> str:
 
 
 def cells_of(row: TableRow) -> tuple[Cell, ...]:
-    """Lay a row out in the order of `COLUMNS`; what is not there is None."""
+    """Return a row's values in the order of `COLUMNS`; absent ones are None."""
     return (
         row.time_us,
         *_head_cells(row),
@@ -115,7 +115,7 @@ def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
     Raises
     ------
     ValueError
-        If a cell is no number, or one that its column needs is empty.
+        If a cell is not a number, or a required one is empty.
     """
     time_us = int(cells[0])
     flags = ImuFlags(int(cells[3] or 0))
@@ -132,14 +132,14 @@ def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
 
 
 def check_times(row: TableRow) -> None:
-    """Check that all times of a row can be; raises ValueError if one cannot."""
+    """Check that all times of a row are possible; raises ValueError if not."""
     for record in (row, row.baro, row.gps, row.state):
         if record is not None and not -MAX_TIME_US <= record.time_us <= MAX_TIME_US:
             raise ValueError(f"{record.time_us} us is no time of a flight")
 
 
 class RowBuilder:
-    """Gather the records of one aircraft into rows."""
+    """Collect the records of one aircraft into rows."""
 
     def __init__(self) -> None:
         self._baro: BaroRaw | None = None
@@ -151,7 +151,7 @@ class RowBuilder:
     ) -> list[TableRow]:
         """Take the next record and return the rows that it completes.
 
-        A state that comes by itself, as an autopilot's does, goes with the next sample.
+        A state without a sample, such as an autopilot's, goes with the next sample.
         """
         match record:
             case BaroRaw():
@@ -175,7 +175,7 @@ class RowBuilder:
         return row
 
     def flush(self) -> list[TableRow]:
-        """Return what waits for an IMU sample as a row without one."""
+        """Return the waiting records as a row without an IMU sample."""
         newest = self._gps or self._baro
         if newest is None:
             return []
@@ -185,7 +185,7 @@ class RowBuilder:
 
 
 def _calibrated(fused: FusedSample) -> ImuCalibrated:
-    """Take from a sample what the table keeps; its filtered twins can be computed again."""
+    """Take from a sample what the table keeps; filtered values can be computed again."""
     sample = fused.sample
     return ImuCalibrated(
         sample.time_us,

@@ -1,4 +1,4 @@
-"""The table format: a CSV that is all one needs to fuse a flight again.
+"""The table format: a CSV with all that is needed to fuse a flight again.
 
     # mavgate table 1
     # header: {"mavgate_version": …, "vehicle_id": …, "settings": {…}, "calibration": {…}, …}
@@ -9,11 +9,11 @@
     # node: {"time_us": 12345, "supply_mv": 3290, "bus_errors": 0, …}
     # header: {…}
 
-A node tells once a second how its board fares. A second header tells that the rows behind it were
-fused with other settings. A state is what filters and estimator remembered there, so that a file
-that begins in flight can be fused again from its first row. Lines that begin with `#` hold JSON;
-spreadsheets and pandas (`comment="#"`) step over them. An empty cell means not known, or nothing
-new.
+A node reports the state of its board once a second. A second header means that the rows after it
+were fused with other settings. A state line is the internal state of filters and estimator at that
+row, so that a file that begins in flight can be fused again from its first row. Lines that begin
+with `#` hold JSON; spreadsheets and pandas (`comment="#"`) skip them. An empty cell means not
+known, or nothing new.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ MAX_LINE: Final = 1 << 20
 
 
 class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """What stands at the head of a table."""
+    """The head of a table."""
 
     mavgate_version: str = ""
     vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
@@ -57,7 +57,7 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
 
 
 REMARK: Final = "Mark: "
-"""How a gateway tells its clients a remark that somebody made."""
+"""Begin of the STATUSTEXT with an operator's remark."""
 
 
 class TableMark(msgspec.Struct, frozen=True):
@@ -78,11 +78,11 @@ class TableFault:
 
 
 TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
-"""A header here is one behind rows: the settings were changed."""
+"""A header here is one after rows: the settings were changed."""
 
 
 def encode_head(header: TableHeader) -> str:
-    """Write everything that stands before the first row."""
+    """Write everything before the first row."""
     return f"{FORMAT_LINE}\n{encode_header(header)}{','.join(COLUMNS)}\n"
 
 
@@ -107,7 +107,7 @@ def encode_node(status: NodeStatus) -> str:
 
 
 def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeStatus) -> str:
-    """Write anything that may stand behind the head."""
+    """Write any line that may follow the head."""
     match event:
         case TableRow():
             return row_to_line(event)
@@ -122,10 +122,10 @@ def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeSt
 
 
 class TableReader:
-    """Turn any chunks of a table into rows, marks and faults; never raises on data.
+    """Decode any chunks of a table into rows, marks and faults; never raises on data.
 
-    Columns are found by name, so a file with some columns more, less or in another order is read
-    as far as it goes.
+    Columns are found by name, so a file with more or fewer columns, or in another order, can be
+    read too.
     """
 
     def __init__(self) -> None:
@@ -145,8 +145,8 @@ class TableReader:
         data : bytes
             Any chunk.
         final : bool
-            Whether the file ends with it. A last line without its end may have been cut within
-            a number and is not believed.
+            Whether the file ends with it. A last line without its end may have been cut within a
+            number and is dropped.
 
         Returns
         -------

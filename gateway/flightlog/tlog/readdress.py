@@ -18,8 +18,8 @@ def readdress(frame: bytes, system_id: int) -> bytes:
     Parameters
     ----------
     frame : bytes
-        A complete frame. Its signature is taken off, since it cannot hold any more; a frame whose
-        message is not known is returned as it is, since its checksum cannot be computed.
+        A complete frame. Its signature is removed, since it would be invalid; a frame of an
+        unknown message is returned unchanged, since its checksum cannot be computed.
     system_id : int
         1 to 255.
 

@@ -1,8 +1,8 @@
-"""Which recorded frames ask something of a vehicle, and must not reach a live one unasked.
+"""Recorded frames that are commands to a vehicle, and must not reach a live one.
 
-A recording holds both directions of a link. What a vehicle tells is played; what ground stations
-said, and whatever else tells a vehicle what to do or feeds its navigation, could arm, steer or
-mislead a real vehicle of the same number on the link that it is played to.
+A recording holds both directions of a link. Messages of a vehicle are played; those of ground
+stations, and any others that command a vehicle or feed its navigation, could arm, steer or mislead
+a real vehicle with the same id on the link that it is played to.
 """
 
 from collections.abc import Set
@@ -30,7 +30,7 @@ _REPORTS: Final = {
         "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
     )
 }  # fmt: skip
-"""Messages that name a receiver and yet ask nothing of it."""
+"""Messages with a target that request nothing of it."""
 _ASKING: Final = frozenset(TARGET_OFFSETS.keys() - _REPORTS)
 _FEEDING: Final = frozenset(
     MESSAGE_IDS[name]
@@ -43,7 +43,7 @@ _FEEDING: Final = frozenset(
         "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
     )
 )  # fmt: skip
-"""What other components hand to an autopilot; when it tells them itself they are telemetry."""
+"""Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
 
@@ -55,13 +55,13 @@ def is_station(origin: int, stations: Set[int]) -> bool:
     origin : int
         The sender.
     stations : set of int
-        Senders whose heartbeats said so.
+        Senders whose heartbeats say so.
     """
     return origin >> 8 >= FIRST_GROUND_STATION or origin in stations
 
 
 def is_command(frame: bytes, stations: Set[int]) -> bool:
-    """Return whether a frame asks something of a vehicle, or feeds its navigation."""
+    """Return whether a frame is a request to a vehicle, or feeds its navigation."""
     message_id = message_id_of(frame)
     if message_id in _FEEDING:
         return origin_of(frame)[1] != AUTOPILOT
@@ -72,7 +72,7 @@ def is_command(frame: bytes, stations: Set[int]) -> bool:
 
 
 def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
-    """Find the records that neither came from a station nor ask anything of a vehicle.
+    """Find the records that are neither from a station nor requests to a vehicle.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Civil time for recordings, on a machine whose clock may be wrong until GPS tells the time.
+"""Civil time for recordings, on a machine whose clock may be wrong until GPS gives the time.
 
-A ground station calls a tlog corrupt whose times lie in the future or do not grow. So the place of
-the gateway clock in civil time stays fixed for as long as a file is open, and a jump asks for a
-new file.
+A ground station considers a tlog corrupt if its times lie in the future or do not grow. So the
+offset from the gateway clock to civil time stays fixed as long as a file is open, and a jump needs
+a new file.
 """
 
 from typing import Final
@@ -19,7 +19,7 @@ _LINK_BITS: Final = 3
 
 
 class CivilClock:
-    """The best knowledge of civil time: GPS where it vouches, else the machine's."""
+    """The best estimate of civil time: GPS if available, else the machine's clock."""
 
     def __init__(self) -> None:
         self._offset_us: int | None = None
@@ -28,11 +28,11 @@ class CivilClock:
 
     @property
     def offset_us(self) -> int | None:
-        """Civil time of gateway time zero in µs since 1970; None before anything was heard."""
+        """Civil time of gateway time zero in µs since 1970; None before the first time is known."""
         return self._offset_us
 
     def hear_machine(self, unix_us: int, now_us: int) -> None:
-        """Note the machine's civil time; it counts until GPS tells better."""
+        """Note the machine's civil time; it counts until GPS time is known."""
         if not self._from_gps:
             self._offset_us = unix_us - now_us
 

@@ -1,4 +1,4 @@
-"""The tlog format: records out of bytes, bytes out of records, and an index to seek by."""
+"""The tlog format: bytes to records, records to bytes, and an index for seeking."""
 
 from array import array
 from bisect import bisect_left
@@ -104,7 +104,7 @@ class Batch:
         return shifted.tobytes()
 
     def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
-        """Go through the records, or through some of them by their numbers."""
+        """Yield the records, or some of them by their numbers."""
         data = self.data
         times, starts, sizes = self.time_us, self.starts, self.sizes
         if wanted is not None:
@@ -116,7 +116,7 @@ class Batch:
 
 
 class TlogScanner:
-    """Turn any chunks of a tlog into batches of records; never raises on data.
+    """Decode any chunks of a tlog into batches of records; never raises on data.
 
     Parameters
     ----------
@@ -174,21 +174,21 @@ class TlogScanner:
 
 
 def _without_torn_times(columns: IntArray, damage_ends: IntArray) -> IntArray:
-    """Leave out records of which the damage before them has taken a part of the time.
+    """Leave out records whose time is partly destroyed by the damage before them.
 
     Parameters
     ----------
     columns : ndarray, shape (COLUMNS, n)
         Records from `scan`.
     damage_ends : ndarray, shape (m,)
-        Where each damage ends; moved behind what is left out.
+        Where each damage ends; extended over the records left out.
     """
     starts, sizes, times = columns[:3]
     far = np.abs(np.diff(times)) > DAY_US
     torn = []
     for run, end in enumerate(damage_ends.tolist()):
         i = int(np.searchsorted(starts, end))
-        # The last of a batch has nothing behind it to compare with.
+        # The last of a batch has nothing after it to compare with.
         if i < len(far) and starts[i] == end and far[i] and (i == 0 or far[i - 1]):
             torn.append(i)
             damage_ends[run] = end + TIME_SIZE + sizes[i]
@@ -196,10 +196,10 @@ def _without_torn_times(columns: IntArray, damage_ends: IntArray) -> IntArray:
 
 
 class TlogIndex:
-    """Where to begin reading for a time, and what the whole file holds.
+    """Index of a file: where to begin reading for a time, and a summary.
 
     One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
-    it. The time stamps of other people's files may jump back; the index searches by the greatest
+    it. The time stamps of other programs' files may jump back; the index searches by the greatest
     time so far, which never does.
     """
 
@@ -254,7 +254,7 @@ class TlogIndex:
         time_us : int
             µs since 1970.
         records : int
-            Begin at least so many records earlier, or at the start of the file.
+            Begin at least this many records earlier, or at the start of the file.
 
         Returns
         -------

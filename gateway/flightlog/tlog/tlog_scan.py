@@ -1,8 +1,8 @@
 """Find the records of a tlog in bytes, at memory speed.
 
-Theory of operation. A tlog is a row of records: eight bytes of time, most significant first, then
-one MAVLink frame, whose own length byte tells where the next record begins. While the file is
-sound, each record is confirmed by the look of the next one, and no checksum is needed:
+Theory of operation. A tlog is a sequence of records: eight bytes of time, most significant first,
+then one MAVLink frame, whose own length byte tells where the next record begins. While the file is
+intact, each record is confirmed by the header of the next one, and no checksum is needed:
 
 | state     | the record here                                      | what is done                |
 | --------- | ---------------------------------------------------- | --------------------------- |
@@ -63,7 +63,7 @@ def _is_header(data: ByteArray, at: int, final: bool) -> int:
 
 @compiled
 def _frame_size(data: ByteArray, at: int) -> int:
-    """Return a frame's size from its first three bytes; 0 for flags nobody knows."""
+    """Return a frame's size from its first three bytes; 0 for unknown flags."""
     if data[at] == 0xFE:
         return int(data[at + 1]) + 8
     flags = data[at + 2]

@@ -1,1 +1,1 @@
-"""Files of other programs' formats: opened by the packages that know them, which are extras."""
+"""File formats of other programs, read by packages that are extras."""

@@ -30,7 +30,7 @@ BROKEN: Final = (
 
 
 class _Complaints(io.TextIOBase):
-    """Counts what pymavlink says on the terminal of damage."""
+    """Count the damage that pymavlink prints to the terminal."""
 
     def __init__(self) -> None:
         self.bytes = self.messages = 0
@@ -42,7 +42,7 @@ class _Complaints(io.TextIOBase):
         return len(text)
 
     def quietly(self, call: Callable[[], Any]) -> Any:
-        """Call while what is said is counted."""
+        """Call while counting what is printed."""
         with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
             return call()
 
@@ -69,7 +69,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     first = next((row for row in stream if row.imu is not None), None)
     if first is None:
         raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
-    # By the first week and time that GPS told; 0 where it never did.
+    # By the first week and time of GPS; 0 without one.
     unix_us = round(log.clock.timebase * US_PER_S) if log.clock.timebase else None
     zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
     table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
@@ -78,7 +78,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
-    """Open a log; one that is packed, or text, is laid out plainly in a file beside."""
+    """Open a log; a packed one, or text, is copied unpacked to a temporary file."""
     content = read_chunks(path, options.progress)
     first = next(content, b"")
     is_binary = first.startswith(MAGIC)
@@ -87,12 +87,12 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
         file = path
         if path.suffix == GZIP or not is_binary:
             for data in chain([first], content):
-                # A byte that is no text must not end the reading.
+                # A byte that is not text must not stop the reading.
                 plain.write(data if is_binary else data.decode("ascii", "replace").encode())
             plain.flush()
             file = Path(plain.name)
         log = kind.__new__(kind)
-        # The fast indexer writes what it says past Python, onto the terminal.
+        # The fast indexer prints to the terminal directly, not through Python.
         log.init_arrays_fast = log.init_arrays
         try:
             heard.quietly(lambda: kind.__init__(log, str(file)))
@@ -103,10 +103,10 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
 
 
 def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[Imported]:
-    """Read the log through; a message that cannot be understood is counted.
+    """Read the whole log; a message that cannot be decoded is counted.
 
-    Of a sound log only what is of use is decoded. The index of a damaged one ends at the damage, so
-    that is read message by message.
+    Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
+    damage, so it is read message by message.
     """
 
     def wanted() -> Any:

@@ -10,7 +10,7 @@ from gateway.flights.writing import FlightToWrite
 
 
 def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
-    """Yield a flight's frames with what they say; frames that no dialect knows are told of."""
+    """Yield a flight's frames with their messages; unknown ones are mentioned in a remark."""
     decoder, unknown = mavlink.MAVLink(None), 0
     for record in flight.frames():
         try:

@@ -22,7 +22,7 @@ from gateway.wire.mavlink_splitter import (
 
 
 class _Topics:
-    """Channels and schemas of one file, each registered when it is met first."""
+    """Channels and schemas of one file, each registered at its first use."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer

@@ -1,8 +1,8 @@
-"""Parquet: a table as columns of one type with their units, or one kind of MAVLink message.
+"""Parquet: a table as typed columns with units, or one type of MAVLink message.
 
-What stands between the rows of a table (changed settings, states, marks, the nodes' reports) is in
-the column `comments` of the row that it precedes, written as in a CSV; settings and calibration
-are in the file's metadata. So a CSV can be had back as it was.
+The comment lines between the rows of a table (changed settings, states, marks, the nodes' reports)
+are in the column `comments` of the next row, written as in a CSV; settings and calibration are in
+the file's metadata. So a CSV can be restored exactly.
 """
 
 import io
@@ -38,7 +38,7 @@ TIME: Final = "time"
 """Civil time, where it is known."""
 HEADER: Final = b"mavgate.header"
 END: Final = "mavgate.end"
-"""Comments behind the last row."""
+"""Comments after the last row."""
 
 UNITS: Final = {
     "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
@@ -59,14 +59,14 @@ _TYPES: Final = {
 
 
 def write(flight: FlightToWrite) -> Iterator[bytes]:
-    """Write a flight's table, or its messages of the one kind that is asked for."""
+    """Write a flight's table, or its messages of the requested type."""
     if flight.message is None:
         return _write_table(flight.table())
     return _write_messages(flight, flight.message)
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open a table that was written here; raises FlightError if it is none."""
+    """Open a table that was written here; raises FlightError if it is not one."""
     reader = TableReader()
 
     def events() -> Iterator[TableEvent]:
@@ -74,7 +74,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
             for text in _lines(path, options):
                 yield from reader.feed(text.encode())
         except (pa.ArrowException, OSError) as error:
-            # What the disk did not like has a number, what the library did not has none.
+            # An error of the operating system has a number, one of the library has none.
             if getattr(error, "errno", None) is not None:
                 raise
             raise FlightError(f"{path}: cannot be read as Parquet: {error}") from error
@@ -171,7 +171,7 @@ def _text(cell: Any) -> str:
 
 
 def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
-    """Write every message of one kind, whoever sent it; raises FlightError if there is none."""
+    """Write every message of one type, of any sender; raises FlightError if there is none."""
     kind = mavlink.mavlink_map.get(MESSAGE_IDS.get(name))
     if kind is None:
         raise FlightError(f"no MAVLink message is called {name}")
@@ -207,8 +207,8 @@ def _message_field(kind: Any, name: str) -> pa.Field:
     length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
     one = _TYPES[written]
     facts = {"unit": kind.fieldunits_by_name.get(name), "enum": kind.fieldenums_by_name.get(name)}
-    told = {key: value for key, value in facts.items() if value}
-    return pa.field(name, pa.list_(one) if length and written != "char" else one, metadata=told)
+    metadata = {key: value for key, value in facts.items() if value}
+    return pa.field(name, pa.list_(one) if length and written != "char" else one, metadata=metadata)
 
 
 def _value(value: Any) -> Any:

@@ -1,8 +1,8 @@
-"""A stream that is emptied as it is written, for packages that write files themselves."""
+"""A stream that is read while it is written, for packages that write files themselves."""
 
 
 class Pieces:
-    """Takes what is written until it is taken away; never more than a piece is kept."""
+    """Buffer written bytes until they are taken."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -20,10 +20,10 @@ class Pieces:
         return self._size
 
     def flush(self) -> None:
-        """Do nothing: all is at hand."""
+        """Do nothing: nothing is buffered elsewhere."""
 
     def close(self) -> None:
-        """Take no more."""
+        """Close the stream."""
         self.closed = True
 
     def taken(self) -> bytes:

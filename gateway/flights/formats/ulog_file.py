@@ -46,7 +46,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
 def _load(path: Path, options: ReadOptions) -> Any:
     content = io.BytesIO(b"".join(read_chunks(path, options.progress)))
     try:
-        # What it says on the terminal of damage is told by `_remarks`.
+        # Damage that it prints to the terminal is reported by `_remarks`.
         with contextlib.redirect_stdout(io.StringIO()):
             return ULog(content, list(TOPICS))
     except ULogException as error:
