@@ -1,13 +1,13 @@
-"""The gateway clock: the only place that asks the machine for the time."""
+"""The gateway clock: the only place that reads the machine's clocks."""
 
 import time
 
 
 class GatewayClock:
-    """Microseconds since the daemon started, also those that the machine slept.
+    """Microseconds since the daemon started, suspended time included.
 
-    The kernel's monotonic clock stands still while the machine sleeps: civil time would then seem
-    to have been set, and what was recorded before would be moved by the length of the sleep.
+    The kernel's monotonic clock stops while the machine is suspended: civil time would then seem
+    to have been set, and the earlier recording would be shifted by that time.
     """
 
     def __init__(self) -> None:
@@ -19,5 +19,5 @@ class GatewayClock:
 
 
 def unix_time_us() -> int:
-    """Return the machine's civil time in µs since 1970; it may jump when the machine learns it."""
+    """Return the machine's civil time in µs since 1970; it may jump when the clock is set."""
     return time.time_ns() // 1000

@@ -1,10 +1,10 @@
-"""What went wrong, in words for people."""
+"""Readable texts of errors."""
 
 import os
 
 
 def reason_of(error: Exception) -> str:
-    """Say what went wrong, in the words of the operating system if it has some."""
+    """Return the text of an error, the operating system's if there is one."""
     number = getattr(error, "errno", None) or 0
     return (
         os.strerror(number)

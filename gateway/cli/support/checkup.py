@@ -102,7 +102,7 @@ def _membership(path: Path) -> str:
         return f"it is for the group {owner}"
     if user in group.gr_mem:
         return f"{user} is in the group {group.gr_name} only from the next log-in on"
-    return f"`sudo usermod -aG {group.gr_name} {user}`, then log in anew"
+    return f"`sudo usermod -aG {group.gr_name} {user}`, then log in again"
 
 
 def _latency(device: Path) -> Iterator[Diagnosis]:

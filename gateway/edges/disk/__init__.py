@@ -1,1 +1,1 @@
-"""Recordings, places and logs on the disk."""
+"""Recordings, places and logs on disk."""

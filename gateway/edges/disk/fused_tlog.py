@@ -1,4 +1,4 @@
-"""A tlog that comes into being while it is played: a table that is fused again."""
+"""A tlog that is generated while it is played, from a table that is fused again."""
 
 import logging
 import os
@@ -13,20 +13,20 @@ from gateway.flightlog.tlog.tlog import TlogIndex, TlogRecord, TlogScanner, enco
 log = logging.getLogger(__name__)
 
 PIECE: Final = 8
-"""Frames that are made at once: one or two milliseconds."""
+"""Frames generated at once: one or two milliseconds."""
 
 
 class FusedTlog:
-    """Makes frames as they are wanted, and keeps them on the disk so that one can seek back.
+    """Generate frames on demand, and keep them on disk for seeking back.
 
     Parameters
     ----------
     frames : iterator of TlogRecord
-        What is played, in the order of its time.
+        The frames to play, in the order of their times.
     last_us : int, optional
-        Time of its end, as far as that is known beforehand.
+        Time of its end, if known beforehand.
     answers : LogAnswers, optional
-        Takes in what the frames tell of the vehicle.
+        Collects answers from the frames.
 
     Raises
     ------
@@ -48,31 +48,31 @@ class FusedTlog:
         self._size = 0
         self._ended = False
         self.index = TlogIndex()
-        """Of what was made by now."""
+        """Index of the frames generated so far."""
         while not self.index.count and self._make():
             pass
 
     @property
     def last_us(self) -> int:
-        """Time of the end, or of the last frame that was made."""
+        """Time of the end, or of the last frame generated."""
         return max(self._last_us or 0, self.index.last_us or 0)
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to so many bytes; makes the next frames where there are none yet."""
+        """Read up to `size` bytes; generate the next frames if there are none yet."""
         while offset >= self._size and self._make():
             pass
         return os.pread(self._file.fileno(), size, offset)
 
     def prepare(self, until_us: int) -> bool:
-        """Make a few of the frames up to a time; tells whether they are all there."""
+        """Generate a few of the frames up to a time; return whether all are there."""
         return (self.index.last_us or 0) >= until_us or not self._make()
 
     def close(self) -> None:
-        """Forget what was made."""
+        """Delete the generated frames."""
         self._file.close()
 
     def _make(self) -> bool:
-        """Make some frames; tells whether there were any."""
+        """Generate some frames; return whether there were any."""
         if self._ended:
             return False
         made = b"".join(encode_record(r.time_us, r.frame) for r in islice(self._frames, PIECE))

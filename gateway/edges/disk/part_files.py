@@ -1,7 +1,7 @@
 """The files of one part on the disk; everything here may block and runs in the recorder's worker.
 
-Files are only ever appended to, so a cut at any moment leaves what was written before. Only what a
-disk has refused in the middle is taken back.
+Files are only ever appended to, so a power cut at any moment leaves what was written before. Only
+a record that was written partly is removed again.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ RIGHTS: Final = 0o644
 
 @dataclass(frozen=True, slots=True)
 class DiskState:
-    """What came of a write."""
+    """Result of a write."""
 
     part_bytes: int
     """Size of the largest file."""
@@ -34,7 +34,7 @@ class DiskState:
 
 
 def free_bytes_near(folder: Path) -> int:
-    """Return the free space where a folder is, or would be made."""
+    """Return the free space where a folder is, or would be created."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     disk = os.statvfs(folder)
@@ -42,7 +42,7 @@ def free_bytes_near(folder: Path) -> int:
 
 
 def reason_of(error: OSError) -> str:
-    """Say in a few words what the disk does not like: a STATUSTEXT has 50 bytes."""
+    """Describe a disk error in a few words: a STATUSTEXT has 50 bytes."""
     known = {
         errno.ENOSPC: "disk is full",
         errno.EDQUOT: "disk quota is used up",
@@ -55,14 +55,14 @@ def reason_of(error: OSError) -> str:
 
 
 class PartFiles:
-    """Appends to the files of one part, opening each with its first bytes.
+    """Append to the files of one part, opening each with its first bytes.
 
     Parameters
     ----------
     folder : Path
-        Made if it is not there.
+        Created if it does not exist.
     session : str
-        Name of the recording; gets a number behind it if the first part finds it taken.
+        Name of the recording; a number is added if the first part finds it taken.
     part : int
         From 1.
     """
@@ -81,9 +81,9 @@ class PartFiles:
         Parameters
         ----------
         pieces : mapping of str to bytes
-            What to append, by the end of the file's name: `.tlog`, `_v1.csv`.
+            What to append, by the ending of the file's name: `.tlog`, `_v1.csv`.
         sync : bool
-            Wait until all of it is on the disk itself.
+            Wait until all of it is on the physical disk.
 
         Returns
         -------
@@ -92,7 +92,7 @@ class PartFiles:
         Raises
         ------
         OSError
-            If the disk does not take it, or a file was removed under our hands.
+            If the disk refuses it, or a file was removed meanwhile.
         """
         for ending, data in pieces.items():
             if ending not in self._files:
@@ -106,12 +106,12 @@ class PartFiles:
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
 
     def rename(self, to_name: str) -> None:
-        """Name the recording otherwise between two writes, also before the first.
+        """Rename the recording between two writes, also before the first.
 
         Raises
         ------
         RecordingError
-            If the name is taken, or is none.
+            If the name is taken or invalid.
         """
         if self.session in {recording.name for recording in list_recordings(self._folder)}:
             rename_recording(self._folder, self.session, to_name)
@@ -120,7 +120,7 @@ class PartFiles:
         self.session = to_name
 
     def close(self) -> None:
-        """Close all files; what the disk holds stays whatever happens, but none stays empty."""
+        """Close all files, keep what was written, and remove empty files."""
         files, self._files = self._files, {}
         for ending, file in files.items():
             try:
@@ -145,7 +145,7 @@ class PartFiles:
             while view:
                 view = view[os.write(file, view) :]
         except OSError:
-            # A full disk takes the start of what is written: no half record may stay.
+            # A full disk writes only the start of the data: no partial record may stay.
             with contextlib.suppress(OSError):
                 os.ftruncate(file, size)
             raise

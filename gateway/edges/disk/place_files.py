@@ -1,8 +1,8 @@
-"""Where the places of each aircraft are kept: one JSON file each, beside its settings.
+"""The stored places of each aircraft: one JSON file each, beside its settings.
 
-A file is replaced whole or not at all, by a thread of its own, since a disk may hold up whoever
-writes to it. What cannot be written is tried again until it can. A file that cannot be read is told
-and left alone: it may hold a mission that a person can mend.
+A file is replaced whole or not at all, by a separate thread, since writing to a disk may block. A
+failed write is retried until it succeeds. A file that cannot be read is reported and left as it
+is: it may hold a mission that a person can repair.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
 RETRY_S: Final = 10.0
-"""Soon for a person who has mended a file or made room, and no load for a disk that is ill."""
+"""Soon for a person who has repaired a file or made room, and no load for a failing disk."""
 
 
 class PlaceFiles:
@@ -31,21 +31,21 @@ class PlaceFiles:
     Parameters
     ----------
     folder : Path
-        Made when it is needed.
-    tell : callable
-        Called with the vehicle id and why its places cannot be kept, or None when they are again.
+        Created when it is needed.
+    report : callable
+        Called with the vehicle id and why its places cannot be stored, or None when they can again.
     """
 
-    def __init__(self, folder: Path, tell: Callable[[int, str | None], None]) -> None:
+    def __init__(self, folder: Path, report: Callable[[int, str | None], None]) -> None:
         self.failures = 0
         """Changes that could not be written at once since the start."""
         self.broken: dict[int, str] = {}
         """Why the places of an aircraft could not be loaded, by vehicle id."""
         self._folder = folder
-        self._tell = tell
+        self._report = report
         self._pending: dict[int, StoredPlaces] = {}
         self._failed: dict[int, StoredPlaces] = {}
-        """What could not be written when it was last tried."""
+        """Places whose last write failed."""
         self._worker = ThreadPoolExecutor(1, "places")
         self._task: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
@@ -72,17 +72,17 @@ class PlaceFiles:
         return found
 
     def save(self, vehicle_id: int, places: StoredPlaces) -> None:
-        """Keep the places of an aircraft; returns at once, and only the newest count."""
+        """Store the places of an aircraft; returns at once, only the newest are written."""
         self._pending[vehicle_id] = places
         self._start()
 
     async def settle(self) -> None:
-        """Wait until what was given so far is written."""
+        """Wait until all pending writes are done."""
         if self._task is not None:
             await self._task
 
     def close(self) -> None:
-        """Write what is left and end; waits for the disk."""
+        """Write what is pending and end; waits for the disk."""
         if self._retry is not None:
             self._retry.cancel()
         if self._task is not None:
@@ -97,7 +97,7 @@ class PlaceFiles:
             self._task = asyncio.get_running_loop().create_task(self._write_pending())
 
     async def _write_pending(self) -> None:
-        """Write all that waits; what fails waits for the next attempt."""
+        """Write all that is pending; failed writes wait for the next attempt."""
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
@@ -121,15 +121,15 @@ class PlaceFiles:
         self._failed[vehicle_id] = places
         self.failures += 1
         log.warning("places of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
-        self._tell(vehicle_id, reason)
+        self._report(vehicle_id, reason)
 
     def _note_success(self, vehicle_id: int, places: StoredPlaces) -> None:
-        # Until it is written it stays, so that an end in between loses nothing.
+        # It stays until it is written, so that a shutdown in between loses nothing.
         if self._pending[vehicle_id] is places:
             del self._pending[vehicle_id]
         if self._failed.pop(vehicle_id, None):
             log.info("places of aircraft %d are kept again", vehicle_id)
-            self._tell(vehicle_id, None)
+            self._report(vehicle_id, None)
 
     def _write(self, vehicle_id: int, places: StoredPlaces) -> None:
         file = self._folder / f"{vehicle_id}.places.json"

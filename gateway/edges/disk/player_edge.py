@@ -1,4 +1,4 @@
-"""The player's edge: hands the frames of recordings on when they are due."""
+"""The player's edge: emits the frames of recordings when they are due."""
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
@@ -9,18 +9,18 @@ from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player, PlayState, c
 from gateway.units import US_PER_S
 
 BATCH: Final = 200
-"""Frames in one go: about a millisecond, after which others get their turn."""
+"""Frames at once: about a millisecond, after which others get their turn."""
 LONGEST_WAIT_S: Final = 0.5
 SEEKING: Final = "seeking"
 
 
 @dataclass(frozen=True, slots=True)
 class PlayerStatus:
-    """What the player does."""
+    """State of the player."""
 
     state: str
     position_s: float
-    """Since the begin of the range."""
+    """Since the start of the range."""
     duration_s: float
     time_us: int
     """Recorded civil time, µs since 1970."""
@@ -32,14 +32,14 @@ class PlayerStatus:
 
 
 class PlayerEdge:
-    """Plays on the event loop.
+    """Play recordings on the event loop.
 
     Parameters
     ----------
     player : Player
-        What is due when.
+        Decides what is due when.
     emit : callable
-        Given each batch of frames.
+        Called with each batch of frames.
     now_us : callable
         The gateway clock.
     files : sequence of str
@@ -66,7 +66,7 @@ class PlayerEdge:
         self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
 
     def start(self) -> None:
-        """Begin; needs a running event loop."""
+        """Start; needs a running event loop."""
         self._turn()
 
     def close(self) -> None:
@@ -76,12 +76,12 @@ class PlayerEdge:
             self._timer = None
 
     def pause(self) -> None:
-        """Hold."""
+        """Pause."""
         self._player.pause(self._clock())
         self._turn()
 
     def resume(self) -> None:
-        """Go on."""
+        """Resume."""
         self._player.resume(self._clock())
         self._turn()
 
@@ -91,12 +91,12 @@ class PlayerEdge:
         self._turn()
 
     def set_speed(self, speed: float) -> None:
-        """Go on at another speed; raises ValueError for one that is not offered."""
+        """Change the speed; raises ValueError if it is out of range."""
         self._player.set_speed(check_speed(speed), self._clock())
         self._turn()
 
     def set_loop(self, loop: bool) -> None:
-        """Start anew at the end, or not."""
+        """Set whether to restart at the end."""
         self._player.loop = loop
 
     def seek(self, offset_s: float, *, relative: bool = False) -> None:
@@ -107,12 +107,12 @@ class PlayerEdge:
         self.seek_time(base_us + round(offset_s * US_PER_S))
 
     def seek_time(self, time_us: int) -> None:
-        """Move to a recorded civil time in µs since 1970, as soon as that is ready."""
+        """Move to a recorded civil time in µs since 1970, as soon as it is ready."""
         self._wanted_us = time_us
         self._turn()
 
     def status(self) -> PlayerStatus:
-        """Describe this moment."""
+        """Return the present state."""
         player = self._player
         fastest = player.speed == AS_FAST_AS_POSSIBLE
         return PlayerStatus(
@@ -127,7 +127,7 @@ class PlayerEdge:
         )
 
     def _turn(self) -> None:
-        """Hand on what is due and wait for the next; what a seek needs is done in between."""
+        """Emit the frames due and wait for the next; the work for a seek is done in between."""
         self.close()
         wanted_us = self._wanted_us
         if wanted_us is not None and self._player.prepare(wanted_us):

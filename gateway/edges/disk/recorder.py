@@ -1,14 +1,14 @@
-"""The recorder: keeps what passes through the gateway, and never holds it up.
+"""The recorder: records what passes through the gateway, and never delays it.
 
-Linux has no way to write to a disk without waiting for it: a card that tidies up, or a network
-folder, blocks for seconds. So the disk is the one thing that a second thread does. It is handed
-immutable bytes and hands back a result; nothing is shared, so there is nothing to lock. While it
-is at work the event loop gathers the next bytes, up to a bound.
+Linux has no way to write to a disk without waiting for it: a card that cleans up, or a network
+folder, blocks for seconds. So a second thread does all disk work. It gets immutable bytes and
+returns a result; nothing is shared, so there is nothing to lock. Meanwhile the event loop buffers
+the next bytes, up to a limit.
 
-Every `flush_s` the gathered bytes go to the kernel, which survives the death of the gateway; every
-`sync_s` the kernel is made to put them on the disk, which survives the loss of power. By default
-both are half a second, so that either costs less than a second; a card that is worn by this may be
-synced less often.
+Every `flush_s` the buffered bytes go to the kernel, which survives a crash of the gateway; every
+`sync_s` the kernel must write them to the disk, which survives a power loss. By default both are
+half a second, so that either costs less than a second; a card that is worn by this may be synced
+less often.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ Result = TypeVar("Result")
 
 
 class Recorder:
-    """Records MAVLink and flights.
+    """Record MAVLink and flights.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ class Recorder:
     unix_us : callable
         The machine's civil time.
     header_of : callable
-        Tells what heads a vehicle's table: version, settings, calibration. Session, part and
+        Returns the head of a vehicle's table: version, settings, calibration. Session, part and
         start are filled in here.
     announce : callable
-        Called with whether it is trouble, and a text for the user.
+        Called with whether it is a problem, and a text for the user.
     state_of : callable
-        Tells what the fusion of a vehicle remembers after all that was handed to `flight`.
+        Returns the state of a vehicle's fusion after all records passed to `flight`.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class Recorder:
         self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
         self._restamping: asyncio.Task[None] | None = None
         self.folder = Path(settings.folder).expanduser()
-        """Where the recordings are."""
+        """Folder of the recordings."""
 
     def start(self) -> None:
-        """Begin to work; needs a running event loop.
+        """Start; needs a running event loop.
 
-        A recording that is wanted already is opened at once: nothing runs yet that could be held
-        up, and a table is worth most from the estimator's first sample on.
+        A recording that is wanted already is opened at once: nothing runs yet that could be
+        delayed, and a table should begin with the estimator's first sample.
         """
         clear_copies(self.folder)
         self._civil.hear_machine(self._machine_us(), self._clock())
@@ -112,7 +112,7 @@ class Recorder:
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     def close(self) -> None:
-        """Write what is left and end; waits for the disk."""
+        """Write what is pending and end; waits for the disk."""
         for task in (self._task, self._restamping):
             if task is not None:
                 task.cancel()
@@ -128,8 +128,8 @@ class Recorder:
         self._restamper.finish()
 
     async def settle(self) -> None:
-        """Wait until orders given so far have been carried out."""
-        # The turn that is at work may have begun before the order came.
+        """Wait until all requests so far have been carried out."""
+        # The present turn may have begun before the request came.
         for _ in range(2):
             self._turned.clear()
             self._wake.set()
@@ -141,7 +141,7 @@ class Recorder:
         self._wake.set()
 
     def stop(self) -> None:
-        """Record no more until the next order or flight."""
+        """Stop recording until the next request or flight."""
         self._session.stop()
         self._wake.set()
 
@@ -150,18 +150,18 @@ class Recorder:
         self._session.set_in_flight(in_flight)
 
     def mark(self, text: str) -> None:
-        """Put a remark at this moment into the recording."""
+        """Add a remark to the recording at this moment."""
         if self._part is not None:
             self._part.add_mark(TableMark(self._clock(), text))
         self._announce(False, REMARK + text)
 
     async def save(self, name: str) -> None:
-        """Name the session that runs, or ran last.
+        """Rename the present or last session.
 
         Raises
         ------
         RecordingError
-            If there is none, or the name is taken or is none.
+            If there is none, or the name is taken or invalid.
         """
         if not self._session.name:
             raise RecordingError("nothing was recorded since the gateway started")
@@ -176,7 +176,7 @@ class Recorder:
             self._part.session = name
 
     def status(self) -> RecorderStatus:
-        """Describe this moment."""
+        """Return the present state."""
         session, disk = self._session, self._disk
         return RecorderStatus(
             state=session.state.value,
@@ -190,21 +190,21 @@ class Recorder:
 
     @property
     def trouble(self) -> str:
-        """Why nothing can be recorded at the moment, or nothing."""
+        """Why nothing can be recorded at the moment, or empty."""
         return self._session.reason if self._session.state is SessionState.BLOCKED else ""
 
     @property
     def recording(self) -> bool:
-        """Whether a recording runs, and the disk has taken its first bytes."""
+        """Whether a recording runs, and its first bytes are written."""
         return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
 
     def frame(self, frame: bytes) -> None:
-        """Keep a MAVLink frame that was sent or received."""
+        """Record a MAVLink frame that was sent or received."""
         if self._part is not None and self._settings.tlog:
             self._part.add_frame(frame, self._clock())
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
-        """Keep what the estimator took, and the state that it made of it."""
+        """Record a sample of the estimator, or the resulting state."""
         if isinstance(record, GpsFix) and record.utc_us is not None:
             self._civil.hear_gps(record.node.vehicle_id, record.utc_us, record.time_us)
         vehicle_id = (
@@ -218,12 +218,12 @@ class Recorder:
         self._seen.add(vehicle_id)
 
     def settings_changed(self, vehicle_id: int) -> None:
-        """Note that what comes is fused with other settings, which a new head tells."""
+        """Note that the following samples are fused with other settings, in a new header line."""
         if self._part is not None and self._part.has_table(vehicle_id):
             self._part.change_settings(self._header(vehicle_id, self._part))
 
     def _new_part(self, session: str, number: int) -> Part:
-        """Begin to gather for a part; later, the fusion would be ahead of its first row."""
+        """Start buffering for a part; later, the fusion would be ahead of its first row."""
         part = Part(session, number, self._civil.offset_us or 0)
         if number == 1:
             self._offsets.clear()
@@ -246,7 +246,7 @@ class Recorder:
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            # A slow disk takes its time from the pause: what waits for it is not to grow by both.
+            # The time that a slow disk needs is subtracted from the pause.
             due_s = loop.time() + self._settings.flush_s
             self._wake.clear()
             await self._turn()
@@ -255,7 +255,7 @@ class Recorder:
                 await asyncio.wait_for(self._wake.wait(), max(due_s - loop.time(), 0.0))
 
     async def _turn(self) -> None:
-        """Write what was gathered, then let the session decide."""
+        """Write the buffered bytes, then let the session decide."""
         self._civil.hear_machine(self._machine_us(), self._clock())
         actions = await self._flush()
         if not actions:
@@ -288,10 +288,10 @@ class Recorder:
         return []
 
     async def _perform(self, actions: list[SessionAction]) -> list[SessionAction]:
-        """Do what the session decided; return what it decides upon the outcome."""
+        """Carry out the session's actions; return its actions upon their outcome."""
         closing = self._part
         opening = next((action for action in actions if isinstance(action, OpenPart)), None)
-        # The next part gathers from here on, so that nothing is lost while the last one closes.
+        # The next part buffers from here on, so that nothing is lost while the last one closes.
         if closing is not None and any(isinstance(a, ClosePart) for a in actions):
             closing.flush_rows()
             self._part = None
@@ -357,7 +357,7 @@ class Recorder:
             await self._on_disk(files.close)
 
     async def _rename(self, action: Rename) -> None:
-        """Name a session by its true time, and let its finished parts be shifted to it."""
+        """Rename a session after its true time, and queue its finished parts to be shifted."""
         await self._restamped()
         old, new = action.session, action.to_session
         try:

@@ -33,7 +33,7 @@ class FileKind(StrEnum):
     FOREIGN = "foreign"
     """Text with columns that are not ours."""
     OTHER = "other"
-    """A format that `OTHER_FORMATS` knows."""
+    """A format in `OTHER_FORMATS`."""
 
 
 OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {}
@@ -41,7 +41,7 @@ OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {}
 
 
 def kind_of(path: Path) -> FileKind:
-    """Look at a file's first bytes; raises OSError if it cannot be read."""
+    """Recognise a file by its first bytes; raises OSError if it cannot be read."""
     head = _head(path)
     if any(knows(head) for knows in OTHER_FORMATS.values()):
         return FileKind.OTHER
@@ -52,7 +52,7 @@ def kind_of(path: Path) -> FileKind:
 
 
 def other_format(path: Path) -> str:
-    """Return which of `OTHER_FORMATS` a file is; raises KeyError if it is none."""
+    """Return which of `OTHER_FORMATS` a file has; raises KeyError if none."""
     head = _head(path)
     for name, knows in OTHER_FORMATS.items():
         if knows(head):
@@ -67,13 +67,13 @@ def _head(path: Path) -> bytes:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Say of a damaged gzip file what it is; raises OSError."""
+    """Raise a clear OSError for a damaged gzip file."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise OSError(
             errno.EIO,
-            f"is no whole gzip file ({error}); `gzip -dc FILE > NEW` saves what is sound",
+            f"is a damaged gzip file ({error}); `gzip -dc FILE > NEW` saves the intact part",
             str(path),
         ) from error
 
@@ -90,12 +90,12 @@ def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]
 
 
 def read_ends(path: Path) -> tuple[bytes, bytes]:
-    """Read the lines of a text that stand before its first row, and some of the last.
+    """Read the lines of a text file up to its first row, and some of the last.
 
     Returns
     -------
     head : bytes
-        The lines up to the first that is no comment, and that one.
+        The lines up to and including the first that is not a comment.
     tail : bytes
         The last lines, the first of them whole.
     """

@@ -1,4 +1,4 @@
-"""The folder of recordings: what is in it, and renaming and deleting without losing anything.
+"""The folder of recordings: listing, and safe renaming and deleting.
 
 A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog` and so on.
 """
@@ -29,11 +29,11 @@ class Recording:
 
 
 class RecordingError(Exception):
-    """What was asked for cannot be done; the text says why."""
+    """The request cannot be carried out; the text says why."""
 
 
 def part_of(path: Path) -> int:
-    """Return which part of its recording a file is; raises ValueError if it is none."""
+    """Return which part of its recording a file is; raises ValueError if it is not one."""
     match = _FILE_NAME.fullmatch(path.name)
     if match is None:
         raise ValueError(f"{path} is no part of a recording")
@@ -41,18 +41,18 @@ def part_of(path: Path) -> int:
 
 
 def is_file_name(name: str) -> bool:
-    """Return whether a name is that of a recording's file, in the folder itself."""
+    """Return whether a name is that of a recording's file, without a path."""
     return _FILE_NAME.fullmatch(name) is not None and not {"/", "\0"} & set(name)
 
 
 def recording_name(path: Path) -> str:
-    """Return the name of the recording that a file is of; of another file its name."""
+    """Return the name of a file's recording; for another file its own name."""
     match = _FILE_NAME.fullmatch(path.name)
     return path.name if match is None else match["name"]
 
 
 def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
-    """Put the parts of a recording that follow one another together; all else stays alone."""
+    """Group consecutive parts of a recording; other files stay alone."""
     found: list[list[Path]] = []
     newest: dict[tuple[Path, str, str], list[Path]] = {}
     for path in paths:
@@ -82,7 +82,7 @@ def list_recordings(folder: Path) -> list[Recording]:
 
 
 def find_recording(folder: Path, name: str) -> Recording:
-    """Find one recording by name; `last` is the newest, unless one is really called so.
+    """Find one recording by name; `last` is the newest, unless one has that name.
 
     Raises
     ------
@@ -99,14 +99,14 @@ def find_recording(folder: Path, name: str) -> Recording:
 
 
 def free_name(folder: Path, wanted: str) -> str:
-    """Return the wanted name, or with a number behind it if there is such a recording."""
+    """Return the wanted name, with a number added if there is such a recording."""
     taken = {recording.name for recording in list_recordings(folder)}
     names = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
     return next(name for name in names if name not in taken)
 
 
 def check_free(folder: Path, name: str) -> None:
-    """Check that a recording can be named so; raises RecordingError if not."""
+    """Check that a recording can have a name; raises RecordingError if not."""
     try:
         check_name(name)
     except ValueError as error:
@@ -116,12 +116,12 @@ def check_free(folder: Path, name: str) -> None:
 
 
 def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
-    """Give a recording another name, also while it is being written; never overwrites.
+    """Rename a recording, also while it is being written; never overwrites.
 
     Raises
     ------
     RecordingError
-        If there is no such recording, the new name is taken, or it is no name.
+        If there is no such recording, or the new name is taken or invalid.
     """
     recording = find_recording(folder, name)
     check_free(folder, to_name)
@@ -132,7 +132,7 @@ def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
 
 
 def delete_recording(folder: Path, name: str) -> Recording:
-    """Delete the files of a recording and tell what they were.
+    """Delete the files of a recording and return what they were.
 
     Raises
     ------

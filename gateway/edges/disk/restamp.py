@@ -1,8 +1,8 @@
-"""Give finished files their true times, once GPS has told them.
+"""Give finished files their true times, once GPS has provided them.
 
 A part may be larger than the memory and the disk slow, so a file is copied in small steps, between
-which the disk takes what is being recorded. The copy takes the place of the file in one step: a
-power cut leaves either.
+which the present recording is written. The copy replaces the file in one step: a power cut leaves
+either.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ NEW: Final = ".new"
 
 
 class Restamper:
-    """Shifts the times of files, one after the other.
+    """Shift the times of files, one after the other.
 
     Parameters
     ----------
@@ -41,22 +41,22 @@ class Restamper:
         self._waiting: deque[tuple[Path, Iterator[None]]] = deque()
 
     def add(self, path: Path, shift_us: int) -> None:
-        """Let the times of a file be shifted, after those that wait already."""
+        """Queue a file whose times are to be shifted."""
         if shift_us:
             self._waiting.append((path, self._steps(path, shift_us)))
 
     async def run(self, on_disk: Callable[[Callable[[], bool]], Awaitable[bool]]) -> None:
-        """Do all that waits, handing each step to the disk's own thread."""
+        """Process the queue, running each step in the disk's thread."""
         while await on_disk(self.step):
             pass
 
     def finish(self) -> None:
-        """Do all that waits at once."""
+        """Process the queue at once."""
         while self.step():
             pass
 
     def step(self) -> bool:
-        """Do a little; tells whether there is more to do."""
+        """Do one step; return whether there is more to do."""
         if not self._waiting:
             return False
         path, steps = self._waiting[0]
@@ -82,7 +82,7 @@ class Restamper:
                     yield
                 copy.flush()
                 os.fsync(copy.fileno())
-            # Deleted meanwhile, it must not come back.
+            # If it was deleted meanwhile, it must not come back.
             if path.exists():
                 temporary.replace(path)
                 sync_folder(path.parent)
@@ -106,7 +106,7 @@ def _shifted_tlog(file: BinaryIO, shift_us: int) -> Iterator[bytes]:
 
 
 def _shifted_table(file: BinaryIO, shift_us: int) -> Iterator[bytes]:
-    """Rows are on the gateway's clock; only the heads tell its place in civil time."""
+    """Yield a table with shifted heads; rows are on the gateway's clock and stay."""
     while lines := file.readlines(STEP):
         yield b"".join([_shifted_line(line, shift_us) for line in lines])
 

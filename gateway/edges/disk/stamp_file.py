@@ -1,4 +1,4 @@
-"""Where the newest signing stamps are kept: one file, written by a thread of its own."""
+"""The newest signing time stamps in one file, written by a separate thread."""
 
 import logging
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class StampFile:
     Parameters
     ----------
     folder : Path
-        Made when it is needed.
+        Created when it is needed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -37,7 +37,7 @@ class StampFile:
         self._is_told = False
 
     def load(self) -> Kept:
-        """Read what was kept; nothing if there is none, or it cannot be read."""
+        """Read the file; nothing if there is none, or it cannot be read."""
         kind = dict[int, dict[str, dict[_Stream, _Stamp]]]
         try:
             return msgspec.json.decode(self._file.read_bytes(), type=kind, strict=False)
@@ -53,7 +53,7 @@ class StampFile:
             return {}
 
     def save(self, stamps: Kept) -> None:
-        """Keep these; returns at once, and only the newest count."""
+        """Store these; returns at once, only the newest are written."""
         is_busy, self._waiting = self._waiting is not None, stamps
         if not is_busy:
             self._worker.submit(self._write)

@@ -1,4 +1,4 @@
-"""A tlog on the disk, as a player reads it: indexed once, then read at any place."""
+"""A tlog on disk for the player: indexed once, then read at any position."""
 
 import os
 from pathlib import Path
@@ -12,9 +12,9 @@ READ_SIZE: Final = 1 << 20
 
 
 class TlogFile:
-    """A tlog on the disk: its index, and reading at any place.
+    """A tlog on disk: its index, and reading at any position.
 
-    It is read, not mapped into memory: a file that shrinks, or a stick that is pulled out, would
+    It is read, not memory-mapped: a file that shrinks, or a USB stick that is pulled out, would
     kill a process that had mapped it.
 
     Parameters
@@ -24,7 +24,7 @@ class TlogFile:
     progress : callable, optional
         Called with how many more bytes were indexed.
     answers : LogAnswers, optional
-        Takes in what the file tells of its vehicles.
+        Collects answers from the file.
 
     Raises
     ------
@@ -52,7 +52,7 @@ class TlogFile:
                 progress(len(data))
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to so many bytes; nothing at the end, or where the medium fails."""
+        """Read up to `size` bytes; nothing at the end, or if the medium fails."""
         try:
             return os.pread(self._file, size, offset)
         except OSError:
@@ -64,7 +64,7 @@ class TlogFile:
         return self.index.last_us or 0
 
     def prepare(self, until_us: int) -> bool:  # noqa: ARG002
-        """Tell that everything is there."""
+        """Return True: everything is there."""
         return True
 
     def close(self) -> None:

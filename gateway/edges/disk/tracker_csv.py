@@ -20,7 +20,7 @@ _KEY_VALUE: Final = re.compile(r"(\w+)=(\S+)")
 
 
 class FlightFileError(Exception):
-    """A log that cannot be flown; the text names the file and what is wrong."""
+    """A log that cannot be used as a flight; the text names the file and the error."""
 
 
 def read_flight(path: Path) -> RecordedFlight:
@@ -29,7 +29,7 @@ def read_flight(path: Path) -> RecordedFlight:
     Parameters
     ----------
     path : Path
-        CSV with a header row. Lines that start with `#` may hold `key=value` words, of which
+        CSV with a header row. Lines that start with `#` may hold `key=value` pairs, of which
         `gps_latency_s` is used. For the columns see `RecordedFlight.from_columns`; others are
         skipped, and an empty cell is "no new sample".
 

@@ -1,1 +1,1 @@
-"""The hub: MAVLink to and from every client, one file a transport."""
+"""The hub: MAVLink to and from every client, one file per transport."""

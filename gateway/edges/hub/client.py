@@ -1,4 +1,4 @@
-"""What all transports to a client share: identity, counters, and how received bytes go on."""
+"""Base of all transports: identity, counters, and passing on received frames."""
 
 import asyncio
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Write = Callable[[bytes], object]
 
 
 def not_open(data: bytes) -> int:
-    """Stand in for the write function of a socket that is not open."""
+    """Write function of a client without an open socket; raises OSError."""
     raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
 
 
@@ -32,7 +32,7 @@ class Client:
     client_id: int
     endpoint: Endpoint
     remote: str = ""
-    """Where the peer is; by default where the endpoint says."""
+    """Address of the peer; by default the endpoint's."""
     name: str = ""
     state: str = "connecting"
     reason: str = ""
@@ -42,20 +42,20 @@ class Client:
     round_trip_us: int | None = None
     counters: ClientCounters = field(default_factory=ClientCounters)
     express: dict[bytes, Express] = field(default_factory=dict)
-    """The hub's short ways for frames from here, by `key_of`."""
+    """The hub's fast paths for frames from here, by `key_of`."""
     write: Write = field(default=not_open)
     """Sends one datagram at once or raises OSError; only of a client that is direct."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
 
     def __post_init__(self) -> None:
-        """Take the rest from the surroundings."""
+        """Fill in the remaining fields."""
         self.remote = self.remote or self.endpoint.address
         self.trusted = _is_trusted(self.endpoint, self.remote)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
 
     def become(self, state: str, error: Exception | None = None) -> None:
-        """Take on a state, and remember what led to it."""
+        """Set the state, and remember its reason."""
         self.state = state
         self.reason = "" if error is None else reason_of(error)
 
@@ -64,15 +64,15 @@ class Client:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Let go of the transport."""
+        """Close the transport."""
 
     def fail(self, error: Exception) -> None:
-        """Close after an error that nobody foresaw; the tick opens again what may be opened."""
+        """Close after an unexpected error; `tick` reopens what can be reopened."""
         self.become("unreachable", error)
         self.close()
 
     def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options of the same place."""
+        """Apply changed options of the same endpoint."""
         if self.name == self.endpoint.name:
             self.name = endpoint.name
         elif self.name == self.endpoint.name_of(self.remote):
@@ -82,7 +82,7 @@ class Client:
         self.context.reconfigure(self)
 
     def tick(self, now_us: int) -> None:
-        """Do what is due a few times a second: connect again, expire."""
+        """Reconnect and expire; called a few times a second."""
 
     @property
     def host(self) -> str:
@@ -91,11 +91,11 @@ class Client:
 
     @property
     def is_direct(self) -> bool:
-        """Whether a frame may go to `write` without further ado."""
+        """Whether a frame may be passed to `write` directly."""
         return False
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
-        """Judge a failed `write` that will be counted as sent all the same."""
+        """Handle a failed `write` whose frame will still be counted as sent."""
         raise NotImplementedError
 
     @property
@@ -116,7 +116,7 @@ class Client:
                 self.context.deliver(self, event, now_us)
 
     def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
-        """Describe the client at this moment; the hub knows which systems are behind it."""
+        """Return the client's present figures; the hub passes the systems behind it."""
         counters = self.counters
         return ClientStats(
             client_id=self.client_id,
@@ -142,15 +142,15 @@ class Client:
 
 
 class HubContext(Protocol):
-    """What a transport asks of the hub."""
+    """The part of the hub that a transport uses."""
 
     @property
     def recordings(self) -> Path | None:
-        """Where the recordings are that a fleet may fetch, if there are any."""
+        """Folder of the recordings that a fleet may fetch, if any."""
 
     @property
     def settings(self) -> HubSettings:
-        """The settings of this moment."""
+        """The present settings."""
 
     @property
     def seal(self) -> Seal:
@@ -169,26 +169,26 @@ class HubContext(Protocol):
         """Take one received frame."""
 
     def appear(self, client: Client) -> None:
-        """Let a client take part."""
+        """Add a client."""
 
     def greet(self, client: Client) -> None:
-        """Tell a peer that has just come which vehicles there are."""
+        """Send the vehicles' greetings to a new peer."""
 
     def reconfigure(self, client: Client) -> None:
-        """Let a client's changed lists and rates hold."""
+        """Apply a client's changed lists and rates."""
 
     def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
-        """Call back when all that has come at once is dealt with, or after a wait."""
+        """Call back after the present events are handled, or after a wait."""
 
     def note_buffer(self, client: Client, free_percent: int) -> None:
         """Take in how much of the buffer of the radio behind a client is free."""
 
     def vanish(self, client: Client) -> None:
-        """Forget a client and close it."""
+        """Remove a client and close it."""
 
 
 def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
-    """Return whether a peer may change state: as the URL says, else if named or on this machine."""
+    """Return whether a peer may change state: as in the URL, else if configured or local."""
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:

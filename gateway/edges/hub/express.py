@@ -1,9 +1,9 @@
-"""The short way for frames that come often and need no judgement.
+"""The fast path for frequent frames that always go to the same clients.
 
-Telemetry of a vehicle that is heard by one way only goes to the same clients again and again.
-For each kind of frame the hub keeps one express: the clients' own write functions in a row, with
-nothing counted on the way but once for all. Whenever anybody comes, goes or changes, all
-expresses are given up, and the next frame of each kind is judged anew.
+Telemetry of a vehicle that is heard by only one path goes to the same clients again and again. For
+each kind of frame the hub keeps one express: a list of the clients' write functions, with one
+common count. Whenever a client comes, goes or changes, all expresses are discarded, and the next
+frame of each kind is routed again.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,12 +13,12 @@ from typing import Protocol
 
 @dataclass(slots=True)
 class ClientCounters:
-    """What one client has done since it appeared."""
+    """Counters of one client since it appeared."""
 
     sent: int = 0
     dropped: int = 0
     unheard: int = 0
-    """For a port at which nobody listens."""
+    """Sent to a port on which nobody listens."""
     bytes_sent: int = 0
     received: int = 0
     bytes_received: int = 0
@@ -30,7 +30,7 @@ class Outlet(Protocol):
 
     @property
     def counters(self) -> ClientCounters:
-        """What it has done."""
+        """Its counters."""
 
     @property
     def write(self) -> Callable[[bytes], object]:
@@ -38,17 +38,17 @@ class Outlet(Protocol):
 
     @property
     def is_direct(self) -> bool:
-        """Whether a frame may go to `write` without further ado."""
+        """Whether a frame may be passed to `write` directly."""
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
-        """Judge a failed `write` that will be counted as sent all the same."""
+        """Handle a failed `write` whose frame will still be counted as sent."""
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Send one frame now or queue it; never block, never raise."""
 
 
 class Express:
-    """Who gets one kind of frame from one client.
+    """The clients that get one kind of frame from one client.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Express:
     message_id : int
         Of the frames.
     clients : sequence of Outlet
-        Those who take each of them.
+        The clients that take each of them.
     tap : callable, optional
         Sees each frame too.
     """
@@ -93,7 +93,7 @@ class Express:
             self._tap(frame)
 
     def settle(self) -> tuple[int, int]:
-        """Add what passed to the clients' own counters; return how many frames and bytes."""
+        """Add the common count to the clients' counters; return how many frames and bytes."""
         frames, size = self._frames, self._bytes
         self._frames = self._bytes = 0
         self._source.counters.received += frames
@@ -105,14 +105,14 @@ class Express:
 
 
 class GuardedExpress(Express):
-    """An express for a system that is heard by several ways: copies end here.
+    """An express for a system that is heard by several paths: copies are dropped here.
 
     Parameters
     ----------
     source, message_id, clients, tap
         As of an express.
     is_copy : callable
-        Notes a frame and tells whether it has come before.
+        Notes a frame and returns whether it has come before.
     """
 
     __slots__ = ("_is_copy",)
@@ -129,7 +129,7 @@ class GuardedExpress(Express):
         self._is_copy = is_copy
 
     def send(self, frame: bytes) -> None:
-        """Count a frame as received; hand it to every client if it is the first of its kind."""
+        """Count a frame as received; hand it to every client unless it is a copy."""
         if self._is_copy(frame):
             self._source.counters.received += 1
             self._source.counters.bytes_received += len(frame)

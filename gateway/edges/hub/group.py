@@ -1,8 +1,8 @@
-"""UDP broadcast and multicast: one datagram for all who listen.
+"""UDP broadcast and multicast: one datagram for all receivers.
 
-Two sockets. One sends and hears the unicast answers; the other has joined a multicast group and
-hears what others say there. Our own datagrams come back on the second and are known by the address
-of the first.
+Two sockets. One sends and receives the unicast answers; the other has joined a multicast group and
+receives what others send there. Our own datagrams come back on the second and are recognised by
+the address of the first.
 """
 
 import socket
@@ -14,7 +14,7 @@ from gateway.edges.hub.udp import MAX_DATAGRAM, READ_BUDGET, DatagramClient
 from gateway.routing.endpoint import EndpointKind
 
 MULTICAST_HOPS: Final = 1
-"""The own network; telemetry has no business beyond it."""
+"""The local network only."""
 
 
 class GroupClient(DatagramClient):
@@ -82,7 +82,7 @@ class GroupClient(DatagramClient):
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:
-    """Return the address of ours from which the group is reached, as sockets have it."""
+    """Return our socket address from which the group is reached."""
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         probe.connect(address)

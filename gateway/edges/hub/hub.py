@@ -1,4 +1,4 @@
-"""The hub: every frame of ours goes to every client, and what clients say finds its way."""
+"""The hub: every frame of ours goes to every client, and clients' frames are routed."""
 
 import asyncio
 import contextlib
@@ -32,19 +32,19 @@ log = logging.getLogger(__name__)
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
 VISITS_IN_FULL: Final = 30
-"""Comings and goings at listening ports that are logged one by one in a minute."""
+"""Connects and disconnects at listening ports that are logged one by one in a minute."""
 
 
 class Hub:
-    """Send MAVLink to many clients, take theirs, and pass between them what concerns them.
+    """Send MAVLink to many clients, receive theirs, and route between them.
 
     Parameters
     ----------
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame for our vehicles, every request to all, and every heartbeat, as far
-        as its client's share of answers reaches.
+        Called with every frame for our vehicles, every request to all, and every heartbeat, within
+        the client's quota of answers.
     now_us : callable
         The gateway clock.
     on_foreign : callable, optional
@@ -52,11 +52,11 @@ class Hub:
     on_gone : callable, optional
         Called with the id of a client that has gone for good.
     on_trouble : callable, optional
-        Called with a short text when clients come into trouble or out of it.
+        Called with a short text when a problem of a client begins or ends.
     seal : callable, optional
         Numbers, and signs, each frame of ours that leaves; without it none is signed.
     recordings : Path, optional
-        Where the recordings are that a fleet may fetch.
+        Folder of the recordings that a fleet may fetch.
     """
 
     def __init__(
@@ -98,10 +98,10 @@ class Hub:
         self._timer: asyncio.TimerHandle | None = None
         self._published = 0
         self._gathering: dict[float, list[Callable[[], None]]] = {}
-        """What is to be flushed, by how long it waits."""
+        """Callbacks to flush, by their wait."""
 
     def start(self) -> None:
-        """Open the endpoints; needs a running event loop. What fails is tried again."""
+        """Open the endpoints; needs a running event loop. A failed one is retried."""
         for url in self.settings.endpoints:
             self.add(url)
         self._tick()
@@ -131,7 +131,7 @@ class Hub:
         self._fanout.publish(frame, now_us)
 
     def set_interval(self, wish: ClientInterval) -> None:
-        """Send a client one message of one system at the rate that it wishes."""
+        """Send a client one message of one system at the rate that it requested."""
         for client_id in self._router.group(wish.client_id):
             self._fanout.set_interval(msgspec.structs.replace(wish, client_id=client_id))
         self._router.forget_express()
@@ -142,7 +142,7 @@ class Hub:
         Raises
         ------
         ValueError
-            If the URL is not understood, or the same endpoint is there already.
+            If the URL is not understood, or the same endpoint exists already.
         """
         endpoint = parse_endpoint(url)
         if endpoint.place in self._endpoints:
@@ -168,7 +168,7 @@ class Hub:
         Raises
         ------
         ValueError
-            If there is none such.
+            If there is no such endpoint.
         """
         for place, opened in self._endpoints.items():
             if name in (place, opened.endpoint.name, opened.endpoint.url):
@@ -182,7 +182,7 @@ class Hub:
             gone.close()
 
     def apply(self, settings: HubSettings) -> None:
-        """Take over changed settings; endpoints that stay keep their clients.
+        """Apply changed settings; unchanged endpoints keep their clients.
 
         Those whose options changed are changed in place, those added at run time stay.
         """
@@ -199,14 +199,14 @@ class Hub:
                 opened.reconfigure(parse_endpoint(url))
 
     def clients(self) -> tuple[ClientStats, ...]:
-        """Describe every client at this moment, in the order of their ids."""
+        """Return the present figures of every client, in the order of their ids."""
         self._router.settle_express()
         return tuple(
             self._clients[key].stats(self._router.origins(key)) for key in sorted(self._clients)
         )
 
     def listeners(self) -> tuple[ListenerStats, ...]:
-        """Describe every listening port at this moment, in the order of the settings."""
+        """Return the present figures of every listening port, in the order of the settings."""
         return tuple(
             opened.stats() for opened in self._endpoints.values() if not isinstance(opened, Client)
         )
@@ -241,25 +241,25 @@ class Hub:
         return self._vehicles.is_own(origin, self.now_us())
 
     def appear(self, client: Client) -> None:
-        """Let a client take part."""
+        """Add a client."""
         self._clients[client.client_id] = client
         self._fanout.add(client.client_id, client.transmit, client.endpoint)
         self._router.forget_express()
         self._log_visit(client, f"client {client.client_id}: {client.remote}")
 
     def greet(self, client: Client) -> None:
-        """Tell a peer that has just come which vehicles there are, and their homes."""
+        """Send the vehicles' greetings, heartbeat and home, to a new peer."""
         self._vehicles.await_greeting(client.client_id)
 
     def reconfigure(self, client: Client) -> None:
-        """Let a client's changed lists and rates hold from the next frame on."""
+        """Apply a client's changed lists and rates from the next frame on."""
         self._fanout.reconfigure(client.client_id, client.endpoint)
         self._router.reconfigure(client)
 
     def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
-        """Call back when all that has come at once is dealt with, or after a wait.
+        """Call back after the present events are handled, or after a wait.
 
-        One handle of the loop serves all clients: a timer for each cost more than it saved.
+        One handle of the loop serves all clients: a timer for each would cost more than it saves.
         """
         if gathering := self._gathering.get(wait_s):
             gathering.append(flush)
@@ -276,11 +276,11 @@ class Hub:
             flush()
 
     def note_buffer(self, client: Client, free_percent: int) -> None:
-        """Let what goes to a radio follow the room in its buffer."""
+        """Adapt the rate to a radio to the room in its buffer."""
         self._fanout.note_buffer(client.client_id, free_percent)
 
     def vanish(self, client: Client) -> None:
-        """Close a client and forget it."""
+        """Close a client and remove it."""
         self._fanout.remove(client.client_id)
         self._router.forget(client.client_id)
         self._vehicles.forget(client.client_id)
@@ -298,7 +298,7 @@ class Hub:
                     client.transmit(greeting_frame, message_id)
 
     def _tick(self) -> None:
-        # First of all: whatever happens below, the next tick comes.
+        # First, so that the next tick comes whatever happens below.
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
         for endpoint in list(self._endpoints.values()):
@@ -314,7 +314,7 @@ class Hub:
             self._ask_round_trips(now_us)
 
     def _tick_one(self, link: Client | Listener[Any], now_us: int) -> None:
-        """Let one link do what is due; one that raises is closed, named, and tried again."""
+        """Tick one link; one that raises is closed, logged, and retried."""
         try:
             link.tick(now_us)
         except Exception as error:
@@ -339,7 +339,7 @@ class Hub:
             log.info("%s", line)
 
     def _ask_round_trips(self, now_us: int) -> None:
-        """Ask every client that speaks; one that does not listens to nothing but telemetry."""
+        """Send round-trip requests to every client that sends; the others only receive."""
         asked = [client for client in self._clients.values() if client.heard_us is not None]
         systems = self._vehicles.systems(now_us)
         if not asked or not systems:

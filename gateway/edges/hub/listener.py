@@ -1,4 +1,4 @@
-"""What listening ports share: they are bound as soon as that is possible, and say why it is not."""
+"""Base of listening ports: bound as soon as possible, with the reason while it is not."""
 
 import asyncio
 import logging
@@ -14,13 +14,13 @@ from gateway.units import US_PER_S
 log = logging.getLogger(__name__)
 
 RETRY_US: Final = US_PER_S
-"""Between attempts to open a socket again: soon for a person, never spinning."""
+"""Between attempts to reopen a socket."""
 
 Peer = TypeVar("Peer", bound=Client)
 
 
 class Listener(Generic[Peer]):
-    """An endpoint that makes a client of everyone who calls.
+    """An endpoint that makes a client of every peer that connects.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Listener(Generic[Peer]):
         return self._socket.getsockname()[1] if self._socket else 0
 
     def tick(self, now_us: int) -> None:
-        """Bind or take callers in again if that failed; called a few times a second."""
+        """Bind or accept again if that failed; called a few times a second."""
         if now_us < self._retry_us or (self._socket and not self.reason):
             return
         self._retry_us = now_us + RETRY_US
@@ -64,29 +64,29 @@ class Listener(Generic[Peer]):
         self._loop.add_reader(self._socket, self._on_readable, self._socket)
 
     def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options of the same place, for the clients that are there too."""
+        """Apply changed options of the same endpoint, to its clients too."""
         self.endpoint = endpoint
         for client in self._clients.values():
             client.reconfigure(endpoint)
 
     def close(self) -> None:
-        """Part from all clients and close the port."""
+        """Drop all clients and close the port."""
         for client in list(self._clients.values()):
             self.leave(client)
         self._shut()
 
     def fail(self, error: Exception) -> None:
-        """Close the port after an error that nobody foresaw; the tick opens it again."""
+        """Close the port after an unexpected error; `tick` reopens it."""
         self._complain(error)
         self._shut()
 
     def leave(self, client: Peer) -> None:
-        """Part from one client."""
+        """Drop one client."""
         self._clients.pop(client.client_id, None)
         self._context.vanish(client)
 
     def stats(self) -> ListenerStats:
-        """Describe the port at this moment."""
+        """Return the port's present figures."""
         return ListenerStats(
             name=self.endpoint.name,
             endpoint=self.endpoint.url,

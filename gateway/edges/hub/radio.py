@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 READ_BYTES: Final = 4096
 AHEAD_US: Final = 30_000
-"""What may lie in the driver's buffer: enough to keep the line busy between two wake-ups."""
+"""Most in the driver's buffer: enough to keep the line busy between two wake-ups."""
 QUEUE_S: Final = 1.0
 """What may wait, as time on the line; older telemetry is of no use on a radio."""
 MIN_QUEUE_BYTES: Final = 2048
@@ -39,7 +39,7 @@ class RadioClient(Client):
     _timer: asyncio.TimerHandle | None = None
 
     def __post_init__(self) -> None:
-        """Begin without a port."""
+        """Start without a port."""
         super().__post_init__()
         baud = self.endpoint.port
         self._outbox = Outbox(max(MIN_QUEUE_BYTES, round(QUEUE_S * baud / BITS_PER_BYTE)))
@@ -81,7 +81,7 @@ class RadioClient(Client):
         self.context.greet(self)
 
     def close(self) -> None:
-        """Close the port; what waits is lost."""
+        """Close the port; waiting frames are lost."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -115,7 +115,7 @@ class RadioClient(Client):
                 return
 
     def _write(self, port: serial.Serial) -> bool:
-        """Write one frame; where the driver is full, wait for it."""
+        """Write one frame; if the driver is full, wait for it."""
         if not self._partial:
             waiting = self._outbox.pop()
             if waiting is None:

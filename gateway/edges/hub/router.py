@@ -1,7 +1,7 @@
-"""What clients say, and whom it concerns: our vehicles, other systems, or nobody.
+"""Routing of clients' frames: to our vehicles, to other systems, or nowhere.
 
-Only trusted clients teach the router anything and only theirs is passed on. What the others send
-reaches our vehicles, as a request that may be answered, and changes nothing that anybody else sees.
+Only frames of trusted clients enter the routing tables and are forwarded. Frames of the others
+reach our vehicles, as requests that may be answered, and change nothing that other clients see.
 """
 
 import asyncio
@@ -29,28 +29,28 @@ from gateway.wire.mavlink_splitter import (
 )
 
 MAX_EXPRESS: Final = 1024
-"""Kinds of frame a client; beyond a few hundred they are forged."""
+"""Kinds of frame per client; beyond a few hundred they are forged."""
 MAX_CLAIMS: Final = 8
-"""Systems that are shown of an untrusted client."""
+"""Systems that are shown for an untrusted client."""
 
 
 class Router:
-    """Pass each received frame on.
+    """Route each received frame.
 
     Parameters
     ----------
     clients : mapping of int to Client
         All clients by id, as they are at any time.
     fanout : Fanout
-        Gives frames to them.
+        Sends frames to them.
     vehicles : OwnVehicles
         Ours.
     probe : RoundTrip
-        Reads answers to questions of ours.
+        Reads answers to our round-trip requests.
     on_frame : callable
         Takes requests to our vehicles.
     on_foreign : callable, optional
-        Sees each frame that is passed on.
+        Called with each frame that is forwarded.
     now_us : callable
         The gateway clock.
     """
@@ -87,7 +87,7 @@ class Router:
 
     @property
     def forwarded(self) -> int:
-        """Frames of other systems that were passed on."""
+        """Frames of other systems that were forwarded."""
         self.settle_express()
         return self._forwarded
 
@@ -100,14 +100,14 @@ class Router:
         return self._links.group(client_id)
 
     def charge(self, client_id: int | None, size: int) -> None:
-        """Let a client pay for a frame to it, or for one to all if it has just asked for it."""
+        """Charge a client for a frame to it, or for one to all that it has just requested."""
         payer = self._serving if client_id is None else client_id
         if payer is not None:
             copies = len(self._clients) if client_id is None else 1
             self._requests.charge(payer, size * copies)
 
     def tick(self, now_us: int) -> None:
-        """Part links of which no copies come, thin what is too much for a narrow one."""
+        """Separate links without copies, and thin the frames to narrow links."""
         self._links.expire(now_us)
         self.settle_express()
         if self._fanout.thin(now_us):
@@ -117,7 +117,7 @@ class Router:
             self.forget_express()
 
     def reconfigure(self, client: Client) -> None:
-        """Let a client's changed options hold: what it taught while it was trusted, if it was."""
+        """Apply a client's changed options; one no longer trusted leaves the routing tables."""
         self.forget_express()
         if client.trusted:
             self._claims.forget(client.client_id)
@@ -126,7 +126,7 @@ class Router:
             self._links.forget(client.client_id)
 
     def forget(self, client_id: int) -> None:
-        """Forget what a client that has gone has said."""
+        """Forget everything about a client that has gone."""
         self.forget_express()
         self._table.forget(client_id)
         self._claims.forget(client_id)
@@ -134,13 +134,13 @@ class Router:
         self._requests.forget(client_id)
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering."""
         for handle in (self._turn, self._pause):
             if handle is not None:
                 handle.cancel()
 
     def deliver(self, client: Client, frame: bytes, now_us: int) -> None:
-        """Take one frame that a client received, and pass it on to whom it concerns."""
+        """Route one frame received from a client."""
         origin = origin_of(frame)
         if self._vehicles.is_own(origin, now_us) or origin == self._probe.origin:
             self.looped += 1
@@ -161,7 +161,7 @@ class Router:
             and self._is_copy(client, origin, frame)
         )
         if is_of_probe(frame):
-            # Of each link on its own, copies or not, and no further.
+            # For each link separately, copies or not, and never forwarded.
             self._ask(client, frame, forwarded=False)
         elif is_copy:
             return
@@ -171,7 +171,7 @@ class Router:
             self._route_broadcast(client, frame, table.is_station(origin), now_us)
 
     def forget_express(self, origin: Origin | None = None) -> None:
-        """Judge every frame, or every frame of one system, anew: something has changed."""
+        """Discard the fast paths, or those of one system, because something has changed."""
         self.settle_express()
         if origin is None:
             for client in self._express_sources:
@@ -193,7 +193,7 @@ class Router:
                     self._fanout.meter(key, int.from_bytes(key[2:5], "little"), frames, size)
 
     def _is_copy(self, client: Client, origin: Origin, frame: bytes) -> bool:
-        """Note a frame of a system that is heard by several ways; return whether it was here."""
+        """Note a frame of a system that is heard by several paths; return whether it is a copy."""
         client_id, now_us = client.client_id, self._now_us()
         since_us = self._table.since_us(client_id, origin)
         first = self._guard.first_way(frame, origin, client_id, since_us, now_us)
@@ -212,7 +212,7 @@ class Router:
         if self._links.note(first, client.client_id, now_us):
             self._fanout.align(self._links.group(client.client_id))
             if for_us:
-                # What was asked first has been answered on one link only.
+                # The first request has been answered on one link only.
                 self._ask(client, frame, forwarded=False)
 
     def _route_addressed(self, client: Client, frame: bytes, now_us: int) -> None:
@@ -245,7 +245,7 @@ class Router:
             self._open_express(client, frame, now_us)
 
     def _open_express(self, client: Client, frame: bytes, now_us: int) -> None:
-        """Let the next frames of this kind take the short way, if all of them go the same one."""
+        """Set up the fast path for frames of this kind, if all of them go to the same clients."""
         key, origin = key_of(frame), origin_of(frame)
         takers = self._fanout.takers(frame, client.client_id)
         if takers is None or key in client.express or len(client.express) >= MAX_EXPRESS:
@@ -265,7 +265,7 @@ class Router:
             self._on_foreign(frame)
 
     def _ask(self, client: Client, frame: bytes, *, forwarded: bool) -> None:
-        """Let our vehicles answer a request when it is its turn."""
+        """Queue a request to our vehicles."""
         incoming = Incoming(client.client_id, frame, client.trusted, forwarded)
         if not self._requests.offer(incoming, self._now_us()):
             self.unserved += 1
@@ -273,7 +273,7 @@ class Router:
             self._serve()
 
     def _serve(self) -> None:
-        """Answer one request; the next one only after what else has come meanwhile."""
+        """Answer one request; the next one only after other events."""
         self._turn = None
         if self._pause is not None:
             self._pause.cancel()
@@ -295,7 +295,7 @@ class Router:
             self._serving = None
 
     def _answer_probe(self, incoming: Incoming, now_us: int) -> bool:
-        """Answer another gateway's question about this link; return whether it was one."""
+        """Answer another gateway's round-trip request; return whether it was one."""
         client = self._clients.get(incoming.client_id)
         systems = self._vehicles.systems(now_us)
         if not is_of_probe(incoming.frame):

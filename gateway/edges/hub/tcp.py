@@ -1,6 +1,6 @@
 """TCP to clients and sources, with a bounded queue in front of each connection.
 
-A stalled client fills its own queue and loses its own oldest telemetry; the kernel ends the
+A stalled client fills its own queue and loses its own oldest telemetry; the kernel closes the
 connection when nothing was acknowledged for long.
 """
 
@@ -18,15 +18,15 @@ from gateway.routing.outbox import Numbering, Outbox
 from gateway.wire.mavlink_splitter import MavlinkSplitter
 
 CHUNK_BYTES: Final = 4096
-"""Joined into one write while a queue drains; and read at once."""
+"""Joined into one write while a queue drains; also read at once."""
 READ_BUDGET: Final = 16
 """Chunks taken at one wake-up, so that one flooding peer cannot starve the others."""
 ACCEPT_BUDGET: Final = 16
-"""Callers taken in at one wake-up."""
+"""Connections accepted at one wake-up."""
 USER_TIMEOUT_MS: Final = 30_000
-"""A peer that acknowledges nothing for so long is gone; a stopped one may come back sooner."""
+"""A peer that acknowledges nothing for so long is gone; a paused one may come back sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
-"""Small, so that what waits does so in the queue, where the old can make room for the new."""
+"""Small, so that frames wait in our queue, where old ones make room for new ones."""
 ACCEPT_BACKLOG: Final = 128
 """A thousand pages that connect again at once find room within a few wake-ups."""
 
@@ -39,7 +39,7 @@ class StreamClient(Client):
     _socket: socket.socket | None = None
 
     def __post_init__(self) -> None:
-        """Begin without a connection."""
+        """Start without a connection."""
         super().__post_init__()
         self._outbox = Outbox(self.context.settings.queue_bytes)
         self._numbering = Numbering(self.context.is_own, self.context.seal)
@@ -76,12 +76,12 @@ class StreamClient(Client):
         self.begin()
 
     def begin(self) -> None:
-        """Take up the talk on a connection that has just been made."""
+        """Start the protocol on a new connection."""
         self.become("open")
         self.context.greet(self)
 
     def close(self) -> None:
-        """Close the connection; what waits is lost."""
+        """Close the connection; waiting frames are lost."""
         if self._socket is not None:
             self.loop.remove_reader(self._socket)
             self.loop.remove_writer(self._socket)
@@ -99,7 +99,7 @@ class StreamClient(Client):
         return frames
 
     def accept(self, data: bytes, now_us: int) -> None:
-        """Take some bytes of the connection."""
+        """Process received bytes."""
         self.receive(self._splitter.feed(data), len(data), now_us)
 
     def _drop(self, frames: int) -> None:
@@ -107,7 +107,7 @@ class StreamClient(Client):
         self.counters.sent -= frames
 
     def _write(self, sock: socket.socket, data: bytes) -> bool:
-        """Write; keep what the socket does not take and wait for room."""
+        """Write; keep what the socket does not accept and wait for room."""
         try:
             taken = sock.send(data)
         except BlockingIOError:
@@ -153,7 +153,7 @@ class StreamClient(Client):
 
 
 class TcpClient(StreamClient):
-    """A connection that the gateway makes, and makes again when it breaks."""
+    """A connection that the gateway makes, and remakes when it breaks."""
 
     _retry_us = 0
     _task: asyncio.Task[None] | None = None
@@ -183,7 +183,7 @@ class TcpClient(StreamClient):
                 if await self._connect_to(family, address):
                     break
         except (OSError, ValueError) as error:
-            # A name that cannot be one raises a ValueError.
+            # An invalid name raises a ValueError.
             self.become("resolving", error)
         finally:
             self._task = None
@@ -194,7 +194,7 @@ class TcpClient(StreamClient):
             sock.setblocking(False)
             await self.loop.sock_connect(sock, address)
             if sock.getsockname() == sock.getpeername():
-                # A closed local port may be drawn as our own and so connect to itself.
+                # A closed local port may be chosen as our own and so connect to itself.
                 raise ConnectionRefusedError
         except OSError as error:
             sock.close()
@@ -218,16 +218,16 @@ class TcpPeer(StreamClient):
     leave: Callable[["TcpPeer"], None] = field(kw_only=True)
 
     def broke(self) -> None:
-        """Leave for good; the client may connect again."""
+        """Remove the client; it may connect again."""
         self.leave(self)
 
     def fail(self, error: Exception) -> None:  # noqa: ARG002
-        """Leave for good after an error that nobody foresaw."""
+        """Remove the client after an unexpected error."""
         self.leave(self)
 
 
 class StreamListener(Listener[Peer]):
-    """A port that takes connections in."""
+    """A port that accepts connections."""
 
     def _bind(self) -> socket.socket:
         host, port = self.endpoint.host, self.endpoint.port
@@ -260,7 +260,7 @@ class StreamListener(Listener[Peer]):
             self._admit(connection, host_and_port(*address[:2]))
 
     def _has_room(self, host: str) -> bool:
-        """Return whether there is room for a newcomer, or somebody who makes room."""
+        """Return whether there is room for a newcomer, after removing another if needed."""
         most = self._context.settings.max_clients
         if len(self._clients) < most:
             return True

@@ -17,7 +17,7 @@ ClientMaker = Callable[[HubContext, int, Endpoint], Client]
 
 
 def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
-    # Not above, nor below: most gateways have no WebSocket, and its library takes its time.
+    # Imported here: most gateways have no WebSocket, and its library is slow to import.
     from gateway.edges.hub.web.websocket import WsClient
 
     return WsClient(context, client_id, endpoint)
@@ -48,15 +48,15 @@ LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
 
 
 def add_endpoint_kind(word: str, make: ClientMaker) -> None:
-    """Let endpoint URLs begin with one more word.
+    """Add a kind of endpoint URL.
 
     Parameters
     ----------
     word : str
-        Before the URL's first colon; what follows, up to the options, is `Endpoint.host`.
+        The part before the URL's first colon; what follows, up to the options, is `Endpoint.host`.
     make : callable
-        Makes the client of one endpoint from the hub, the client's id and the endpoint: a
-        subclass of `Client` is called just so.
+        Creates the client of one endpoint from the hub, the client's id and the endpoint; a
+        subclass of `Client` has this signature.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""UDP to one peer each, on a connected socket.
+"""UDP to a single peer, on a connected socket.
 
-A connected socket costs a fifth less per datagram than an addressed one, the kernel reports an
-ICMP refusal on exactly the socket that it concerns, and a send buffer of its own keeps a peer
-behind a slow interface from filling everybody's.
+A connected socket costs a fifth less per datagram than `sendto`, the kernel reports an ICMP
+refusal on the socket that it concerns, and with its own send buffer a peer behind a slow interface
+does not fill that of others.
 """
 
 import asyncio
@@ -21,17 +21,17 @@ from gateway.wire.mavlink_splitter import is_frame, split_datagram
 NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
-"""Datagrams taken at one wake-up, so that one flooding peer cannot starve the others."""
+"""Datagrams read at one wake-up, so that one flooding peer cannot starve the others."""
 RESOLVE_AGAIN_US: Final = 60 * US_PER_S
 """Names of home networks change their address at most some times a day."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """The default holds only about 256 small datagrams; a parameter upload bursts more."""
 BACKLOG_DATAGRAMS: Final = 256
-"""Waiting behind a full socket buffer; what is older is of no use to a ground station."""
+"""Waiting for a full socket buffer; older ones are of no use to a ground station."""
 
 
 class DatagramClient(Client):
-    """A peer behind a datagram socket; what is common to unicast, broadcast and multicast."""
+    """A peer behind a datagram socket; base of unicast, broadcast and multicast."""
 
     refused_us: int | None = None
     _socket: socket.socket | None = None
@@ -39,14 +39,14 @@ class DatagramClient(Client):
     _is_gathering = False
 
     def __post_init__(self) -> None:
-        """Begin without a socket."""
+        """Start without a socket."""
         super().__post_init__()
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
         self._packer = _packer(self.endpoint)
 
     @property
     def is_direct(self) -> bool:
-        """Whether a frame may go to `write` without further ado."""
+        """Whether a frame may be passed to `write` directly."""
         return self._packer is None
 
     @property
@@ -55,7 +55,7 @@ class DatagramClient(Client):
         return len(self._backlog)
 
     def transmit(self, frame: bytes, message_id: int) -> None:  # noqa: ARG002
-        """Send one frame; count it as dropped if the network does not take it."""
+        """Send one frame; count it as dropped if the network refuses it."""
         if self._packer is not None:
             self._pack(frame)
             return
@@ -80,7 +80,7 @@ class DatagramClient(Client):
             self._socket = None
 
     def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options, packing included."""
+        """Apply changed options, packing included."""
         self._flush()
         self._packer = _packer(endpoint)
         super().reconfigure(endpoint)
@@ -93,7 +93,7 @@ class DatagramClient(Client):
         self.loop.add_reader(sock, self._on_readable, sock)
 
     def accept(self, data: bytes, now_us: int) -> None:
-        """Take one datagram that this peer sent."""
+        """Process one datagram of this peer."""
         if self.state != "open":
             self.revive()
         if not is_frame(data):
@@ -108,12 +108,12 @@ class DatagramClient(Client):
         self.context.deliver(self, data, now_us)
 
     def revive(self) -> None:
-        """Note that the peer is there after all."""
+        """Note that the peer is reachable after all."""
         self.become("open")
         self.refused_us = None
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
-        """Judge a failed send that will be counted as sent all the same."""
+        """Handle a failed send whose frame will still be counted as sent."""
         self._count_sent(-1, -len(data))
         self._recover(data, 1, error)
 
@@ -145,7 +145,7 @@ class DatagramClient(Client):
         self.counters.bytes_sent += size
 
     def _recover(self, data: bytes, frames: int, error: OSError) -> None:
-        """Judge a failed send: wait for room, try again, or give the frames up."""
+        """Handle a failed send: wait for room, retry, or drop the frames."""
         if isinstance(error, BlockingIOError) and self._socket is not None:
             self.write = self._wait
             self.loop.add_writer(self._socket, self._on_writable, self._socket)
@@ -163,7 +163,7 @@ class DatagramClient(Client):
         self.counters.dropped += frames
 
     def _sends_after_refusal(self, data: bytes) -> bool:
-        """Send again: a refusal that is told now belongs to an earlier datagram."""
+        """Send again: a refusal reported now belongs to an earlier datagram."""
         self._note_refusal()
         try:
             self.write(data)
@@ -177,7 +177,7 @@ class DatagramClient(Client):
         self.refused_us = self.context.now_us()
 
     def _wait(self, data: bytes) -> None:
-        """Take the place of the socket while its buffer is full; the oldest makes room."""
+        """Queue datagrams while the socket buffer is full; the oldest makes room."""
         if len(self._backlog) == BACKLOG_DATAGRAMS:
             self.counters.dropped += 1
             self.counters.sent -= 1
@@ -215,11 +215,11 @@ class DatagramClient(Client):
 
 
 class UdpClient(DatagramClient):
-    """A UDP peer at a configured place.
+    """A UDP peer at a configured address.
 
     A name may resolve only later, or to another address later: it is looked up again while nothing
-    is heard from there. Of several addresses, as `localhost` has, one that refuses gives way to the
-    next.
+    is received from there. Of several addresses, as `localhost` has, the next is tried when one
+    refuses.
     """
 
     _port = 0
@@ -228,13 +228,13 @@ class UdpClient(DatagramClient):
     _task: asyncio.Task[None] | None = None
 
     def __post_init__(self) -> None:
-        """Begin without an address."""
+        """Start without an address."""
         super().__post_init__()
         self._places: list[tuple[int, tuple[Any, ...]]] = []
         self.become("resolving")
 
     def tick(self, now_us: int) -> None:
-        """Open the socket or look the name up again; forget a refusal that was not repeated."""
+        """Open the socket or look the name up again; clear a refusal that was not repeated."""
         if now_us < self._retry_us:
             return
         self._retry_us = now_us + RETRY_US
@@ -265,7 +265,7 @@ class UdpClient(DatagramClient):
         try:
             found = await self.loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         except (OSError, ValueError) as error:
-            # A name that cannot be one raises a ValueError.
+            # An invalid name raises a ValueError.
             if self._socket is None:
                 self.become("resolving", error)
         else:
@@ -277,7 +277,7 @@ class UdpClient(DatagramClient):
             self._task = None
 
     def _connect(self) -> None:
-        """Use the first place that there is a way to."""
+        """Use the first address that has a route."""
         super().close()
         for family, address in self._places:
             try:

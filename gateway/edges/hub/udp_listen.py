@@ -1,8 +1,8 @@
-"""A UDP port that serves everybody who speaks MAVLink to it.
+"""A UDP port that serves everybody who sends MAVLink to it.
 
-The port's own socket hears only strangers: each new client gets a connected socket on the same
-port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allows that, and is set
-only after the bind, so that a second gateway on the same port still fails loudly.
+The port's own socket receives only from unknown peers: each new client gets a connected socket on
+the same port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allows that,
+and is set only after the bind, so that a second gateway on the same port still fails loudly.
 """
 
 import itertools
@@ -19,12 +19,12 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
 
 IP_PKTINFO: Final = 8
-"""Not exported by `socket` before Python 3.14; tells to which of our addresses a client spoke."""
+"""Not exported by `socket` before Python 3.14; gives the local address of a datagram."""
 ANCILLARY_BYTES: Final = 64
 STRANGERS: Final = 4
-"""Taken at one wake-up: to admit one takes as long as to serve the others several times."""
+"""Admitted at one wake-up: admitting one takes as long as serving the others several times."""
 PARTINGS: Final = 32
-"""From clients that have died, at one tick; they cost nothing until it is their turn."""
+"""Dead clients removed at one tick; they cost nothing until then."""
 
 Address = tuple[str | int, ...]
 
@@ -33,12 +33,12 @@ class UdpPeer(DatagramClient):
     """A client of a listening port."""
 
     def revive(self) -> None:
-        """Note that the client is there after all."""
+        """Note that the client is reachable after all."""
         self._end_hold()
         super().revive()
 
     def tick(self, now_us: int) -> None:
-        """Call trouble off that was not repeated; try a client again that refused."""
+        """Clear a problem that was not repeated; retry a client that refused."""
         if self._socket is None:
             return
         self._end_hold()
@@ -46,7 +46,7 @@ class UdpPeer(DatagramClient):
             self.become("open")
 
     def _note_refusal(self) -> None:
-        """Hold back until the next tick: a client that is dead costs more than one that lives."""
+        """Stop sending until the next tick: a dead client costs more than a live one."""
         super()._note_refusal()
         if self.write == self._direct:
             self.write = self._hold
@@ -61,7 +61,7 @@ class UdpPeer(DatagramClient):
             self.write = self._direct
 
     def has_died(self, now_us: int) -> bool:
-        """Return whether it failed, or is silent and its machine says that nobody listens."""
+        """Return whether it failed, or is silent and its machine reports a closed port."""
         if self._socket is None:
             return True
         heard_us = self.heard_us if self.heard_us is not None else self.since_us
@@ -77,7 +77,7 @@ class UdpListener(Listener[UdpPeer]):
         super().__init__(context, endpoint)
 
     def tick(self, now_us: int) -> None:
-        """Bind again if that failed, and part from clients that have gone."""
+        """Bind again if that failed, and remove clients that have gone."""
         super().tick(now_us)
         settings = self._context.settings
         self.table.max_clients = settings.max_clients
@@ -114,7 +114,7 @@ class UdpListener(Listener[UdpPeer]):
             self._clients[presence.client_id].accept(data, self._context.now_us())
 
     def _admit(self, data: bytes, address: Address, local_host: str) -> Presence | None:
-        """Take in a new client if what it says is MAVLink and there is room."""
+        """Admit a new client if it sends MAVLink and there is room."""
         first = next((event for event in split_datagram(data) if isinstance(event, bytes)), None)
         if first is None:
             return None
@@ -139,7 +139,7 @@ class UdpListener(Listener[UdpPeer]):
         try:
             sock.connect(address)
         except OSError:
-            # It claims to come from where there is no way to.
+            # There is no route to the address that it claims.
             sock.close()
             self.table.remove(presence)
             return None
@@ -156,12 +156,12 @@ class UdpListener(Listener[UdpPeer]):
         return presence
 
     def _note_speakers(self) -> None:
-        """Tell the table when its clients, which have sockets of their own, were last heard."""
+        """Update the table with when its clients, which have their own sockets, were last heard."""
         for presence in self.table.presences():
             presence.heard_us = self._clients[presence.client_id].heard_us or presence.heard_us
 
     def _return_strays(self, sock: socket.socket, peer: Address, local_host: str) -> None:
-        """Take what others sent between the bind and the connect of a client's socket."""
+        """Process datagrams of others that came between bind and connect of a client's socket."""
         for _ in range(READ_BUDGET):
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)

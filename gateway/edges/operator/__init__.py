@@ -1,1 +1,1 @@
-"""What the person who runs the gateway sees and steers it by."""
+"""Status and control of the gateway for its operator."""

@@ -1,4 +1,4 @@
-"""Which control socket a command is for: the one that was named, the user's own, the service's."""
+"""Choose a command's control socket: the named one, the user's own, or the service's."""
 
 import os
 from pathlib import Path
@@ -29,17 +29,17 @@ def find_socket(name: str) -> Path:
     Returns
     -------
     Path
-        The user's own where one runs, otherwise the system service's.
+        The user's own if one runs, otherwise the system service's.
 
     Raises
     ------
     ControlError
-        If none runs, several do, or the one that does may not be asked.
+        If none runs, several do, or the running one denies access.
     """
     own = live_sockets(name)
     if len(own) > 1:
         listed = ", ".join(map(str, own))
-        raise ControlError(f"several run: say which one by --socket: {listed}")
+        raise ControlError(f"several run: choose one by --socket: {listed}")
     if own:
         return own[0]
     service = SERVICE_FOLDER / f"{name}.sock"
@@ -47,20 +47,20 @@ def find_socket(name: str) -> Path:
         if os.access(service, os.W_OK):
             return service
         text = f"the service's socket {service} is for the group {GROUP}: "
-        raise ControlError(text + f"`sudo usermod -aG {GROUP} $USER`, then log in anew")
+        raise ControlError(text + f"`sudo usermod -aG {GROUP} $USER`, then log in again")
     starter = STARTERS[name]
     text = f"nothing runs that could do this: start {starter} first (no socket {socket_path(name)})"
     raise ControlError(text)
 
 
 def live_sockets(name: str) -> list[Path]:
-    """List the sockets of this user at which somebody listens."""
+    """List the sockets of this user on which a process listens."""
     listening = _listening()
     return [path for path in numbered(socket_path(name)) if path in listening]
 
 
 def _listening() -> set[Path]:
-    """Read from the kernel where somebody listens; asking there would make a connection each."""
+    """Read the listening sockets from the kernel; trying each would open a connection."""
     lines = SOCKETS.read_text(encoding="utf-8", errors="replace").splitlines()[1:]
     found = (line.split(maxsplit=7) for line in lines)
     return {Path(words[7]) for words in found if len(words) == 8 and words[3] == ACCEPTS}

@@ -1,8 +1,8 @@
-"""The control socket: how the command line talks to a gateway that runs.
+"""The control socket, by which the command line talks to a running gateway.
 
-A Unix socket that only the user (and root) can open; a system service's, its group too. One line of
-JSON asks, one line answers; docs/control.md describes every verb. Whoever offers a verb registers a
-handler and the shape of its parameters, which are checked before the handler sees them.
+A Unix socket that only the user (and root) can open; a system service's, its group too. Each
+request and each reply is one line of JSON; docs/control.md describes every verb. Each verb has a
+registered handler and a parameter type, which is checked before the handler is called.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_LINE: Final = 64 << 10
-"""A request is some words; a status of many clients some thousand bytes."""
+"""A request is short; a status of many clients has some thousand bytes."""
 MAX_PATH: Final = 107
 """Bytes of `sun_path`, less the zero at its end."""
 MAX_CONNECTIONS: Final = 16
@@ -32,25 +32,25 @@ FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
 SERVICE_SOCKET_RIGHTS: Final = 0o660
 SERVICE_FOLDER: Final = Path("/run/mavgate")
-"""What the unit has systemd make."""
+"""Created by systemd for the unit."""
 GROUP: Final = "mavgate"
-"""Whose members may steer the service."""
+"""Group whose members may control the service."""
 MOST_GATEWAYS: Final = 9
-"""Of one user that can be told apart: `run.sock`, `run-2.sock`, …"""
+"""Gateways of one user: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
 STARTERS: Final = {
     "run": "`mavgate run` or `mavgate demo`",
     "play": "`mavgate play`",
     "fleet": "`mavgate fleet`",
 }
-"""What opens which socket."""
+"""The command that opens each socket."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 """Linux `struct ucred`: process, user, group."""
 
 
 class ControlError(Exception):
-    """A request that cannot be granted, or nobody to ask; the text says why."""
+    """A request that was refused, or no gateway to send it to; the text says why."""
 
 
 class NoParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,12 +73,12 @@ Handler = Callable[[Any], Awaitable[object] | object]
 
 
 class ControlServer:
-    """Answers requests on a Unix socket.
+    """Answer requests on a Unix socket.
 
     Parameters
     ----------
     path : Path
-        Where the socket is made; where another gateway listens there, the next number is taken.
+        Where the socket is created; if another gateway listens there, with the next number.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,7 +95,7 @@ class ControlServer:
         params: type[Params],
         handler: Callable[[Params], Awaitable[object] | object],
     ) -> None:
-        """Offer a verb.
+        """Register a verb.
 
         Parameters
         ----------
@@ -110,14 +110,14 @@ class ControlServer:
         self._verbs[verb] = (params, handler)
 
     async def start(self) -> None:
-        """Make the socket and listen.
+        """Create the socket and listen.
 
         Raises
         ------
         ControlError
-            If the socket cannot be made, or as many gateways as can be told apart run already.
+            If the socket cannot be created, or `MOST_GATEWAYS` run already.
         """
-        # Not above: those who only ask need none of it, and it is half of what a command costs.
+        # Imported here: clients do not need it, and it is half of a command's start-up time.
         import asyncio
 
         check_length(self.path)
@@ -179,14 +179,14 @@ class ControlServer:
             writer.close()
 
     def _is_allowed(self, writer: asyncio.StreamWriter) -> bool:
-        """Check who is at the other end; the folder's rights alone may be lax."""
+        """Check the peer's user; the folder's mode alone may be too permissive."""
         user, groups = peer_of(writer)
         is_member = self._for_group and os.getgid() in groups
         return user in (0, os.getuid()) or is_member
 
 
 def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
-    """Tell by the kernel's word the user at the other end, and the user's groups."""
+    """Return the peer's user id and group ids, from the kernel."""
     link = writer.get_extra_info("socket")
     data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     _, user, group = _CREDENTIALS.unpack(data)
@@ -198,13 +198,13 @@ def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
 
 
 def numbered(path: Path) -> list[Path]:
-    """List the names under which the gateways of one user make their sockets."""
+    """List the socket paths of one user's gateways."""
     others = [path.with_stem(f"{path.stem}-{n}") for n in range(2, MOST_GATEWAYS + 1)]
     return [path, *others]
 
 
 def _first_free(path: Path) -> Path:
-    """Find a name, and remove the socket of a gateway that was killed; never that of a live one."""
+    """Find a free path, and remove the socket of a killed gateway; never that of a live one."""
     for candidate in numbered(path):
         if not candidate.is_socket():
             return candidate
@@ -218,7 +218,7 @@ def _first_free(path: Path) -> Path:
 
 
 def check_length(path: Path) -> None:
-    """Check that the kernel takes a path for a socket; raises ControlError if not."""
+    """Check that a path is short enough for a socket; raises ControlError if not."""
     size = len(os.fsencode(path))
     if size > MAX_PATH:
         raise ControlError(
@@ -228,7 +228,7 @@ def check_length(path: Path) -> None:
 
 
 def socket_path(name: str) -> Path:
-    """Return where a kind of gateway makes its socket.
+    """Return where a kind of gateway creates its socket.
 
     Parameters
     ----------
@@ -238,8 +238,8 @@ def socket_path(name: str) -> Path:
     Returns
     -------
     Path
-        In the folder that systemd made for a service, in the user's runtime folder, or in the state
-        folder where there is none.
+        In the folder that systemd created for a service, in the user's runtime folder, or in the
+        state folder if there is none.
     """
     if service := os.environ.get("RUNTIME_DIRECTORY"):
         return Path(service.split(":")[0]) / f"{name}.sock"
@@ -251,7 +251,7 @@ def socket_path(name: str) -> Path:
 def request(
     path: Path, verb: str, params: dict[str, Any] | None = None, *, timeout_s: float | None = None
 ) -> Any:
-    """Ask a gateway that runs, and wait for its answer.
+    """Send a request to a running gateway, and wait for its reply.
 
     Parameters
     ----------
@@ -267,12 +267,12 @@ def request(
     Returns
     -------
     object
-        The result, as JSON has it.
+        The result, decoded from JSON.
 
     Raises
     ------
     ControlError
-        If nobody listens, or the request is refused.
+        If no gateway listens, or the request is refused.
     """
     check_length(path)
     line = msgspec.json.encode({"verb": verb, "params": params or {}}) + b"\n"

@@ -32,7 +32,7 @@ class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Url(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An endpoint, as the settings write it."""
+    """An endpoint, as in the settings."""
 
     url: str
 
@@ -44,7 +44,7 @@ class MarkParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lon_deg: float | None = None
     alt_amsl_m: float | None = None
     vehicle_id: int | None = None
-    """The one aircraft that it is for; all without it."""
+    """The aircraft to mark it for; all by default."""
 
 
 class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,7 +54,7 @@ class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class To(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A moment, written as people write it; see `parse_moment`."""
+    """A moment as text; see `parse_moment`."""
 
     to: str
 
@@ -83,14 +83,14 @@ class RecorderVerbs:
     Parameters
     ----------
     recorder : Recorder
-        What obeys.
+        The object to control.
     """
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
 
     def register(self, server: ControlServer) -> None:
-        """Offer the verbs on a socket."""
+        """Register the verbs on a socket."""
         server.register("record.start", NoParams, self._start)
         server.register("record.stop", NoParams, self._stop)
         server.register("record.status", NoParams, self._status)
@@ -119,7 +119,7 @@ class RecorderVerbs:
             raise ControlError(str(error)) from error
         return self._recorder.status()
 
-    # A folder of thousands of files takes its time, which the telemetry has not.
+    # A folder of thousands of files takes long, and must not delay the telemetry.
     async def _delete(self, params: Named) -> Recording:
         folder = self._recorder.folder
         try:
@@ -152,7 +152,7 @@ class AircraftVerbs:
         self._mark = mark
 
     def register(self, server: ControlServer) -> None:
-        """Offer the verb on a socket."""
+        """Register the verb on a socket."""
         server.register("mark", MarkParams, self._put)
 
     def _put(self, params: MarkParams) -> str:
@@ -175,11 +175,11 @@ class HubVerbs:
     Parameters
     ----------
     hub : Hub
-        Whose clients.
+        The hub.
     snapshot : callable
-        Describes the gateway at this moment.
+        Returns the present state of the gateway.
     reload : callable
-        Applies changed settings and tells how that went; raises ControlError.
+        Applies changed settings and returns a text; raises ControlError.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class HubVerbs:
         self._reload = reload
 
     def register(self, server: ControlServer) -> None:
-        """Offer the verbs on a socket."""
+        """Register the verbs on a socket."""
         server.register("status", NoParams, lambda _: self._snapshot())
         server.register("reload", NoParams, lambda _: self._reload())
         server.register("clients.list", NoParams, self._list)
@@ -221,14 +221,14 @@ class PlayerVerbs:
     Parameters
     ----------
     player : PlayerEdge
-        What obeys.
+        The object to control.
     """
 
     def __init__(self, player: PlayerEdge) -> None:
         self._player = player
 
     def register(self, server: ControlServer) -> None:
-        """Offer the verbs on a socket."""
+        """Register the verbs on a socket."""
         server.register("seek", To, self._seek)
         server.register("play.pause", NoParams, self._pause)
         server.register("play.resume", NoParams, self._resume)

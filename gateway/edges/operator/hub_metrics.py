@@ -1,4 +1,4 @@
-"""What Prometheus is told of the hub, and how families are made and written."""
+"""Prometheus metrics of the hub, and how families are built and written."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -16,25 +16,25 @@ Sample = tuple[Labels, float]
 CLIENT: Final = ("client", "name", "remote")
 LISTENER: Final = ("name", "endpoint")
 HUB_HELP: Final = {
-    "published": "MAVLink frames that the gateway made itself.",
-    "forwarded": "Frames of other systems, such as an autopilot, that were passed on.",
-    "duplicates": "Copies that came a second way and were dropped: two endpoints reach one peer.",
+    "published": "MAVLink frames of the gateway itself.",
+    "forwarded": "Frames of other systems, such as an autopilot, that were forwarded.",
+    "duplicates": "Copies by a second path, dropped: two endpoints reach one peer.",
     "looped": "Frames of ours that came back: an endpoint leads to a router that sends to us.",
-    "unroutable": "Frames for a system that nobody has heard of, or from one who may not ask.",
-    "unserved": "Requests given up since their client asks for more than its share.",
+    "unroutable": "Frames for an unknown system, or from a client that may not send to it.",
+    "unserved": "Requests dropped because their client exceeded its quota.",
 }
 CLIENT_COUNTERS: Final = (
     ("sent", "Frames sent to a client."),
-    ("dropped", "Frames given up: the client is too slow for them, or out of reach."),
-    ("unheard", "Frames for a port at which nobody listened, as before a station is started."),
+    ("dropped", "Frames dropped: the client is too slow for them, or out of reach."),
+    ("unheard", "Frames sent to a port on which nobody listened, as before a station is started."),
     (
         "bytes_sent",
-        "Bytes sent to a client; the rate against the width of its link tells its load.",
+        "Bytes sent to a client; the rate divided by the width of its link is its load.",
     ),
-    ("received", "Frames of a client."),
+    ("received", "Frames received from a client."),
     (
         "bytes_garbage",
-        "Bytes of a client that were no MAVLink: a wrong baud rate or another program.",
+        "Bytes from a client that were not MAVLink: a wrong baud rate or another program.",
     ),
 )
 
@@ -45,13 +45,13 @@ def text_of(found: Iterable[Metric]) -> str:
 
 
 def gauge(name: str, text: str, labels: Labels, samples: Iterable[Sample]) -> Metric:
-    """Make a gauge; its name begins with `mavgate_`."""
+    """Build a gauge; its name begins with `mavgate_`."""
     family = GaugeMetricFamily(f"mavgate_{name}", text, labels=labels)
     return _filled(family, samples)
 
 
 def counter(name: str, text: str, labels: Labels, samples: Iterable[Sample]) -> Metric:
-    """Make a counter; its samples are called by its name and `_total`."""
+    """Build a counter; its samples are named by its name and `_total`."""
     family = CounterMetricFamily(f"mavgate_{name}", text, labels=labels)
     return _filled(family, samples)
 
@@ -62,7 +62,7 @@ def hub_families(
     clients: tuple[ClientStats, ...],
     now_us: int,
 ) -> Iterator[Metric]:
-    """Describe the hub, its listening ports and its clients."""
+    """Yield the metrics of the hub, its listening ports and its clients."""
     yield from _hub(hub)
     yield from _listeners(listeners)
     yield from _clients(clients, now_us)
@@ -77,7 +77,7 @@ def _listeners(listeners: tuple[ListenerStats, ...]) -> Iterator[Metric]:
     ports = [((port.name, port.endpoint), port) for port in listeners]
     yield gauge(
         "listener_open",
-        "1 while a listening port takes clients; 0: another program has it.",
+        "1 while a listening port accepts clients; 0: another program has it.",
         LISTENER,
         [(labels, float(port.state == "open")) for labels, port in ports],
     )
@@ -89,7 +89,7 @@ def _listeners(listeners: tuple[ListenerStats, ...]) -> Iterator[Metric]:
     )
     yield counter(
         "listener_turned_away",
-        "Clients that found no room: see max_clients.",
+        "Clients turned away for lack of room: see max_clients.",
         LISTENER,
         [(labels, float(port.turned_away)) for labels, port in ports],
     )
@@ -143,7 +143,7 @@ def _filled(family: Any, samples: Iterable[Sample]) -> Metric:
 
 
 class _Moment(Collector):
-    """What was gathered of one moment, in place of a registry that counts by itself."""
+    """The metrics of one moment, in place of a registry that counts by itself."""
 
     def __init__(self, found: Iterable[Metric]) -> None:
         self._found = found

@@ -46,7 +46,7 @@ def keys_of(text: str) -> Iterator[str]:
 
 
 class Keyboard:
-    """The terminal that a command was started in; where there is none, nothing happens.
+    """The terminal of a command; without one, nothing happens.
 
     Parameters
     ----------
@@ -62,10 +62,10 @@ class Keyboard:
         self._before: list[Any] | None = None
 
     def start(self) -> None:
-        """Take the keys from now on; needs a running event loop."""
+        """Start reading keys; needs a running event loop."""
         try:
             fd = sys.stdin.fileno() if self._descriptor is None else self._descriptor
-            # A job in the background would be stopped for touching the terminal.
+            # A background job would be stopped for touching the terminal.
             if not os.isatty(fd) or os.tcgetpgrp(fd) != os.getpgrp():
                 return
             self._before = termios.tcgetattr(fd)
@@ -76,7 +76,7 @@ class Keyboard:
         asyncio.get_running_loop().add_reader(fd, self._read, fd)
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         if self._before is None or self._descriptor is None:
             return
         asyncio.get_running_loop().remove_reader(self._descriptor)

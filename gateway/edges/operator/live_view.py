@@ -1,9 +1,9 @@
 """The live view in the terminal: link, aircraft and clients at a glance.
 
-Tables that are wider than the terminal are broken into several below each other, so that all is
-legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates stand beside the aircraft.
-Where the rows do not suffice, the end is cut off; so what matters most comes first, and last the
-rates of the messages.
+Tables that are wider than the terminal are split into several below each other, so that all is
+legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates are beside the aircraft. If
+there are too few rows, the end is cut off; so the most important comes first, and the message
+rates last.
 """
 
 import logging
@@ -29,9 +29,9 @@ from gateway.units import US_PER_S
 SILENT_US: Final = 2 * US_PER_S
 LOG_LINES: Final = 5
 RATE_SNAPSHOTS: Final = 11
-"""Rates are told over so many views: a message of 1 Hz must not flicker between 0 and 2."""
+"""Rates are averaged over this many views: a message of 1 Hz must not flicker between 0 and 2."""
 RATE_NAME: Final = 22
-"""Letters of the longest usual name, so that names and figures stand below each other."""
+"""Letters of the longest usual name, so that names and figures are aligned."""
 
 SIDE_BY_SIDE: Final = 150
 """Columns of a terminal from which on two halves are wide enough."""
@@ -56,7 +56,7 @@ FLAG_WORDS: Final = (
 
 
 class RecentLog(logging.Handler):
-    """Keep the newest log lines: on the view's screen they have no other place."""
+    """Keep the newest log lines, to show them in the view."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class RecentLog(logging.Handler):
 
 
 class LiveView:
-    """Draw snapshots; keeps the last ones to tell rates."""
+    """Draw snapshots; keeps the last ones to compute rates."""
 
     def __init__(self) -> None:
         self.log = RecentLog()
@@ -79,7 +79,7 @@ class LiveView:
         self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
-        """Build the whole view of one moment.
+        """Build the view of one snapshot.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class LiveView:
 
 
 class _Halves:
-    """Two parts side by side where the terminal is wide, below each other elsewhere."""
+    """Two parts side by side in a wide terminal, below each other otherwise."""
 
     def __init__(self, left: RenderableType, right: RenderableType) -> None:
         self._left, self._right = left, right
@@ -132,9 +132,9 @@ class _Halves:
 
 
 class _Grid:
-    """A table that is broken into several below each other where it is too wide.
+    """A table that is split into several below each other if it is too wide.
 
-    The first column has the table's own name at its head, and stands in each of them.
+    The first column has the table's name as its heading, and is repeated in each of them.
     """
 
     def __init__(self, *heads: str) -> None:
@@ -142,7 +142,7 @@ class _Grid:
         self._rows: list[tuple[str | Text, ...]] = []
 
     def add_row(self, *cells: str | Text) -> None:
-        """Add a row, a cell a column."""
+        """Add a row, one cell per column."""
         self._rows.append(cells)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

@@ -1,8 +1,8 @@
-"""A bound on the log: whatever goes wrong, and however often, it does not fill the disk.
+"""A rate limit for the log, so that no repeated error fills the disk.
 
-A kind of line is the place in the code that writes it and, for an error nobody foresaw, the place
-that raised it. Of each kind a few lines at once are told and then one a second; the next one that
-is told says how many were not.
+A kind of line is the place in the code that writes it and, for an unexpected error, the place that
+raised it. Of each kind a few lines at once are written and then one a second; the next one written
+says how many were not.
 """
 
 import logging
@@ -22,8 +22,8 @@ Kind = tuple[str, int, str]
 @dataclass(slots=True)
 class _Kind:
     since_s: float
-    """Since when there has been a line to spare."""
-    untold: int = 0
+    """Since when another line is allowed."""
+    suppressed: int = 0
 
 
 class LogLimit(logging.Filter):
@@ -34,7 +34,7 @@ class LogLimit(logging.Filter):
         self._kinds: dict[Kind, _Kind] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a line is written; the first after a gap says how long the gap was."""
+        """Return whether a line is written; the first after a gap says how many were not."""
         if len(self._kinds) >= MAX_KINDS:
             self._kinds.clear()
         now_s = record.created
@@ -42,13 +42,13 @@ class LogLimit(logging.Filter):
         # A clock that was set back would silence a kind until it has caught up.
         kind.since_s = min(max(kind.since_s, now_s - BURST * REFILL_S), now_s)
         if now_s - kind.since_s < REFILL_S:
-            kind.untold += 1
+            kind.suppressed += 1
             return False
         kind.since_s += REFILL_S
-        if kind.untold:
-            record.msg = f"{record.getMessage()} (and {kind.untold} more like it, not told)"
+        if kind.suppressed:
+            record.msg = f"{record.getMessage()} (and {kind.suppressed} more like it, not logged)"
             record.args = None
-            kind.untold = 0
+            kind.suppressed = 0
         return True
 
 

@@ -1,4 +1,4 @@
-"""What the log says of a gateway every now and then: one moment in one line."""
+"""The summary line that a gateway logs periodically."""
 
 import math
 from typing import Final
@@ -10,7 +10,7 @@ UNKNOWN: Final = "—"
 
 
 def summary_line(snapshot: Snapshot) -> str:
-    """Sum up a moment in one line for a log."""
+    """Summarise a snapshot in one line for a log."""
     report = snapshot.report
     parts = [f"receiver {report.port} {'connected' if report.connected else 'not connected'}"]
     parts += [

@@ -1,4 +1,4 @@
-"""What Prometheus is told of the gateway: each family with what it means and what to do then."""
+"""Prometheus metrics of the gateway: each family with its meaning and what to do."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -40,7 +40,7 @@ VEHICLE_GAUGES: Final[tuple[tuple[str, str, Callable[[NavState], float]], ...]] 
     ("climb_metres_per_second", "Speed upwards.", lambda s: -s.vel_n_mps[2]),
     (
         "horizontal_deviation_metres",
-        "Standard deviation of the horizontal position, as the estimator believes.",
+        "Standard deviation of the horizontal position, by the estimator.",
         lambda s: math.hypot(s.pos_std_m[0], s.pos_std_m[1]),
     ),
     (
@@ -72,18 +72,25 @@ BOARD_GAUGES: Final[tuple[tuple[str, str, Callable[[NodeStatus], float]], ...]] 
     ),
 )
 BOARD_COUNTERS: Final = (
-    ("bus_errors", "Failed words with a sensor, 16 bits: a loose wire, or a bus that is too long."),
+    (
+        "bus_errors",
+        "Failed transfers with a sensor, 16 bits: a loose wire, or a bus that is too long.",
+    ),
     ("radio_failed", "Payloads that nobody acknowledged, 16 bits: out of reach, or a weak supply."),
     ("radio_retries", "Payloads that were sent again, 16 bits: a busy channel or a weak link."),
 )
 FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
     (
         "gps_fix",
-        "Kind of GPS fix: 0 none, 2 in the plane, 3 in space; others are no fix.",
+        "Type of GPS fix: 0 none, 2 is 2D, 3 is 3D; others are no fix.",
         lambda f: float(f.fix_type),
     ),
     ("satellites", "Satellites in use.", lambda f: float(f.satellites)),
-    ("gps_accuracy_metres", "Horizontal accuracy, as the receiver tells it.", lambda f: f.h_acc_m),
+    (
+        "gps_accuracy_metres",
+        "Horizontal accuracy, as the receiver reports it.",
+        lambda f: f.h_acc_m,
+    ),
 )
 
 
@@ -98,13 +105,13 @@ def prometheus_text(snapshot: Snapshot) -> str:
     Returns
     -------
     str
-        One line a sample, with help and type before each family.
+        One line per sample, with help and type before each family.
     """
     return text_of(families(snapshot))
 
 
 def families(snapshot: Snapshot) -> Iterator[Metric]:
-    """Describe a moment of the daemon.
+    """Yield the metrics of a snapshot.
 
     Parameters
     ----------
@@ -113,7 +120,7 @@ def families(snapshot: Snapshot) -> Iterator[Metric]:
     Yields
     ------
     Metric
-        Names begin with `mavgate_`; what is not known is left out.
+        Names begin with `mavgate_`; unknown values are left out.
     """
     yield from _gateway(snapshot)
     yield from _refusals(snapshot)
@@ -161,7 +168,7 @@ def _refusals(snapshot: Snapshot) -> Iterator[Metric]:
         (
             "requests_refused",
             snapshot.refused,
-            "Requests to change something of clients that may not: see trusted= of endpoints.",
+            "Requests to change something from untrusted clients: see trusted= of endpoints.",
         ),
         (
             "requests_forged",
@@ -195,7 +202,7 @@ def _nodes(nodes: tuple[NodeLink, ...], now_us: int) -> Iterator[Metric]:
 
 
 def _boards(snapshot: Snapshot) -> Iterator[Metric]:
-    """Yield what the nodes report of their own boards."""
+    """Yield the nodes' reports of their own boards."""
     boards = [board for one in snapshot.aircraft for board in one.boards]
     for name, text, value_of in BOARD_GAUGES:
         yield gauge(f"node_{name}", text, NODE, [(_of(b.node), value_of(b)) for b in boards])
@@ -215,7 +222,7 @@ def _boards(snapshot: Snapshot) -> Iterator[Metric]:
 
 
 def _receptions(aircraft: tuple[AircraftStatus, ...]) -> Iterator[Metric]:
-    """Yield how well the aircraft's GPS receives, and how far home is."""
+    """Yield the aircraft's GPS reception, and the distance to home."""
     for name, text, value_of in FIX_GAUGES:
         samples = [((str(one.vehicle_id),), value_of(one.fix)) for one in aircraft if one.fix]
         yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
@@ -224,7 +231,7 @@ def _receptions(aircraft: tuple[AircraftStatus, ...]) -> Iterator[Metric]:
         for one in aircraft
         if one.home is not None and one.home.distance_m is not None
     ]
-    yield gauge("vehicle_home_distance_metres", "Way over ground to home.", ("vehicle",), ways)
+    yield gauge("vehicle_home_distance_metres", "Distance over ground to home.", ("vehicle",), ways)
 
 
 def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
@@ -233,7 +240,7 @@ def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
         yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
     yield gauge(
         "vehicle_valid",
-        "1 where the estimate holds, by quantity.",
+        "1 where the estimate is valid, by quantity.",
         ("vehicle", "quantity"),
         [
             ((str(vehicle_id), quantity), float(flag in state.flags))

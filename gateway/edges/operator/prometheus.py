@@ -16,16 +16,16 @@ MAX_REQUEST_BYTES: Final = 8192
 MAX_CONNECTIONS: Final = 8
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 RETRY_S: Final = 5.0
-"""Between attempts to bind a port that is taken: whoever scrapes it asks about as often."""
+"""Between attempts to bind a port in use: about the interval of a scraper."""
 
 
 class MetricsServer:
-    """Answer every HTTP GET with the state of the moment.
+    """Answer every HTTP GET with the present metrics.
 
     Parameters
     ----------
     text : callable
-        Describes the gateway now, as `metric_families.text_of` writes it.
+        Returns the present metrics, as `metric_families.text_of` writes them.
     """
 
     def __init__(self, text: Callable[[], str]) -> None:
@@ -58,7 +58,7 @@ class MetricsServer:
         self._release()
 
     def listeners(self) -> tuple[ListenerStats, ...]:
-        """Describe the port, if one is wanted."""
+        """Return the port's state, if one is configured."""
         if not self._wanted:
             return ()
         url = f"http://127.0.0.1:{self._wanted}/metrics"
@@ -77,7 +77,7 @@ class MetricsServer:
         asyncio.get_running_loop().add_reader(self._socket, self._on_readable, self._socket)
 
     def _fail(self, error: OSError) -> None:
-        """Begin anew later."""
+        """Retry later."""
         reason = reason_of(error)
         if reason != self._reason:
             log.warning("no metrics on port %d yet: %s", self._wanted, reason)

@@ -1,4 +1,4 @@
-"""What systemd and the kernel's scheduler want to know of a service.
+"""Notifications to systemd, and the scheduler's priority.
 
 The notification protocol is one datagram of text to a socket that the environment names; see
 sd_notify(3). Without that variable nothing happens.
@@ -19,7 +19,7 @@ NS_PER_US: Final = 1_000
 
 
 class ServiceNotifier:
-    """Tell systemd that we are ready, alive, reloading or stopping."""
+    """Notify systemd that we are ready, alive, reloading or stopping."""
 
     def __init__(self) -> None:
         self._place = os.environ.get("NOTIFY_SOCKET", "")
@@ -27,13 +27,13 @@ class ServiceNotifier:
         self._timer: asyncio.TimerHandle | None = None
 
     def ready(self) -> None:
-        """Tell that the service works, and from now on that it is alive; needs a running loop."""
+        """Report that the service works, and from now on that it is alive; needs a running loop."""
         self._send("READY=1")
         if self._interval_s:
             self._beat()
 
     def reloading(self) -> None:
-        """Tell that settings are being read again; `ready` ends it."""
+        """Report that settings are being read again; `ready` ends it."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // NS_PER_US}")
 
     def status(self, text: str) -> None:
@@ -41,7 +41,7 @@ class ServiceNotifier:
         self._send(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """Tell that the service ends."""
+        """Report that the service is stopping."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -67,10 +67,10 @@ class ServiceNotifier:
 
 
 def set_realtime_priority(priority: int) -> None:
-    """Ask for the round-robin real-time scheduler, for this thread and none that it starts.
+    """Request the round-robin real-time scheduler, for this thread and none that it starts.
 
     On a busy machine this keeps the worst latency below a millisecond, which niceness does not.
-    What writes to the disk gets no such share.
+    The threads that write to the disk do not get it.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def set_realtime_priority(priority: int) -> None:
 
 
 def _watchdog_interval_s() -> float:
-    """Return half of the time after which systemd takes us for dead; 0 without a watchdog."""
+    """Return half of systemd's watchdog time; 0 without a watchdog."""
     owner = os.environ.get("WATCHDOG_PID", "")
     if owner and owner != str(os.getpid()):
         return 0.0

@@ -1,7 +1,7 @@
-"""A pseudo-terminal that speaks like the receiver's serial port, at the true rate.
+"""A pseudo-terminal that behaves like the receiver's serial port, at the true rate.
 
-Whoever opens `path` meets what a USB adapter would show: bytes at their times, and none kept for a
-reader that is not there (beyond the kernel's few kilobytes, which opening flushes).
+A program that opens `path` reads the same as from a USB adapter: bytes at their times, and none
+buffered without a reader (except the kernel's few kilobytes, which opening flushes).
 """
 
 import asyncio
@@ -13,11 +13,11 @@ from typing import Final
 from gateway.simulator.timed_frame import TimedFrame
 
 MAX_LATE_S: Final = 1.0
-"""A loop held up for longer, as by a suspended machine, goes on where it was: making up for it
-would hold up the loop even more."""
+"""A loop delayed for longer, as by a suspended machine, continues where it was: catching up would
+delay the loop even more."""
 
 MAX_BATCH: Final = 64
-"""Frames written in one go before the loop's other work gets its turn."""
+"""Frames written at once before the loop's other work gets its turn."""
 
 
 class PtyPort:
@@ -42,9 +42,9 @@ class PtyPort:
         if not speed > 0.0:
             raise ValueError(f"speed of {speed}; it must be positive")
         self.written = 0
-        """Frames that went out whole."""
+        """Frames written completely."""
         self.dropped = 0
-        """Frames that found the terminal full, since nobody reads."""
+        """Frames dropped because nobody reads and the terminal is full."""
         self.ended = asyncio.Event()
         """Set after the last frame, and by closing."""
         self._frames = frames
@@ -61,7 +61,7 @@ class PtyPort:
         """The device to open instead of a serial port."""
 
     def start(self) -> None:
-        """Begin: the frames' time zero is now. Needs a running event loop."""
+        """Start: the frames' time zero is now. Needs a running event loop."""
         self._start_s = asyncio.get_running_loop().time()
         self._advance()
 
@@ -77,7 +77,7 @@ class PtyPort:
         self.ended.set()
 
     def _advance(self) -> None:
-        """Write what is due and wait for the next frame."""
+        """Write the frames due and wait for the next."""
         loop = asyncio.get_running_loop()
         self._timer = None
         for _ in range(MAX_BATCH):

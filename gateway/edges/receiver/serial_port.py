@@ -38,7 +38,7 @@ KNOWN_ADAPTERS: Final = {
     (0x2341, 0x0043): "Arduino Uno",
     (0x2341, 0x0001): "Arduino Uno",
 }
-"""USB serial chips that stand on Arduino-class boards and programming cables."""
+"""USB serial chips of Arduino-class boards and programming cables."""
 
 
 class SerialSettings(Settings, frozen=True):
@@ -132,13 +132,13 @@ def find_port(wanted: str, ports: list[Port]) -> str:
 
 
 class SerialPort:
-    """Keep one serial port open and hand on what it says.
+    """Keep one serial port open and pass on its bytes.
 
     Parameters
     ----------
     settings : SerialSettings
     on_bytes : callable
-        Gets every chunk and the gateway time of its reading.
+        Called with every chunk and the gateway time of its reading.
     on_open, on_lost : callable
         Called with the device after each opening, before the first bytes, and after each loss.
     now_us : callable
@@ -169,7 +169,7 @@ class SerialPort:
         return self._port is not None
 
     def start(self) -> None:
-        """Open the port, now or as soon as it is there."""
+        """Open the port, now or as soon as it exists."""
         self._open()
 
     def close(self) -> None:
@@ -215,7 +215,7 @@ class SerialPort:
     def _read(self) -> None:
         assert self._port is not None
         try:
-            # pyserial's own read asks the kernel twice more, on the way of every sample.
+            # pyserial's own read makes two more system calls, for every sample.
             data = os.read(self._port.fileno(), READ_SIZE)
         except BlockingIOError:
             return
@@ -247,7 +247,7 @@ class SerialPort:
         self._delay_s = min(2.0 * self._delay_s, LONGEST_RETRY_S)
 
     def _complain(self, text: str) -> None:
-        """Log a trouble once, however often it comes back."""
+        """Log a problem once, however often it is repeated."""
         if text != self._last_complaint:
             log.warning("%s; trying again until it works", text)
             self._last_complaint = text

@@ -107,7 +107,7 @@ def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> Non
     path.write_bytes(damaged[how])
     words = ["-o", tmp_path / "out.csv"] if command != "info" else []
     told = run(command, path, *words, code=2)
-    assert "log.csv.gz: is no whole gzip file" in told
+    assert "log.csv.gz: is a damaged gzip file" in told
     assert "gzip -dc" in told
     assert not (tmp_path / "out.csv").exists()
 

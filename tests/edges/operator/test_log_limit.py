@@ -27,7 +27,7 @@ def test_the_next_line_tells_how_many_were_left_out() -> None:
         limit.filter(line(f"n {n}", 1000.0))
     record = line("at last", 1001.0)
     assert limit.filter(record)
-    assert record.getMessage() == "at last (and 7 more like it, not told)"
+    assert record.getMessage() == "at last (and 7 more like it, not logged)"
     after = line("and then", 1002.0)
     assert limit.filter(after)
     assert after.getMessage() == "and then"

@@ -1,4 +1,4 @@
-"""TLS without a socket: bytes of the network in, bytes of the stream out, and back."""
+"""TLS without a socket: network bytes in, plain bytes out, and back."""
 
 import functools
 import ssl
@@ -17,9 +17,9 @@ class TlsLayer:
     Parameters
     ----------
     context : ssl.SSLContext
-        Certificates and what is accepted.
+        Certificates and accepted authorities.
     server_name : str, optional
-        Whom we call; None if we were called.
+        Name of the server; None if we are the server.
     """
 
     def __init__(self, context: ssl.SSLContext, server_name: str | None = None) -> None:
@@ -32,22 +32,22 @@ class TlsLayer:
             server_hostname=server_name,
         )
         self.is_open = False
-        """Whether both have agreed on keys."""
+        """Whether the handshake is complete."""
         self.is_ended = False
-        """Whether the peer has said that nothing more comes."""
+        """Whether the peer has closed its direction."""
 
     def feed(self, data: bytes) -> tuple[bytes, bytes]:
-        """Take bytes of the network.
+        """Process network bytes.
 
         Returns
         -------
         tuple of bytes
-            What the peer said, and what is to be sent at once.
+            Received plain bytes, and bytes to send at once.
 
         Raises
         ------
         ssl.SSLError
-            If they are no TLS, or a certificate is not accepted; `outgoing` then tells the peer.
+            If they are not TLS, or a certificate is not accepted; `outgoing` then holds the alert.
         """
         self._inward.write(data)
         plain = b""
@@ -65,22 +65,22 @@ class TlsLayer:
         return plain, self.outgoing()
 
     def wrap(self, plain: bytes) -> bytes:
-        """Return the bytes to send for some of the stream."""
+        """Return the bytes to send for some plain bytes."""
         self._stream.write(plain)
         return self.outgoing()
 
     def outgoing(self) -> bytes:
-        """Return what is to be sent at once."""
+        """Return the bytes to send at once."""
         return self._outward.read()
 
 
 def server_context(settings: HubSettings) -> ssl.SSLContext:
-    """Return what a listening port shows; a certificate that was replaced is read again.
+    """Return the context of a listening port; a replaced certificate is read again.
 
     Raises
     ------
     OSError
-        If the files cannot be read or are none.
+        If the files cannot be read or are invalid.
     """
     if not settings.tls_certificate:
         raise OSError("set hub.tls_certificate to a PEM file")
@@ -90,12 +90,12 @@ def server_context(settings: HubSettings) -> ssl.SSLContext:
 
 
 def caller_context(settings: HubSettings) -> ssl.SSLContext:
-    """Return what we accept servers by.
+    """Return the context for connecting to servers.
 
     Raises
     ------
     OSError
-        If the file cannot be read or is none.
+        If the file cannot be read or is invalid.
     """
     if not settings.tls_authority:
         return ssl.create_default_context()
@@ -110,6 +110,6 @@ def _server_context(
     key_ns: int,  # noqa: ARG001
 ) -> ssl.SSLContext:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    # A password is never asked for: nobody sits before a daemon.
+    # Never ask for a password: a daemon has no terminal.
     context.load_cert_chain(certificate, key, password="")
     return context

@@ -1,8 +1,8 @@
-"""WebSocket to pages and programs, on the sockets and queues that TCP clients have.
+"""WebSocket to pages and programs, on the sockets and queues of TCP clients.
 
 A page that stalls fills its own queue and loses its own oldest telemetry. A silent peer is pinged:
-one that has answered before and does so no more is gone; one that never answers, as simple
-programs do, is left to the kernel, which ends a connection that acknowledges nothing.
+one that has answered before and stops is gone; one that never answers, as simple programs do, is
+left to the kernel, which closes a connection that acknowledges nothing.
 """
 
 import contextlib
@@ -29,17 +29,17 @@ from gateway.wire.mavlink_splitter import SplitFault, SplitFaultKind
 log = logging.getLogger(__name__)
 
 HANDSHAKE_US: Final = 5 * US_PER_S
-"""From the connection to the upgrade; who takes longer only holds a place."""
+"""From the connection to the upgrade; one that takes longer only blocks a place."""
 PINGS: Final = 3
-"""Within the idle time-out, so that one lost answer costs nobody the connection."""
+"""Within the idle time-out, so that one lost answer does not break the connection."""
 UNREAD_BYTES: Final = 65_536
-"""What may wait beside the queue: answers to one who asks and never reads."""
+"""Most bytes beside the queue: answers to a peer that sends requests and never reads."""
 REFUSED_IN_FULL: Final = 5
-"""Callers that were refused which are logged one by one in a minute."""
+"""Refused connections that are logged one by one in a minute."""
 
 
 class WebStream(StreamClient):
-    """A peer behind a WebSocket, within TLS or not."""
+    """A peer behind a WebSocket, with or without TLS."""
 
     read_budget = 1
     """A chunk holds hundreds of the smallest messages, and each costs as much as a large one."""
@@ -51,11 +51,11 @@ class WebStream(StreamClient):
 
     @property
     def is_connected(self) -> bool:
-        """Whether there is a connection, be the handshake done or not."""
+        """Whether there is a connection, before or after the handshake."""
         return self._socket is not None
 
     def begin(self) -> None:
-        """Begin the handshake."""
+        """Start the handshake."""
         self._begun_us = self._spoke_us = self.context.now_us()
         self._answers = False
         self.become("connecting")
@@ -67,20 +67,20 @@ class WebStream(StreamClient):
         self._web = self.protocol()
 
     def protocol(self) -> WsProtocol:
-        """Make our end of a new connection."""
+        """Create the protocol of a new connection."""
         raise NotImplementedError
 
     def secure(self) -> TlsLayer:
-        """Make our end of TLS, or raise OSError."""
+        """Create the TLS layer, or raise OSError."""
         raise NotImplementedError
 
     def opened(self) -> None:
-        """Take part: the handshake is done."""
+        """Add the client: the handshake is done."""
         self.become("open")
         self.context.greet(self)
 
     def give_up(self, reason: str) -> None:
-        """Give the connection up."""
+        """Close the connection and record the reason."""
         raise NotImplementedError
 
     def wrap(self, frames: bytes) -> bytes:
@@ -88,7 +88,7 @@ class WebStream(StreamClient):
         return self._seal(self._web.wrap(frames))
 
     def transmit(self, frame: bytes, message_id: int) -> None:
-        """Send one frame at once, or queue it if others wait or shall be packed with it."""
+        """Send one frame at once, or queue it if others wait or are to be packed with it."""
         if self.state != "open":
             self.counters.dropped += 1
             return
@@ -104,7 +104,7 @@ class WebStream(StreamClient):
             self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def accept(self, data: bytes, now_us: int) -> None:
-        """Take some bytes of the connection."""
+        """Process received bytes."""
         self._spoke_us = now_us
         plain = self._open_up(data) if self._tls is not None else data
         if not plain or not self.is_connected:
@@ -120,7 +120,7 @@ class WebStream(StreamClient):
             self.give_up(found.ended)
 
     def say(self, data: bytes) -> bool:
-        """Send something of the protocol's own, past the queue; tell whether the peer is there."""
+        """Send a protocol message, past the queue; return whether the peer is still connected."""
         assert self._socket is not None
         data = self._seal(data)
         if not self._partial:
@@ -128,11 +128,11 @@ class WebStream(StreamClient):
         elif len(self._partial) < UNREAD_BYTES:
             self._partial += data
         else:
-            self.give_up("it asks and does not read")
+            self.give_up("it sends requests and does not read")
         return self.is_connected
 
     def tick(self, now_us: int) -> None:
-        """Ask whether a silent peer is there, and part from one that is not."""
+        """Ping a silent peer, and drop one that does not answer."""
         super().tick(now_us)
         if self._socket is None:
             return
@@ -149,14 +149,14 @@ class WebStream(StreamClient):
             self.say(self._web.ping())
 
     def close(self) -> None:
-        """Say good-bye if there is room for it, and close the connection; what waits is lost."""
+        """Send a close message if there is room, and close; waiting frames are lost."""
         if self._socket is not None and self.state == "open" and not self._partial:
             with contextlib.suppress(OSError):
                 self._socket.send(self._seal(self._web.close(CloseReason.GOING_AWAY)))
         super().close()
 
     def _open_up(self, data: bytes) -> bytes:
-        """Return what bytes of the network say."""
+        """Return the plain bytes of some network bytes."""
         assert self._tls is not None
         assert self._socket is not None
         was_open = self._tls.is_open
@@ -176,7 +176,7 @@ class WebStream(StreamClient):
         return plain
 
     def secured(self) -> None:
-        """Go on after the keys were agreed on."""
+        """Continue after the TLS handshake."""
 
     def _seal(self, data: bytes) -> bytes:
         return data if self._tls is None else self._tls.wrap(data)
@@ -191,7 +191,7 @@ class WebStream(StreamClient):
             self.receive(events, len(found.payload) + found.text_size, now_us)
 
     def _flush(self) -> None:
-        """Send what has gathered."""
+        """Send the gathered frames."""
         self._is_gathering = False
         if self._socket is not None and not self._partial:
             self._on_writable(self._socket)
@@ -214,12 +214,12 @@ class WebStream(StreamClient):
 
 
 class WsClient(WebStream, TcpClient):
-    """A connection that the gateway makes, and makes again when it breaks."""
+    """A connection that the gateway makes, and remakes when it breaks."""
 
     _caller: WsCaller
 
     def begin(self) -> None:
-        """Begin the handshake."""
+        """Start the handshake."""
         super().begin()
         if self._socket is None:
             return
@@ -229,20 +229,20 @@ class WsClient(WebStream, TcpClient):
             self._write(self._socket, self._tls.feed(b"")[1])
 
     def protocol(self) -> WsProtocol:
-        """Make our end of a new connection."""
+        """Create the protocol of a new connection."""
         self._caller = WsCaller(self.endpoint.address, self.endpoint.path)
         return self._caller
 
     def secure(self) -> TlsLayer:
-        """Make our end of TLS, or raise OSError."""
+        """Create the TLS layer, or raise OSError."""
         return TlsLayer(caller_context(self.context.settings), self.endpoint.host)
 
     def secured(self) -> None:
-        """Ask for the upgrade."""
+        """Send the upgrade request."""
         self.say(self._caller.hello)
 
     def give_up(self, reason: str) -> None:
-        """Give the connection up, and tell why until another is made."""
+        """Close the connection, and keep the reason until another is made."""
         was_open = self.state == "open"
         self.broke()
         if not was_open:
@@ -259,38 +259,38 @@ class WsPeer(WebStream):
     welcome: Callable[["WsPeer"], None] = field(kw_only=True)
     leave: Callable[["WsPeer"], None] = field(kw_only=True)
     complain: Callable[[str], None] = field(kw_only=True)
-    """Takes why a caller was refused."""
+    """Called with why a connection was refused."""
 
     def protocol(self) -> WsProtocol:
-        """Make our end of a new connection."""
+        """Create the protocol of a new connection."""
         return WsServer(lambda origin: admits_page(origin, self.local_host, self.endpoint.origins))
 
     def secure(self) -> TlsLayer:
-        """Make our end of TLS, or raise OSError."""
+        """Create the TLS layer, or raise OSError."""
         return TlsLayer(server_context(self.context.settings))
 
     def opened(self) -> None:
-        """Take part: the handshake is done."""
+        """Add the client: the handshake is done."""
         self.welcome(self)
         super().opened()
 
     def give_up(self, reason: str) -> None:
-        """Give the connection up for good."""
+        """Close the connection for good."""
         if self.state != "open":
             self.complain(f"{self.remote}: {reason}")
         self.broke()
 
     def broke(self) -> None:
-        """Leave for good; the client may connect again."""
+        """Remove the client; it may connect again."""
         self.leave(self)
 
     def fail(self, error: Exception) -> None:  # noqa: ARG002
-        """Leave for good after an error that nobody foresaw."""
+        """Remove the client after an unexpected error."""
         self.leave(self)
 
 
 class WsListener(StreamListener[WsPeer]):
-    """A port for WebSockets, its clients, and its callers whose handshake is not done."""
+    """A WebSocket port, its clients, and its pending handshakes."""
 
     def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
         self._callers: dict[int, WsPeer] = {}
@@ -298,26 +298,26 @@ class WsListener(StreamListener[WsPeer]):
         super().__init__(context, endpoint)
 
     def tick(self, now_us: int) -> None:
-        """Bind again if that failed, and part from callers that say nothing."""
+        """Bind again if that failed, and drop handshakes that take too long."""
         super().tick(now_us)
         for caller in list(self._callers.values()):
             caller.tick(now_us)
         self._tell(self._refused.poll(now_us))
 
     def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options; pages that may not be here any more stay till they go."""
+        """Apply changed options; connected pages stay, even if no longer allowed."""
         super().reconfigure(endpoint)
         for caller in self._callers.values():
             caller.endpoint = endpoint
 
     def close(self) -> None:
-        """Part from all clients and close the port."""
+        """Drop all clients and close the port."""
         for caller in list(self._callers.values()):
             self.leave(caller)
         super().close()
 
     def leave(self, client: WsPeer) -> None:
-        """Part from one client."""
+        """Drop one client."""
         self._callers.pop(client.client_id, None)
         super().leave(client)
 
@@ -327,7 +327,7 @@ class WsListener(StreamListener[WsPeer]):
         return super()._bind()
 
     def _admit(self, connection: socket.socket, peer: str) -> None:
-        """Let a caller begin; where there is no room, the one that has taken longest goes."""
+        """Admit a new handshake; if there is no room, the oldest one is dropped."""
         if len(self._clients) + len(self._callers) >= self._context.settings.max_clients:
             next(iter(self._callers.values())).give_up("no handshake yet, and others wait")
         client_id = self._context.new_client_id()

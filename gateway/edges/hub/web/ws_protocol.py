@@ -1,9 +1,9 @@
-"""One WebSocket connection without a socket: bytes in; payload, bytes to answer and events out.
+"""One WebSocket connection without a socket: bytes in; payload, reply bytes and events out.
 
-MAVLink goes as binary messages. A page gets one frame a message, or several if they are packed;
-what comes is taken as a stream of bytes, so that it does not matter where messages end.
+MAVLink is sent as binary messages. A page gets one frame per message, or several if they are
+packed; received messages are read as a byte stream, so that message boundaries do not matter.
 
-| it comes                                        | it is answered by                        |
+| received                                        | answer                                   |
 | ----------------------------------------------- | ---------------------------------------- |
 | a request to upgrade from a page that may       | 101, and the connection is open          |
 | one from another page                           | 403 and the end                          |
@@ -15,8 +15,8 @@ what comes is taken as a stream of bytes, so that it does not matter where messa
 | unmasked or compressed frames, wrong ones       | close 1002                               |
 | a close                                         | a close                                  |
 
-Compression is offered by browsers and never agreed to: telemetry does not shrink, and each
-connection would hold a window of memory.
+Compression is offered by browsers and never accepted: telemetry does not compress well, and each
+connection would need memory for its window.
 
 References
 ----------
@@ -45,23 +45,23 @@ from wsproto.frame_protocol import CloseReason
 from wsproto.utilities import ProtocolError
 
 MAX_MESSAGE: Final = 65_536
-"""No program packs more; what is longer is no MAVLink."""
+"""No program packs more; longer messages are not MAVLink."""
 SUBPROTOCOLS: Final = ("mavlink", "binary")
-"""Names that pages ask for when they ask at all; a browser gives up if none is agreed to."""
+"""Names that pages request, if any; a browser gives up if none is accepted."""
 FINAL_BINARY: Final = b"\x82"
 SHORT: Final = 126
-"""From this length on two bytes tell it."""
+"""From this payload size on, the length takes two bytes."""
 TWO_BYTES: Final = struct.Struct("!BH")
 
 
 @dataclass(slots=True)
 class WsInput:
-    """What came of some received bytes."""
+    """Result of some received bytes."""
 
     payload: bytes = b""
     """Bytes of binary messages."""
     text_size: int = 0
-    """Bytes of text messages, which are no MAVLink."""
+    """Bytes of text messages, which are not MAVLink."""
     reply: bytes = b""
     """To be sent at once, as it is."""
     opened: bool = False
@@ -73,7 +73,7 @@ class WsInput:
 
 
 class WsProtocol:
-    """What both ends of a connection do."""
+    """Base of both ends of a connection."""
 
     def __init__(self, role: ConnectionType) -> None:
         self._wire = WSConnection(role)
@@ -81,7 +81,7 @@ class WsProtocol:
         self._ended = False
 
     def feed(self, data: bytes) -> WsInput:
-        """Take received bytes; never raises on data."""
+        """Process received bytes; never raises on data."""
         found = WsInput()
         if self._ended or not data:
             return found
@@ -106,15 +106,15 @@ class WsProtocol:
         return found
 
     def wrap(self, payload: bytes) -> bytes:
-        """Make a binary message of some MAVLink."""
+        """Build a binary message of some MAVLink."""
         raise NotImplementedError
 
     def ping(self) -> bytes:
-        """Ask the peer whether it is there."""
+        """Return a ping message."""
         return self._wire.send(Ping())
 
     def close(self, code: CloseReason) -> bytes:
-        """Say good-bye, unless that has been said."""
+        """Return a close message, unless one was sent."""
         try:
             return self._wire.send(CloseConnection(code=code))
         except ProtocolError:
@@ -153,7 +153,7 @@ class WsProtocol:
             for answer in answers:
                 found.reply += self._wire.send(answer)
         except ProtocolError:
-            # There is no answer in this state: a peer that says what none may say any more.
+            # No reply is possible in this state: the peer sent data after its close.
             return
 
 
@@ -163,7 +163,7 @@ class WsServer(WsProtocol):
     Parameters
     ----------
     admits : callable
-        Tells whether a page of this origin may connect.
+        Whether a page of this origin may connect.
     """
 
     def __init__(self, admits: Callable[[str], bool]) -> None:
@@ -171,7 +171,7 @@ class WsServer(WsProtocol):
         self._admits = admits
 
     def wrap(self, payload: bytes) -> bytes:
-        """Make a binary message: written here, since every frame to every page takes this way."""
+        """Build a binary message; written here for speed, since every frame to a page needs it."""
         size = len(payload)
         if size < SHORT:
             return FINAL_BINARY + size.to_bytes() + payload
@@ -208,16 +208,16 @@ class WsCaller(WsProtocol):
     place : str
         Host and port of the server.
     path : str
-        What it is asked for.
+        Path of the request.
     """
 
     def __init__(self, place: str, path: str) -> None:
         super().__init__(ConnectionType.CLIENT)
         self.hello = self._wire.send(Request(host=place, target=path))
-        """What opens the handshake."""
+        """The upgrade request."""
 
     def wrap(self, payload: bytes) -> bytes:
-        """Make a binary message, masked as those of clients have to be."""
+        """Build a binary message, masked as required of clients."""
         return self._wire.send(BytesMessage(data=payload))
 
     def _shake_hands(self, event: Event, found: WsInput) -> None:
