@@ -188,6 +188,35 @@ def test_row_3d_from_two_viewpoints(page: Page) -> None:
     page.wait_for_function(f"document.querySelector('.scene').dataset.frames > {before} + 2")
 
 
+TOUCH_THE_BODY = """
+async () => {
+  const scene = document.querySelector(".scene");
+  const drawn = new Set();
+  const last = Number(scene.dataset.frames) + 5;
+  while (Number(scene.dataset.frames) < last) {
+    document.body.classList.toggle("touched");
+    await new Promise(requestAnimationFrame);
+    drawn.add(scene.dataset.model);
+  }
+  return [...drawn];
+}
+"""
+"""Changes the body's classes, as its framework does; returns what is drawn meanwhile."""
+
+
+def test_3d_keeps_the_aircraft_while_the_theme_stays(page: Page) -> None:
+    show(page, "flight")
+    expect(page.locator(".scene")).to_have_attribute("data-model", "plane")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
+    # A scene that begins anew asks for the path anew.
+    assert not any("/path/" in url for url in asked)
+    with page.expect_request("**/path/*"):
+        page.emulate_media(color_scheme="dark")
+    assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
+
+
 def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")

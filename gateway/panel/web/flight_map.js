@@ -126,8 +126,7 @@ export default {
     this.$watch("style", () => this.set_style());
     this.set_style();
     this.paint();
-    this.theme = new MutationObserver(() => this.paint());
-    this.theme.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.stop_theme = mavgate.watch_theme(() => this.paint());
     this.size = new ResizeObserver(() => map.invalidateSize({ animate: false }));
     this.size.observe(this.$el);
     this.stop = mavgate.subscribe(() => (this.stale = true));
@@ -145,7 +144,7 @@ export default {
   unmounted() {
     cancelAnimationFrame(this.handle);
     this.stop?.();
-    this.theme?.disconnect();
+    this.stop_theme?.();
     this.size?.disconnect();
     this.map?.remove();
   },

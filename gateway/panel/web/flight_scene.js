@@ -195,7 +195,7 @@ export default {
       this.trouble = "This browser draws no 3D (WebGL is off).";
       return;
     }
-    this.renderer.setPixelRatio(in_software() ? 0.5 : Math.min(window.devicePixelRatio, 1.5));
+    this.renderer.setPixelRatio(in_software() ? 0.75 : Math.min(window.devicePixelRatio, 1.5));
     this.renderer.setScissorTest(true);
     this.aircraft = {};
     this.origin = null;
@@ -206,8 +206,7 @@ export default {
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(this.$el);
     this.stop = mavgate.subscribe(() => this.take());
-    this.theme = new MutationObserver(() => this.paint());
-    this.theme.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.stop_theme = mavgate.watch_theme(() => this.paint());
     this.$el.addEventListener("pointermove", (event) => this.drag(event));
     this.$el.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     this.resize();
@@ -227,7 +226,7 @@ export default {
     cancelAnimationFrame(this.handle);
     this.stop?.();
     this.observer?.disconnect();
-    this.theme?.disconnect();
+    this.stop_theme?.();
     this.renderer?.dispose();
   },
 
@@ -280,6 +279,7 @@ export default {
       this.pole.material.color.set(mavgate.colour("home"));
       this.beacon.material.color.set(mavgate.colour("mark"));
       for (const id of Object.keys(this.aircraft)) this.forget(id);
+      this.take();
     },
     place(lat, lon, alt) {
       const o = this.origin;
@@ -294,11 +294,9 @@ export default {
       for (const [id, state] of Object.entries(mavgate.vehicles)) {
         if (state.lat_deg === null || state.alt_amsl_m === null) continue;
         this.set_origin(state);
+        const known = this.aircraft[id];
+        if (known && (known.model !== state.model || known.generation !== state.generation)) this.forget(id);
         const craft = (this.aircraft[id] ??= this.make(id, state));
-        if (craft.model !== state.model || craft.generation !== state.generation) {
-          this.forget(id);
-          continue;
-        }
         const point = this.place(state.lat_deg, state.lon_deg, state.alt_amsl_m);
         if (!craft.point || craft.point.distanceToSquared(point) > 0) {
           if (craft.point && craft.point.distanceTo(point) > 500) craft.path.clear();

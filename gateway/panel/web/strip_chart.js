@@ -22,8 +22,7 @@ export default {
     this.chart.on("datazoom", () => this.noteZoom());
     this.sizes = new ResizeObserver(() => this.chart.resize());
     this.sizes.observe(this.$el);
-    this.themes = new MutationObserver(() => this.layOut());
-    this.themes.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.stop_theme = mavgate.watch_theme(() => this.layOut());
     this.$el.addEventListener("wheel", () => this.wish(), { passive: true });
     this.$el.addEventListener("pointerdown", () => this.wish());
     this.timer = setInterval(() => this.follow(), FOLLOW_MS);
@@ -32,7 +31,7 @@ export default {
   unmounted() {
     clearInterval(this.timer);
     this.sizes.disconnect();
-    this.themes.disconnect();
+    this.stop_theme();
     this.chart.dispose();
   },
   methods: {

@@ -36,6 +36,18 @@
     factor: (quantity) => FACTORS[bus.units][quantity][0],
     // A colour of the style sheet, as canvas and WebGL want it.
     colour: (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`).trim(),
+    // Calls back when the page turns dark or light, not when another class of its body is set again.
+    watch_theme(callback) {
+      const is_dark = () => document.body.classList.contains("body--dark");
+      let dark = is_dark();
+      const observer = new MutationObserver(() => {
+        if (is_dark() === dark) return;
+        dark = is_dark();
+        callback();
+      });
+      observer.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+      return () => observer.disconnect();
+    },
   };
   window.mavgate = bus;
 
