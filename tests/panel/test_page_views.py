@@ -14,7 +14,16 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from gateway.edges.operator.control_socket import request
 from gateway.estimation.select import ESTIMATORS
 from tests.panel.bench_receiver import BenchReceiver
-from tests.panel.browsing import CONFIG, DESKTOP, WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.browsing import (
+    CONFIG,
+    DESKTOP,
+    START_LIMIT_MS,
+    WAIT_MS,
+    Process,
+    needs_chromium,
+    open_page,
+    show,
+)
 
 pytestmark = [
     pytest.mark.io,
@@ -141,7 +150,7 @@ def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
     def is_compared() -> bool:
         card.get_by_role("button", name="Compare").click()
         told = card.get_by_text(re.compile("what the aircraft itself told|try again in a moment"))
-        expect(told).to_be_visible()
+        expect(told).to_be_visible(timeout=START_LIMIT_MS)  # It may compile them first.
         return rows.count() > 0
 
     for _ in range(60):
