@@ -24,6 +24,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+class WorkError(Exception):
+    """What the work says in words of its own when it cannot be done."""
+
+
 @dataclass(frozen=True, slots=True)
 class WorkFailed:
     """Work that came to no result, through no fault of the others."""
@@ -96,7 +100,8 @@ def _run_in_one_pool(
 
 def failure_of(error: BaseException) -> WorkFailed:
     """Tell of an exception what was wrong."""
-    return WorkFailed(f"{type(error).__name__}: {error}")
+    told = isinstance(error, WorkError)
+    return WorkFailed(str(error) if told else f"{type(error).__name__}: {error}")
 
 
 @contextmanager

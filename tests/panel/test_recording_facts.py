@@ -4,7 +4,7 @@ import pytest
 
 from gateway.panel.serving.recording_facts import RecordingFacts
 from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
-from gateway.season.reckoning.flight_facts import FlightFacts
+from gateway.season.statistics.flight_facts import FlightFacts
 
 pytestmark = pytest.mark.io
 

@@ -3,22 +3,25 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from hashlib import sha256
 from pathlib import Path
+from typing import Any, ClassVar
 
 import fsspec
 import pandas as pd
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
-from gateway.season.batch.flight_tasks import FlightResult, FuseTask, without_secrets
+from gateway.season.batch.flight_tasks import FlightResult, FuseTask, InfoTask, without_secrets
 from gateway.season.batch.result_folder import RESULTS, ResultFolder
 from gateway.season.batch.season_run import run_season
 from gateway.season.batch.storage import StorageError, items_of
-from gateway.season.executors import LocalProcesses, WorkFailed
+from gateway.season.executors import LocalProcesses, WorkError, WorkFailed, failure_of
 
 pytestmark = pytest.mark.io
 
@@ -238,6 +241,89 @@ def test_a_local_url_is_read_too(season: Path, tmp_path: Path) -> None:
     code, text = run("info", f"file://{season}", "-o", tmp_path)
     assert code == 1
     assert all(name in text for name in FLIGHTS)
+
+
+class _Elsewhere(MemoryFileSystem):
+    """A storage with marks of change, a host and an error of its own, which tells what was read."""
+
+    protocol = "elsewhere"
+    store: ClassVar[dict[str, Any]] = {}
+    fetched: ClassVar[list[str]] = []
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return (
+            "/" + path.rpartition("://")[2].partition("/")[2].strip("/") if "://" in path else path
+        )
+
+    def info(self, path: str, **more: Any) -> dict[str, Any]:
+        told = super().info(path, **more)
+        if told["type"] == "file":
+            told["ETag"] = sha256(self.store[path].getvalue()).hexdigest()
+        return told
+
+    def _open(self, path: str, mode: str = "rb", **more: Any) -> Any:
+        if mode == "rb":
+            if "locked" in path:
+                raise LookupError("no key fits elsewhere://user:secret@host")
+            self.fetched.append(Path(path).name)
+        return super()._open(path, mode, **more)
+
+
+class _InThisProcess:
+    def run(self, work, items):
+        for number, item in enumerate(items):
+            try:
+                yield number, work(item)
+            except WorkError as error:
+                yield number, failure_of(error)
+
+
+def test_what_is_elsewhere_is_fetched_once_and_only_if_it_changed(
+    season: Path, tmp_path: Path
+) -> None:
+    fsspec.register_implementation("elsewhere", _Elsewhere, clobber=True)
+    storage = fsspec.filesystem("elsewhere")
+    for name in FLIGHTS[:2]:
+        storage.pipe_file(f"/flights/{name}", (season / name).read_bytes())
+    storage.pipe_file("/flights/locked.csv", b"x")
+
+    def fetched() -> list[str]:
+        items = items_of(["elsewhere://user:secret@host/flights"], each_file=True)
+        _Elsewhere.fetched.clear()
+        results = run_season(InfoTask(OPTIONS), items, _InThisProcess(), folder, silent)
+        digests = [sha256(storage.store[f"/flights/{name}"].getvalue()) for name in FLIGHTS[:2]]
+        assert [r.digest for r in results[:2]] == [digest.hexdigest() for digest in digests]
+        assert [r.place for r in results[:2]] == [
+            f"elsewhere://host/flights/{n}" for n in FLIGHTS[:2]
+        ]
+        told = "elsewhere://host/flights/locked.csv: "
+        assert (results[2].error or "").startswith(told)
+        assert "secret" not in str(results)
+        return _Elsewhere.fetched.copy()
+
+    folder = ResultFolder(tmp_path)
+    assert fetched() == [*FLIGHTS[:2]]
+    assert fetched() == []
+    storage.pipe_file(f"/flights/{FLIGHTS[1]}", (season / FLIGHTS[2]).read_bytes())
+    assert fetched() == [FLIGHTS[1]]
+
+
+def test_a_broken_file_elsewhere_is_told_by_its_url(memory: str, tmp_path: Path) -> None:
+    fsspec.filesystem("memory").pipe_file("/flights/broken.csv", b"x,y\n1,2\n")
+    code, text = run("info", f"{memory}/broken.csv", "-o", tmp_path)
+    assert code == 1
+    assert "memory://flights/broken.csv: the file has no column" in text.replace("\n", " ")
+    assert "/tmp" not in text
+
+
+def test_a_storage_without_its_package_says_how_to_add_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacking(url: str) -> None:
+        raise ImportError("Install s3fs to access S3")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", lacking)
+    with pytest.raises(StorageError, match=r"(?s)s3://season/: needs.*pip install s3fs"):
+        items_of(["s3://season/"])
 
 
 def test_a_url_that_leads_nowhere_is_said(tmp_path: Path) -> None:

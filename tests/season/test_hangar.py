@@ -24,8 +24,8 @@ from gateway.season.hangar.hangar_file import (
     geojson_of,
 )
 from gateway.season.hangar.indexing import index_folder, read_file
-from gateway.season.reckoning.flight_facts import FlightFacts, lost_share
-from gateway.season.reckoning.track_shape import feature, simplified
+from gateway.season.statistics.flight_facts import FlightFacts, lost_share
+from gateway.season.statistics.track_shape import feature, simplified
 from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 
 pytestmark = pytest.mark.io

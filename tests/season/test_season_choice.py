@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from gateway.cli.app import app
 from gateway.config import load
-from gateway.season.reckoning.chance import lead_of
-from gateway.season.reckoning.cross_validation import choose, folds_of
-from gateway.season.reckoning.season_errors import FlightErrors, errors_by_group, versus
+from gateway.season.statistics.chance import lead_of
+from gateway.season.statistics.cross_validation import choose, folds_of
+from gateway.season.statistics.season_errors import FlightErrors, errors_by_group, versus
 
 GROUPS = [f"{1 + k % 2} 2026-06-{1 + k // 4:02d}" for k in range(40)]
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from gateway.season.batch.flight_tasks import FlightResult
-    from gateway.season.reckoning.season_errors import Versus
+    from gateway.season.statistics.season_errors import Versus
 
 FAILED: Final = 1
 """What the command ends with where a recording failed."""
@@ -63,46 +63,36 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="batch", rich_help_panel=PANEL)
 
 
-@group.command()
-def fuse(
-    files: SeasonFiles,
-    *,
-    output: OutputOption,
-    against: AgainstOption = None,
-    columns: ColumnsOption = None,
-    settings: SettingsOption = "recorded",
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    config: ConfigOption = None,
-) -> None:
-    """Fuse many recordings with every estimator, judge each by withheld fixes, make one page."""
-    from gateway.season.batch.flight_tasks import FuseTask
+def _add_judging(name: Literal["fuse", "report"], text: str) -> None:
+    """Add a command that judges every estimator on every flight; they differ in what they write."""
 
-    work = SeasonWork(files, config, jobs, scheduler)
-    task = FuseTask(season_options(config, columns, settings))
-    _finish(work.run(task, work.items(), output), output, against)
+    @group.command(name, help=text)
+    def judge(
+        files: SeasonFiles,
+        *,
+        output: OutputOption,
+        against: AgainstOption = None,
+        columns: ColumnsOption = None,
+        settings: SettingsOption = "recorded",
+        jobs: JobsOption = None,
+        scheduler: SchedulerOption = None,
+        config: ConfigOption = None,
+    ) -> None:
+        from gateway.season.batch.flight_tasks import FuseTask, ReportTask
+
+        if name == "report" and not _can_make_pages():
+            refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
+        work = SeasonWork(files, config, jobs, scheduler)
+        task = {"fuse": FuseTask, "report": ReportTask}[name]
+        options = season_options(config, columns, settings)
+        _finish(work.run(task(options), work.items(), output), output, against)
 
 
-@group.command()
-def report(
-    files: SeasonFiles,
-    *,
-    output: OutputOption,
-    against: AgainstOption = None,
-    columns: ColumnsOption = None,
-    settings: SettingsOption = "recorded",
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    config: ConfigOption = None,
-) -> None:
-    """Make the page of each of many recordings, and one of the season."""
-    from gateway.season.batch.flight_tasks import ReportTask
-
-    if not _can_make_pages():
-        refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
-    work = SeasonWork(files, config, jobs, scheduler)
-    task = ReportTask(season_options(config, columns, settings))
-    _finish(work.run(task, work.items(), output), output, against)
+_add_judging(
+    "fuse",
+    "Fuse many recordings with every estimator, judge each by withheld fixes, make one page.",
+)
+_add_judging("report", "Make the page of each of many recordings, and one of the season.")
 
 
 @group.command()
@@ -179,7 +169,7 @@ def sweep(
 def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
     from gateway.season.batch.season_page import errors_of, flight_table, write_season_page
-    from gateway.season.reckoning.season_errors import errors_by_group
+    from gateway.season.statistics.season_errors import errors_by_group
 
     compared = None if against is None else _compare(results, against)
     grid = table_of(
@@ -208,7 +198,7 @@ def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | Non
 def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
     from gateway.season.batch.result_folder import read_results
     from gateway.season.batch.season_page import errors_of
-    from gateway.season.reckoning.season_errors import versus
+    from gateway.season.statistics.season_errors import versus
 
     with refusing():
         found = versus(errors_of(results), errors_of([*read_results(against)]))

@@ -26,8 +26,8 @@ from gateway.config import GatewaySettings, render
 from gateway.flights.reading import ReadOptions
 from gateway.output import check_output, write_new
 from gateway.season.batch.flight_tasks import FlightResult, SweepTask
-from gateway.season.reckoning.cross_validation import Choice, FloatArray, choose
-from gateway.season.reckoning.season_errors import group_of
+from gateway.season.statistics.cross_validation import Choice, FloatArray, choose
+from gateway.season.statistics.season_errors import group_of
 
 
 def run_season_sweep(

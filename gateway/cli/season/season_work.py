@@ -1,5 +1,6 @@
 """Many recordings as a command: where they are, who does the work, how far it is."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -54,8 +55,10 @@ class SeasonWork:
 
     def items(self, *, each_file: bool = False) -> list[BatchItem]:
         """Find the recordings; what is not there ends the command."""
-        if any(map(is_url, self.names)) and not has_fsspec():
-            refuse(f"URLs need fsspec, the extra mavgate[batch]:\n{how_to_add('batch')}")
+        if any(map(is_url, self.names)):
+            if not has_fsspec():
+                refuse(f"URLs need fsspec, the extra mavgate[batch]:\n{how_to_add('batch')}")
+            _quieten_storages()
         wanted: Wanted = "all" if each_file else "tables"
         names: list[str] = []
         with refusing():
@@ -134,6 +137,13 @@ def season_options(
                 columns=read_column_map(columns),
             )
         )
+
+
+def _quieten_storages() -> None:
+    """Leave out what storages log of each connection, unless details are wanted."""
+    log = logging.getLogger()
+    if log.level == logging.INFO:
+        log.setLevel(logging.WARNING)
 
 
 def failures(results: Sequence[FlightResult]) -> int:

@@ -1,10 +1,11 @@
 """What can be done to each recording of a season: the same here and on any machine."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 import msgspec
 
@@ -21,8 +22,8 @@ from gateway.flights.fused_rows import fused_lines
 from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, joined_rows, open_rows
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.replay import header_for
-from gateway.season.batch.storage import BatchItem, StorageError, local_files
-from gateway.season.reckoning.flight_facts import began_text
+from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
+from gateway.season.statistics.flight_facts import began_text
 from gateway.sensing.calibration import NodeCalibration
 
 HELD: Final = "held_m"
@@ -94,71 +95,76 @@ class FlightTask(Protocol):
 
 
 @dataclass(frozen=True)
-class FuseTask:
-    """Fuse with every estimator, judge each by withheld fixes, write the settings' own states."""
+class _ReadingTask:
+    """A task of which all that changes the outcome is how the recording is read."""
 
+    name: ClassVar[str]
     options: ReadOptions
-    name: str = "fuse"
 
     @property
     def fingerprint(self) -> bytes:
         """See `FlightTask`."""
         return options_bytes(self.options)
+
+
+class _JudgingTask(_ReadingTask, ABC):
+    """Fuses with every estimator, and judges each by withheld fixes."""
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
         read = read_season_flight(files, self.options, name)
         case = make_case(read.flight)
-        states = fuse_states(read.flight, case.fusion, case.sensed)
-        lines = fused_lines(read.header, read.flight.time_us, states)
-        written = {f"fused/{name}.csv": b"".join(lines)}
-        return Worked(read.vehicle, read.began, _figures(case), written)
+        return Worked(read.vehicle, read.began, _figures(case), self._files_of(read, case, name))
+
+    @abstractmethod
+    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files: ...
 
 
 @dataclass(frozen=True)
-class ReportTask:
+class FuseTask(_JudgingTask):
+    """Fuse with every estimator, judge each by withheld fixes, write the settings' own states."""
+
+    name: ClassVar[str] = "fuse"
+
+    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:
+        states = fuse_states(read.flight, case.fusion, case.sensed)
+        lines = fused_lines(read.header, read.flight.time_us, states)
+        return {f"fused/{name}.csv": b"".join(lines)}
+
+
+@dataclass(frozen=True)
+class ReportTask(_JudgingTask):
     """Make the page of each flight."""
 
-    options: ReadOptions
-    name: str = "report"
+    name: ClassVar[str] = "report"
 
-    @property
-    def fingerprint(self) -> bytes:
-        """See `FlightTask`."""
-        return options_bytes(self.options)
-
-    def do(self, files: list[Path], name: str) -> Worked:
-        """See `FlightTask`."""
+    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:  # noqa: ARG002
         # They need what may be missing, and load for a second.
         from gateway.analysis.reporting.compose import make_report
         from gateway.analysis.reporting.page import write_report
 
-        read = read_season_flight(files, self.options, name)
-        case = make_case(read.flight)
         with TemporaryDirectory(prefix="mavgate-") as folder:
             write_report(make_report(case), Path(folder), jobs=1)
             pages = sorted(Path(folder).iterdir())
-            written = {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
-        return Worked(read.vehicle, read.began, _figures(case), written)
+            return {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
 
 
 @dataclass(frozen=True)
-class SweepTask:
+class SweepTask(_ReadingTask):
     """Score every point of a grid of settings."""
 
-    options: ReadOptions
     axes: tuple[Axis, ...]
     metric_column: str
     hold_out: int
     interval_s: float
-    name: str = "sweep"
+    name: ClassVar[str] = "sweep"
 
     @property
     def fingerprint(self) -> bytes:
         """See `FlightTask`."""
         axes = [(axis.key, axis.values) for axis in self.axes]
         asked = (axes, self.metric_column, self.hold_out, self.interval_s)
-        return options_bytes(self.options) + msgspec.json.encode(asked)
+        return super().fingerprint + msgspec.json.encode(asked)
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
@@ -179,16 +185,10 @@ class SweepTask:
 
 
 @dataclass(frozen=True)
-class InfoTask:
+class InfoTask(_ReadingTask):
     """Tell what is in each file."""
 
-    options: ReadOptions
-    name: str = "info"
-
-    @property
-    def fingerprint(self) -> bytes:
-        """See `FlightTask`."""
-        return options_bytes(self.options)
+    name: ClassVar[str] = "info"
 
     def do(self, files: list[Path], name: str) -> Worked:  # noqa: ARG002
         """See `FlightTask`."""
@@ -238,20 +238,30 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
     ----------
     task : FlightTask
     known : tuple
-        The recording, its digest, its key, and the name for what is written.
+        The recording, its stamp, its key, and the name for what is written.
+
+    Raises
+    ------
+    StorageError, OSError
+        If the recording cannot be had at the moment.
     """
-    item, digest, key, name = known
+    item, stamp, key, name = known
     result = FlightResult(
-        place=item.place, digest=digest, key=key, task=task.name, version=__version__
+        place=item.place, digest=stamp, key=key, task=task.name, version=__version__
     )
-    try:
-        with local_files(item) as files:
+    with local_files(item) as files:
+        if item.is_fetched:
+            result = msgspec.structs.replace(result, digest=digest_of_files(files))
+        try:
             worked = task.do(files, name)
-    except SweepError:
-        # It is the question that is wrong, not the recording.
-        raise
-    except (FlightError, StorageError, ValueError) as error:
-        return msgspec.structs.replace(result, error=str(error) or type(error).__name__), {}
+        except SweepError:
+            # It is the question that is wrong, not the recording.
+            raise
+        except (FlightError, ValueError) as error:
+            text = str(error) or type(error).__name__
+            for part, file in zip(item.parts, files, strict=True):
+                text = text.replace(str(file), without_user(part.place))
+            return msgspec.structs.replace(result, error=text), {}
     return (
         msgspec.structs.replace(
             result,

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from gateway.season.batch.flight_tasks import HELD, FlightResult
-from gateway.season.reckoning.season_errors import (
+from gateway.season.statistics.season_errors import (
     FlightErrors,
     GroupErrors,
     Versus,

@@ -10,7 +10,7 @@ import msgspec
 from gateway import __version__
 from gateway.season.batch.flight_tasks import FlightResult, FlightTask, name_of, work_on
 from gateway.season.batch.result_folder import ResultFolder
-from gateway.season.batch.storage import BatchItem, digest_of_item
+from gateway.season.batch.storage import BatchItem, stamp_of_item
 from gateway.season.executors import Executor, WorkFailed
 
 Tell = Callable[[str, int, int], None]
@@ -46,29 +46,29 @@ def run_season(
     found: list[FlightResult | None] = [None] * len(items)
     todo: list[tuple[BatchItem, str, str, str]] = []
     numbers: list[int] = []
-    digests = _digests(items, executor, tell)
-    names = _names(items, digests)
-    for number, (item, digest) in enumerate(zip(items, digests, strict=True)):
-        if isinstance(digest, WorkFailed):
-            found[number] = _failed(task, item, "", "", digest)
+    stamps = _stamps(items, executor, tell)
+    names = _names(items, stamps)
+    for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
+        if isinstance(stamp, WorkFailed):
+            found[number] = _failed(task, item, "", "", stamp)
             continue
-        key = _key(task, digest)
+        key = _key(task, stamp)
         kept = folder.find(key) if folder is not None else None
         if kept is not None:
             found[number] = msgspec.structs.replace(kept, place=item.place)
         else:
-            todo.append((item, digest, key, names[number]))
+            todo.append((item, stamp, key, names[number]))
             numbers.append(number)
     done = len(items) - len(todo)
     for place, outcome in executor.run(partial(work_on, task), todo):
-        item, digest, key, _ = todo[place]
+        item, stamp, key, _ = todo[place]
         if isinstance(outcome, WorkFailed):
-            result = _failed(task, item, digest, key, outcome)
+            result = _failed(task, item, stamp, key, outcome)
         else:
             result, files = outcome
             if result.version != __version__:
                 reason = WorkFailed(f"done by mavgate {result.version}; here is {__version__}")
-                result = _failed(task, item, digest, key, reason)
+                result = _failed(task, item, stamp, key, reason)
             elif folder is not None:
                 folder.keep(result, files)
         found[numbers[place]] = result
@@ -77,35 +77,35 @@ def run_season(
     return [result for result in found if result is not None]
 
 
-def _digests(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[str | WorkFailed]:
+def _stamps(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[str | WorkFailed]:
     found: list[str | WorkFailed] = [""] * len(items)
-    for done, (number, outcome) in enumerate(executor.run(digest_of_item, items), 1):
+    for done, (number, outcome) in enumerate(executor.run(stamp_of_item, items), 1):
         found[number] = outcome
         tell("looking for changes", done, len(items))
     return found
 
 
-def _names(items: Sequence[BatchItem], digests: Sequence[str | WorkFailed]) -> list[str]:
-    """Name what is written; where two recordings have one name, with a part of their digests."""
+def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
+    """Name what is written; where two recordings have one name, with a part of their stamps."""
     names = [name_of(item) for item in items]
     often = Counter(names)
     return [
-        f"{name}-{digest[:8]}" if often[name] > 1 and isinstance(digest, str) else name
-        for name, digest in zip(names, digests, strict=True)
+        f"{name}-{stamp[:8]}" if often[name] > 1 and isinstance(stamp, str) else name
+        for name, stamp in zip(names, stamps, strict=True)
     ]
 
 
-def _key(task: FlightTask, digest: str) -> str:
-    told = "\n".join((task.name, digest, __version__)).encode()
+def _key(task: FlightTask, stamp: str) -> str:
+    told = "\n".join((task.name, stamp, __version__)).encode()
     return sha256(told + b"\n" + task.fingerprint).hexdigest()[:32]
 
 
 def _failed(
-    task: FlightTask, item: BatchItem, digest: str, key: str, failure: WorkFailed
+    task: FlightTask, item: BatchItem, stamp: str, key: str, failure: WorkFailed
 ) -> FlightResult:
     return FlightResult(
         place=item.place,
-        digest=digest,
+        digest=stamp,
         key=key,
         task=task.name,
         version=__version__,

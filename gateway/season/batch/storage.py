@@ -1,6 +1,8 @@
 """Recordings wherever they are: local paths, and anything that fsspec opens by a URL."""
 
+import re
 import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
@@ -14,15 +16,30 @@ import msgspec
 
 from gateway.edges.disk.recording_streams import CHUNK, GZIP
 from gateway.edges.disk.recordings import parts_together, recording_name
+from gateway.season.executors import WorkError
 from gateway.season.hangar.indexing import ENDINGS, digest_of, recordings_below
 
 MARK: Final = "://"
 """What makes a name a URL."""
 OF_ONE_PROCESS: Final = "memory"
 """A file system that no other process sees: its files travel with the work."""
+HERE: Final = "file"
+"""The file system that needs no package."""
+REMOTE_ENDINGS: Final = (*ENDINGS, ".parquet", ".ulg", ".bin")
+"""Of recordings in a folder elsewhere, whose files are not opened only to see what they are."""
+STAMPS: Final = (
+    "ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "last_modified", "updated",
+)  # fmt: skip
+"""What storages call that by which a file can be told from what it was before."""
+PACKAGES: Final = {
+    "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko",
+    "ssh": "paramiko", "az": "adlfs", "abfs": "adlfs", "http": "aiohttp", "https": "aiohttp",
+}  # fmt: skip
+"""What fsspec needs beside itself, by the scheme of the URL."""
+_USER: Final = re.compile(r"(?<=://)[^/@]*@")
 
 
-class StorageError(Exception):
+class StorageError(WorkError):
     """A place that cannot be reached; the text says which and why."""
 
 
@@ -42,13 +59,23 @@ class BatchItem(msgspec.Struct, frozen=True):
 
     @property
     def place(self) -> str:
-        """Where its first part is: what it is called."""
-        return self.parts[0].place
+        """Where its first part is: what it is called; without a user's name and password."""
+        return without_user(self.parts[0].place)
+
+    @property
+    def is_fetched(self) -> bool:
+        """Whether a part of it has to be fetched from elsewhere."""
+        return any(part.data is None and is_url(part.place) for part in self.parts)
 
 
 def is_url(name: str) -> bool:
     """Return whether a name is a URL and no path."""
     return MARK in name
+
+
+def without_user(url: str) -> str:
+    """Return a URL as it may be shown and kept: what logs in is left out."""
+    return _USER.sub("", url)
 
 
 def has_fsspec() -> bool:
@@ -83,10 +110,23 @@ def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem
     ]
 
 
-def digest_of_item(item: BatchItem) -> str:
-    """Return the SHA-256 of a recording's files; raises OSError."""
+def stamp_of_item(item: BatchItem) -> str:
+    """Return what changes when a recording does, in hexadecimal digits.
+
+    That is the SHA-256 of its files, or of what their storage tells of them, where they need not be
+    fetched for it; raises OSError and StorageError.
+    """
+    if item.is_fetched:
+        told = [_told_by_storage(part) for part in item.parts]
+        if all(told):
+            return sha256("\n".join(told).encode()).hexdigest()
     with local_files(item) as paths:
-        digests = [digest_of(path) for path in paths]
+        return digest_of_files(paths)
+
+
+def digest_of_files(paths: Sequence[Path]) -> str:
+    """Return the SHA-256 of a recording's files; raises OSError."""
+    digests = [digest_of(path) for path in paths]
     return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
@@ -101,8 +141,8 @@ def local_files(item: BatchItem) -> Iterator[list[Path]]:
 
     Raises
     ------
-    OSError
-        If one cannot be read.
+    StorageError
+        If one cannot be fetched.
     """
     if not any(part.data is not None or is_url(part.place) for part in item.parts):
         yield [Path(part.place) for part in item.parts]
@@ -120,7 +160,11 @@ def _fetched(part: StoredFile, folder: Path) -> Path:
         path.write_bytes(part.data)
         return path
     storage, remote = _storage(part.place)
-    with storage.open(remote, "rb") as source, path.open("wb") as target:
+    with (
+        _storage_errors(part.place),
+        storage.open(remote, "rb") as source,
+        path.open("wb") as target,
+    ):
         shutil.copyfileobj(source, target, CHUNK)
     return path
 
@@ -130,19 +174,24 @@ def _places(name: str) -> list[str]:
         path = Path(name)
         return [str(found) for found in recordings_below(path)] if path.is_dir() else [name]
     storage, remote = _storage(name)
-    try:
+    with _storage_errors(name):
         if "*" in remote:
             found = storage.glob(remote)
         elif storage.isdir(remote):
             found = storage.find(remote)
         else:
             return [name]
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{name}: {error}") from error
-    places = [storage.unstrip_protocol(place) for place in sorted(found)]
-    places = [place for place in places if _ending(Path(place)) in ENDINGS]
+    # A host that is in the URL is not in the path.
+    plain = name.rstrip("/")
+    begin = plain.removesuffix(remote) if plain.endswith(remote) else None
+    places = [
+        storage.unstrip_protocol(place) if begin is None else begin + place
+        for place in sorted(found)
+        if _ending(Path(place)) in REMOTE_ENDINGS
+    ]
     if not places:
-        raise StorageError(f"{name}: no recording is there ({', '.join(ENDINGS)})")
+        endings = ", ".join(REMOTE_ENDINGS)
+        raise StorageError(f"{without_user(name)}: no recording is there ({endings})")
     return places
 
 
@@ -150,18 +199,50 @@ def _part(place: str) -> StoredFile:
     if not is_url(place):
         return StoredFile(str(Path(place).absolute()))
     storage, remote = _storage(place)
-    local = OF_ONE_PROCESS in (storage.protocol, *storage.protocol)
-    return StoredFile(place, storage.cat_file(remote) if local else None)
+    protocols = {storage.protocol} if isinstance(storage.protocol, str) else {*storage.protocol}
+    if HERE in protocols:
+        return StoredFile(remote)
+    with _storage_errors(place):
+        return StoredFile(place, storage.cat_file(remote) if OF_ONE_PROCESS in protocols else None)
+
+
+def _told_by_storage(part: StoredFile) -> str:
+    """Return a file's place, size and change as its storage tells them; nothing if it does not."""
+    if part.data is not None or not is_url(part.place):
+        return ""
+    storage, remote = _storage(part.place)
+    with _storage_errors(part.place):
+        facts = storage.info(remote)
+    stamps = [str(facts[name]) for name in STAMPS if facts.get(name)]
+    return "\t".join([without_user(part.place), str(facts.get("size")), *stamps]) if stamps else ""
 
 
 def _storage(url: str) -> tuple[Any, str]:
     """Return a file system of fsspec and the path in it; raises StorageError."""
     fsspec = import_module("fsspec")
     try:
-        storage, remote = fsspec.core.url_to_fs(url)
-    except (ImportError, ValueError, OSError) as error:
-        raise StorageError(f"{url}: {error}") from error
+        with _storage_errors(url):
+            storage, remote = fsspec.core.url_to_fs(url)
+    except ImportError as error:
+        package = PACKAGES.get(url.partition(MARK)[0])
+        how = f"{sys.executable} -m pip install {package}" if package else str(error)
+        raise StorageError(f"{without_user(url)}: needs another package:\n{how}") from error
     return storage, remote
+
+
+@contextmanager
+def _storage_errors(url: str) -> Iterator[None]:
+    """Make a StorageError of whatever a storage raises but for a missing package."""
+    try:
+        yield
+    except (ImportError, StorageError):
+        raise
+    except FileNotFoundError as error:
+        raise StorageError(f"{without_user(url)}: is not there") from error
+    # Each of fsspec's storages has exceptions of its own packages.
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        raise StorageError(f"{without_user(url)}: {without_user(text)}") from error
 
 
 def _ending(path: Path) -> str:

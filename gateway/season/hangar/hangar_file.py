@@ -11,9 +11,9 @@ from urllib.parse import quote
 
 import msgspec
 
-from gateway.season.reckoning.flight_facts import FlightFacts
-from gateway.season.reckoning.recording_tally import Flown
-from gateway.season.reckoning.track_shape import Place, feature, feature_collection
+from gateway.season.statistics.flight_facts import FlightFacts
+from gateway.season.statistics.recording_tally import Flown
+from gateway.season.statistics.track_shape import Place, feature, feature_collection
 
 HANGAR_NAME: Final = "hangar.sqlite"
 SCHEMA: Final = 1

@@ -23,7 +23,7 @@ from gateway.edges.disk.recordings import recording_name
 from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
 from gateway.season.executors import Executor, WorkFailed
 from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
-from gateway.season.reckoning.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows
+from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows
 
 ENDINGS: Final = (".tlog", ".csv")
 """Files of other endings are looked at where a format knows their first bytes."""

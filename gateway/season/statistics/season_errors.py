@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.season.reckoning.chance import Lead, lead_of
+from gateway.season.statistics.chance import Lead, lead_of
 
 WORSE: Final = 1.05
 WORSE_M: Final = 0.05

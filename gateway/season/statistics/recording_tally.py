@@ -1,4 +1,4 @@
-"""The flights of one recording, reckoned from its bytes without reading all of them."""
+"""The flights of one recording, computed from its bytes without reading all of them."""
 
 import struct
 from collections.abc import Iterable
@@ -14,8 +14,8 @@ from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, T
 from gateway.flightlog.tlog.recorded_commands import is_station
 from gateway.flightlog.tlog.tlog import Batch, TlogIndex
 from gateway.records import NavFlags, NodeStatus
-from gateway.season.reckoning.flight_facts import FlightFacts, FlightTally, began_text, lost_share
-from gateway.season.reckoning.track_shape import Place
+from gateway.season.statistics.flight_facts import FlightFacts, FlightTally, began_text, lost_share
+from gateway.season.statistics.track_shape import Place
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 
 SYS_STATUS_ID: Final = 1
@@ -46,7 +46,7 @@ Flown = tuple[FlightFacts, list[Place]]
 
 
 class RowsTally:
-    """Reckons a table, or the rows that another format was read as."""
+    """Sums up a table, or the rows that another format was read as."""
 
     def __init__(self) -> None:
         self._tally = FlightTally()
@@ -103,7 +103,7 @@ class RowsTally:
 
 
 class TableSkimmer:
-    """Reckons a table from its bytes: of most rows it reads the times alone."""
+    """Sums up a table from its bytes: of most rows it reads the times alone."""
 
     def __init__(self) -> None:
         self._tally, self._reader = RowsTally(), TableReader()
@@ -176,7 +176,7 @@ class TableSkimmer:
 
 
 def tally_rows(rows: Iterable[TableRow], header: TableHeader) -> list[Flown]:
-    """Reckon a flight of another format from its rows."""
+    """Sum up a flight of another format from its rows."""
     tally = RowsTally()
     for row in rows:
         tally.add_time(row.time_us)
@@ -186,7 +186,7 @@ def tally_rows(rows: Iterable[TableRow], header: TableHeader) -> list[Flown]:
 
 
 class TlogTally:
-    """Reckons a tlog batch by batch, a flight a vehicle."""
+    """Sums up a tlog batch by batch, a flight a vehicle."""
 
     def __init__(self) -> None:
         self._index = TlogIndex()

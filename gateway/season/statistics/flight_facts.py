@@ -1,4 +1,4 @@
-"""What the catalogue tells of one flight, reckoned from its positions and fixes in one pass."""
+"""What the catalogue tells of one flight, computed from its positions and fixes in one pass."""
 
 import math
 from typing import Final
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import GroundWay
-from gateway.season.reckoning.track_shape import Place, simplified
+from gateway.season.statistics.track_shape import Place, simplified
 from gateway.units import US_PER_S
 
 POINT_US: Final = US_PER_S // 10
@@ -146,7 +146,7 @@ def began_text(unix_us: int | None) -> str | None:
 
 
 def lost_share(times_us: NDArray[np.int64]) -> float | None:
-    """Reckon which share of samples is missing between those that came at a steady rate.
+    """Estimate which share of samples is missing between those that came at a steady rate.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.season.reckoning.chance import Lead, lead_of
+from gateway.season.statistics.chance import Lead, lead_of
 
 FOLDS: Final = 10
 

@@ -1,1 +1,0 @@
-"""What is reckoned of many flights: facts, folds, chances; pure."""

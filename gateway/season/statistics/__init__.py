@@ -1,0 +1,1 @@
+"""What is computed from many flights: facts of each, comparisons, cross-validation; pure."""
