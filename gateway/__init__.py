@@ -1,6 +1,6 @@
 """mavgate: a MAVLink telemetry gateway for home-made UAV trackers.
 
-What a program needs to run the stages by itself is here by name, and imported when it is asked for:
+The names that a program needs to run the stages by itself, imported at their first use:
 
     from gateway import AircraftSettings, Outgoing, Pipeline, PipelineSettings
 """
@@ -39,7 +39,7 @@ __all__ = ["__version__", *_MODULE_OF]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of the library when it is first asked for."""
+    """Import a name of the library at its first use."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'gateway' has no attribute {name!r}")
     return getattr(import_module(f"gateway.{_MODULE_OF[name]}"), name)

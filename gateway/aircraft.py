@@ -1,6 +1,6 @@
-"""One aircraft: `sensing → estimation → vehicle`, and what changes their settings as they run.
+"""One aircraft: `sensing → estimation → vehicle`, and changes of their settings as they run.
 
-Pure: time is an argument, and what should happen outside comes back as a list of actions.
+Pure: time is an argument, and effects are returned as a list of actions.
 """
 
 import zlib
@@ -57,14 +57,14 @@ from gateway.vehicle.vehicle_settings import VehicleSettings
 
 @dataclass(frozen=True, slots=True)
 class SettingsChanged:
-    """What comes from here on was fused with other settings."""
+    """The following samples are fused with other settings."""
 
     vehicle_id: int
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
 Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
-"""Frames to send, wishes of clients, and what a recording keeps, in the order of its fusion."""
+"""Frames to send, clients' rates, and records for a recording, in the order of its fusion."""
 
 ABSORB: Final = {
     CalibrationKind.GYRO: remove_gyro_error,
@@ -89,17 +89,17 @@ class Aircraft:
     Parameters
     ----------
     vehicle_id : int
-        In the frames of its nodes; MAVLink system id.
+        Id in the frames of its nodes; MAVLink system id.
     settings : AircraftSettings
         Of all stages.
     clock : SigningClock, optional
         Civil time.
     stamps : StampBook, optional
-        The signing stamps that were taken before.
+        The signing time stamps accepted before.
     stored : StoredPlaces, optional
-        Missions, mark and home kept of an earlier run.
+        Missions, mark and home kept from an earlier run.
     correct : callable, optional
-        Changes the states before they are told: for a playback that knows what comes.
+        Changes the states before they are sent: for a playback, which knows the future.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Aircraft:
 
     @property
     def fusion_state(self) -> FusionState:
-        """All that filters and estimator remember now, and where home is."""
+        """State of filters and estimator, and home."""
         home = self.vehicle.telemetry.home
         return FusionState(
             vehicle_id=self.vehicle_id,
@@ -142,9 +142,9 @@ class Aircraft:
         )
 
     def restore(self, state: FusionState) -> None:
-        """Go on from a state to the last bit; raises ValueError as `make_fusion`.
+        """Restore a state, bit for bit; raises ValueError as `make_fusion`.
 
-        Home is where it was also if the rest does not fit.
+        Home is restored even if the rest does not fit.
         """
         if state.home is not None:
             *place, since_us = state.home
@@ -152,7 +152,7 @@ class Aircraft:
         self._chain, self._estimator = make_fusion(self.settings, state)
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
-        """Let one raw record run through the stages."""
+        """Run one raw record through the stages."""
         match record:
             case ImuRaw():
                 return self._take_imu(record, self._chain.imu(record), now_us)
@@ -169,17 +169,17 @@ class Aircraft:
                 return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
 
     def fuse(self, records: Sequence[ImuRaw | ImuCalibrated]) -> list[FusedSample]:
-        """Let IMU samples run through sensing and estimation alone: the vehicle hears nothing.
+        """Run IMU samples through sensing and estimation only, without the vehicle.
 
         Parameters
         ----------
         records : sequence of ImuRaw or ImuCalibrated
-            Between which neither a height nor a fix came.
+            Without a barometer sample or fix in between.
 
         Returns
         -------
         list of FusedSample
-            What `take` records of each.
+            As `take` returns for each.
         """
         samples = [
             self._chain.imu(record) if isinstance(record, ImuRaw) else self._filter(record)
@@ -200,7 +200,7 @@ class Aircraft:
         ]
 
     def hear(self, record: BaroRaw | GpsFix) -> None:
-        """Let estimation alone take a height or a fix."""
+        """Pass a barometer sample or fix to the estimation only."""
         if isinstance(record, BaroRaw):
             self._estimator.update_baro(self._chain.baro(record))
         else:
@@ -228,7 +228,7 @@ class Aircraft:
         wanted: Iterable[VehicleAction],
         now_us: int,
     ) -> list[Action]:
-        """Put what is recorded behind the frames, which it may not delay, but before a change."""
+        """Order the actions: frames first, then what is recorded, then changes of settings."""
         actions = self.perform(wanted, now_us)
         changed = [action for action in actions if isinstance(action, SettingsChanged)]
         if not changed:
@@ -238,7 +238,7 @@ class Aircraft:
         return [*others, record, *changed]
 
     def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
-        """Carry out what the vehicle asks of the other stages; hand the rest on.
+        """Carry out the vehicle's actions on the other stages; return the rest.
 
         Parameters
         ----------
@@ -261,7 +261,7 @@ class Aircraft:
         return actions
 
     def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
-        """Take a measured error into the calibration, unless no sensor errs so much."""
+        """Correct the calibration by a measured error, unless it is too large for a sensor."""
         try:
             fresh = ABSORB[measured.kind](self.settings.calibration, measured.error_b)
             calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
@@ -273,7 +273,7 @@ class Aircraft:
         return changed + self.perform(found, now_us)
 
     def change(self, settings: AircraftSettings, now_us: int) -> list[Action]:
-        """Take over what differs from the settings that hold, and tell parameters that differ."""
+        """Apply what differs from the present settings, and send the parameters that differ."""
         actions: list[Action] = []
         for section in ("sensing", "calibration", "estimation"):
             wanted = getattr(settings, section)
@@ -283,13 +283,13 @@ class Aircraft:
         return actions
 
     def sign_by(self, passphrase: str, now_us: int) -> list[Action]:
-        """Sign, and check signatures, by another passphrase from now on."""
+        """Sign, and check signatures, with another passphrase from now on."""
         self.settings = with_passphrase(self.settings, passphrase)
         vehicle = self.settings.vehicle
         return self.perform(self.vehicle.take_settings("vehicle", vehicle), now_us)
 
     def _change(self, section: str, settings: Settings) -> list[Action]:
-        """Rebuild the stage whose settings changed; the others go on undisturbed."""
+        """Rebuild the stage whose settings changed; the others keep their state."""
         wanted = msgspec.structs.replace(self.settings, **{section: settings})
         if section in ("sensing", "calibration"):
             self._chain = SensorChain(wanted.sensing, wanted.calibration)
@@ -298,7 +298,7 @@ class Aircraft:
             if wanted.estimation.estimator == self.settings.estimation.estimator:
                 fresh.restore(self._estimator.snapshot())
             self._estimator = fresh
-        # Only now: a stage that cannot be built leaves the settings of the one that runs.
+        # Only now, so that a stage that cannot be built changes no settings.
         self.settings = wanted
         return [] if section == "vehicle" else [SettingsChanged(self.vehicle_id)]
 
@@ -306,14 +306,14 @@ class Aircraft:
 def make_fusion(
     settings: AircraftSettings, state: FusionState | None = None
 ) -> tuple[SensorChain, Estimator]:
-    """Build the two stages that make navigation states of raw records.
+    """Build the two stages that turn raw records into navigation states.
 
     Parameters
     ----------
     settings : AircraftSettings
         Of the aircraft.
     state : FusionState, optional
-        To go on from; else they begin afresh.
+        To restore; without it they start fresh.
 
     Returns
     -------
@@ -336,7 +336,7 @@ def make_fusion(
 
 
 def _fits(settings: AircraftSettings) -> str:
-    """Tell version and settings apart from all others, in a few letters."""
+    """Return a short checksum of version and settings."""
     fused_with = (settings.sensing, settings.estimation, settings.calibration)
     return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
 

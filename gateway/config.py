@@ -1,4 +1,4 @@
-"""The settings file: TOML in, one checked tree of settings out, and the documented file back.
+"""The settings file: read from TOML, checked, and written as a documented file.
 
 Every section is the settings of one stage or edge, declared beside its code. A wrong file is
 refused with all its errors at once, each with file, key, value and what is allowed.
@@ -48,7 +48,7 @@ class GatewaySettings(Settings, frozen=True):
     aircraft_folder: Annotated[
         str,
         setting(
-            "Folder of what differs between aircraft: one file each, named by its vehicle id "
+            "Folder of the aircraft's own settings: one file each, named by its vehicle id "
             '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
             "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
             'Missions, mark and home are kept beside it ("1.places.json").',
@@ -65,7 +65,7 @@ class GatewaySettings(Settings, frozen=True):
 
 
 class ConfigError(Exception):
-    """A settings file that cannot be used; the text has a line for each error."""
+    """An invalid settings file; the text has a line for each error."""
 
 
 def load(path: Path) -> GatewaySettings:
@@ -74,7 +74,7 @@ def load(path: Path) -> GatewaySettings:
     Parameters
     ----------
     path : Path
-        A TOML file; keys that are not there keep their defaults.
+        A TOML file; absent keys keep their defaults.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def load(path: Path) -> GatewaySettings:
     Raises
     ------
     ConfigError
-        If the file cannot be read, is no TOML, or has a key, type or value that is not allowed.
+        If the file cannot be read, is not TOML, or has a key, type or value that is not allowed.
     """
     return msgspec.convert(_read(path, GatewaySettings), GatewaySettings)
 
@@ -94,7 +94,7 @@ def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
     Parameters
     ----------
     settings : GatewaySettings
-        Names the folder, and gives what an aircraft's file leaves out.
+        With the folder, and the values that an aircraft's file leaves out.
 
     Returns
     -------
@@ -122,9 +122,9 @@ def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
 
 
 def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: AircraftSettings) -> Path:
-    """Write what an aircraft has different from the settings file.
+    """Write the settings of an aircraft that differ from the settings file.
 
-    Comments and order of a file that is there already are kept; it is replaced whole or not at all.
+    Comments and order of an existing file are kept; it is replaced whole or not at all.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
     vehicle_id : int
         1 to 31.
     aircraft : AircraftSettings
-        What it has.
+        Its settings.
 
     Returns
     -------
@@ -143,7 +143,7 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
     Raises
     ------
     OSError
-        If the file cannot be written, or what is there is no TOML, which is left alone.
+        If the file cannot be written, or the existing one is not TOML, which is left unchanged.
     """
     file = aircraft_file(settings, vehicle_id)
     document = _document(file)
@@ -159,7 +159,7 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
 
 
 def save_endpoint(file: Path, url: str) -> None:
-    """Add an endpoint to those of a settings file, which is made if it is not there.
+    """Add an endpoint to those of a settings file, which is created if it does not exist.
 
     Comments and order are kept; the file is replaced whole or not at all.
 
@@ -207,12 +207,12 @@ def _write_document(file: Path, document: Any, rights: int) -> None:
 
 
 def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:
-    """Name the file of one aircraft."""
+    """Return the path of one aircraft's file."""
     return aircraft_folder(settings) / f"{vehicle_id}.toml"
 
 
 def aircraft_folder(settings: GatewaySettings) -> Path:
-    """Name the folder of what differs between aircraft."""
+    """Return the folder of the aircraft's files."""
     return Path(settings.aircraft_folder).expanduser()
 
 
@@ -230,7 +230,7 @@ def render(settings: GatewaySettings) -> str:
     """
     head = _comment(
         "Settings of mavgate. Every key may be left out: its value here is the default. "
-        "`mavgate check-config FILE` tells what is wrong with a file."
+        "`mavgate check-config FILE` lists the errors in a file."
     )
     return "\n".join([*head, *_render_section(settings, "")]) + "\n"
 
@@ -254,7 +254,7 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay one tree of settings over another."""
+    """Merge one tree of settings into another."""
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
@@ -266,7 +266,7 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 def _write_difference(
     table: MutableMapping[str, Any], default: Mapping[str, Any], value: Mapping[str, Any]
 ) -> None:
-    """Put into a TOML table what differs from the default, and take out what does not."""
+    """Write what differs from the default to a TOML table, and remove what does not."""
     for key, new in value.items():
         old = default.get(key)
         if new == old:
@@ -285,7 +285,7 @@ def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Itera
         yield from errors
         if not errors:
             sound[key] = value
-    # Each of these is right by itself; what is left are rules between them and within their texts.
+    # Each of these is valid by itself; the remaining rules are between them and within texts.
     try:
         msgspec.convert(sound, kind)
     except msgspec.ValidationError as error:
@@ -310,7 +310,7 @@ def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -
 
 
 def _check_home(path: str, value: Any, field: Field) -> Iterator[str]:
-    """Check that `~` or `~user` at the start of a path stands for a folder."""
+    """Check that `~` or `~user` at the start of a path is a home folder."""
     if field.is_path:
         try:
             Path(value).expanduser()
@@ -333,7 +333,7 @@ def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationE
 
 
 def _choice_hint(value: Any, field: Field) -> str:
-    """Return what may be chosen, and what was probably meant."""
+    """Return the allowed choices, and the one probably meant."""
     if not field.choices:
         return ""
     near = difflib.get_close_matches(str(value), field.choices, n=1)
@@ -369,7 +369,7 @@ def _render_key(field: Field, value: Any) -> Iterator[str]:
 
 
 def _in_toml(value: Any) -> str:
-    """Write a value; tables of a list stay in its brackets, one a line."""
+    """Write a value; tables of a list stay in its brackets, one per line."""
     if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
         tables = []
         for entry in value:

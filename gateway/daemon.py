@@ -1,4 +1,4 @@
-"""The composition root: it alone builds the edges, joins them to the pipeline and ends them."""
+"""The composition root: builds the edges, connects them to the pipeline, and shuts them down."""
 
 import asyncio
 import logging
@@ -59,18 +59,18 @@ SHORTEST_WAIT_S: Final = 0.001
 
 
 class Daemon:
-    """The gateway at work: receiver in, MAVLink out.
+    """The running gateway: receiver in, MAVLink out.
 
     Parameters
     ----------
     settings : GatewaySettings
-        Everything that can be set.
+        All settings.
     aircraft : mapping of int to AircraftSettings
-        What is different for single aircraft, by vehicle id.
+        Settings of single aircraft, by vehicle id.
     read : callable
         Reads the settings again, or raises ConfigError.
     line : iterator of TimedFrame, optional
-        What a simulated receiver says; it then takes the place of the serial port.
+        Frames of a simulated receiver, instead of the serial port.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Daemon:
         return control
 
     def start(self) -> None:
-        """Open everything; needs a running event loop. What is not there yet is tried again."""
+        """Open everything; needs a running event loop. What is missing is retried."""
         if self._settings.hub.realtime_priority:
             set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
@@ -149,15 +149,15 @@ class Daemon:
         self._notifier.ready()
 
     async def control_socket(self) -> Path:
-        """Wait until orders can be taken, and tell where."""
+        """Wait until the control socket listens, and return its path."""
         if self._opening is not None:
             await asyncio.shield(self._opening)
         return self._control.path
 
     def reload(self) -> str:
-        """Take over changed settings of the hub, and signing; clients that stay notice nothing.
+        """Apply changed settings of the hub and of signing; other clients stay connected.
 
-        All others hold from the next start on: ground stations may have changed them meanwhile.
+        Other changes apply at the next start: ground stations may have changed them meanwhile.
 
         Returns
         -------
@@ -167,7 +167,7 @@ class Daemon:
         Raises
         ------
         ConfigError
-            If the settings are wrong; nothing has changed then.
+            If the settings are wrong; then nothing is changed.
         """
         settings = self._read()
         passphrase = settings.vehicle.signing_passphrase
@@ -189,7 +189,7 @@ class Daemon:
         return status
 
     def close(self) -> None:
-        """End everything: first what comes in, then what goes out."""
+        """Close everything: first the inputs, then the outputs."""
         self._notifier.stopping()
         if self._receiver is not None:
             self._receiver.close()
@@ -206,7 +206,7 @@ class Daemon:
         self._hub.close()
 
     def snapshot(self) -> Snapshot:
-        """Describe this moment."""
+        """Return the present state."""
         aircraft = sorted(self._pipeline.aircraft.items())
         return Snapshot(
             time_us=self.now_us(),
@@ -225,17 +225,17 @@ class Daemon:
         )
 
     def _metrics_text(self) -> str:
-        # Not above: most gateways serve no metrics, and need not wait for the library.
+        # Imported here: most gateways serve no metrics, and need not wait for the library.
         from gateway.edges.operator.metric_families import prometheus_text
 
         return prometheus_text(self.snapshot())
 
     def announce(self, text: str) -> None:
-        """Tell the ground stations an event that is no trouble."""
+        """Announce an event that is not a problem to the ground stations."""
         self._announce(False, text)
 
     def toggle_recording(self) -> None:
-        """Start the recorder if it is idle, or stop it, whatever the settings say."""
+        """Start the recorder if it is idle, else stop it, whatever the settings."""
         idle = self._recorder.status().state == SessionState.IDLE
         (self._recorder.record if idle else self._recorder.stop)()
 
@@ -279,8 +279,8 @@ class Daemon:
         actions = self._pipeline.handle(incoming, now_us)
         if (stamps := self._pipeline.stamps_to_keep()) is not None:
             self._stamps.save(stamps)
-        # A ground station's broadcast comes both to us and past us; of strangers only what came to
-        # something is kept.
+        # A ground station's broadcast comes both to us and past us; of strangers only what had an
+        # effect is recorded.
         kept = incoming.trusted or bool(actions)
         if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
             self._recorder.frame(frame)
@@ -296,13 +296,13 @@ class Daemon:
             self._recorder.frame(frame)
 
     def _poll(self) -> None:
-        # First of all: whatever happens below, the next turn comes.
+        # First, so that the next turn comes whatever happens below.
         loop = asyncio.get_running_loop()
         self._timer = loop.call_later(LONGEST_WAIT_S, self._poll)
         now_us = self.now_us()
         self._perform(self._pipeline.poll(now_us))
         for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
-            # After its first heartbeat, before which ground stations hear nothing of it.
+            # After its first heartbeat, before which ground stations ignore its messages.
             self._announce_places(vehicle_id, self._broken_places.pop(vehicle_id))
         self._recorder.set_in_flight(self._pipeline.in_flight)
         trouble, recording = self._recorder.trouble, self._recorder.recording
@@ -313,7 +313,7 @@ class Daemon:
         self._timer = loop.call_later(wait_s, self._poll)
 
     def _perform(self, actions: Iterable[Action]) -> None:
-        """Do outside what the pure stages decided."""
+        """Carry out the actions of the pure stages."""
         for action in actions:
             match action:
                 case Outgoing():
@@ -334,7 +334,7 @@ class Daemon:
                     self._recorder.settings_changed(action.vehicle_id)
 
     def _save(self, vehicle_id: int) -> None:
-        """Write an aircraft's settings to its file, and tell how that went."""
+        """Write an aircraft's settings to its file, and announce the result."""
         aircraft = self._pipeline.find(vehicle_id)
         try:
             file = save_aircraft(self._settings, vehicle_id, aircraft.settings)
@@ -358,7 +358,7 @@ class Daemon:
 
 
 def _status_of(aircraft: Aircraft) -> AircraftStatus:
-    """Gather what the operator wants to see of an aircraft beside its state."""
+    """Return the status of an aircraft besides its navigation state."""
     vehicle, state = aircraft.vehicle, aircraft.state
     home, here = vehicle.telemetry.home, None
     if state is not None and math.isfinite(state.lat_deg + state.lon_deg):

@@ -1,11 +1,11 @@
-"""Extensions: what other installed packages add to the gateway.
+"""Extensions of the gateway by other installed packages.
 
 A package names a function in its `pyproject.toml`:
 
     [project.entry-points."mavgate.extensions"]
     my-extension = "my_package:extend"
 
-It is called once, without arguments, when a `mavgate` command starts, and adds what it brings;
+It is called once, without arguments, when a `mavgate` command starts, and adds to the registries;
 docs/extend.md shows how.
 """
 
@@ -23,7 +23,7 @@ class ExtensionError(Exception):
 
 
 def load_extensions() -> tuple[str, ...]:
-    """Let every installed extension add what it brings.
+    """Call the function of every installed extension.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def load_extensions() -> tuple[str, ...]:
     Raises
     ------
     ExtensionError
-        If one cannot be imported, or what it adds is not taken.
+        If one cannot be imported, or an addition is refused.
     """
     found = []
     for entry in entry_points(group=GROUP):

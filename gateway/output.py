@@ -1,7 +1,7 @@
-"""The one writer of files that a person or the gateway asks for: whole or not at all.
+"""The only writer of output files: whole or not at all.
 
-Nothing that exists is replaced unasked, nothing but a regular file ever, and nothing that is being
-read. What is written beside the target and put in its place in one step survives a loss of power.
+No file is replaced without permission, none that is not a regular file, and none that is being
+read. A file is written beside the target and renamed, so that it survives a power loss.
 """
 
 import contextlib
@@ -14,29 +14,29 @@ from pathlib import Path
 from typing import Final
 
 READABLE: Final = 0o666
-"""Less what the user's mask takes away."""
+"""Less the user's umask."""
 PRIVATE: Final = 0o600
-"""For what holds a passphrase."""
+"""For files with a passphrase."""
 
 
 def check_output(
     path: Path, inputs: Iterable[Path | None] = (), *, overwrite: bool = False
 ) -> None:
-    """Check that a file may be written here, before the work that makes it.
+    """Check that a file may be written here, before the work for it.
 
     Parameters
     ----------
     path : Path
-        The file to be.
+        The output file.
     inputs : iterable of Path or None
-        What it is made of; None for what was not given.
+        The input files; None for those not given.
     overwrite : bool
-        Whether a regular file that is there may be replaced.
+        Whether an existing regular file may be replaced.
 
     Raises
     ------
     OSError
-        FileExistsError if it is there and may not be replaced; otherwise what speaks against it.
+        FileExistsError if it exists and may not be replaced; otherwise the reason.
     """
     try:
         there = path.lstat()
@@ -74,15 +74,15 @@ def write_new(
     Parameters
     ----------
     path : Path
-        Must not be there yet unless it may be overwritten.
+        Must not exist unless it may be overwritten.
     pieces : iterable of bytes
         What to write.
     overwrite : bool
-        Put it in the place of a regular file that is there.
+        Replace an existing regular file.
     inputs : iterable of Path or None
-        What it is made of; none of it is replaced.
+        The input files; none of them is replaced.
     rights : int, optional
-        Who may read and write it; by default those of the file that it replaces, or `READABLE`.
+        Its mode; by default that of the file that it replaces, or `READABLE`.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def write_new(
     Raises
     ------
     OSError
-        As `check_output`, or what the disk does not like.
+        As `check_output`, or if the disk fails.
     """
     check_output(path, inputs, overwrite=overwrite)
     claimed = _claim(path)
@@ -118,10 +118,10 @@ def write_new(
 
 
 def sync_folder(folder: Path) -> None:
-    """Make new names in a folder survive a power cut."""
+    """Sync a folder, so that new names in it survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        # Some file systems (FAT among them) cannot; then there is nothing to be done.
+        # Some file systems (FAT among them) cannot; then there is nothing to do.
         with contextlib.suppress(OSError):
             os.fsync(descriptor)
     finally:
@@ -129,7 +129,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _claim(path: Path) -> bool:
-    """Take the name, so that nobody else does while the work goes on; False if it is taken."""
+    """Create the file, so that no other program takes the name; False if it exists."""
     try:
         path.touch(exist_ok=False)
     except FileExistsError:
@@ -138,7 +138,7 @@ def _claim(path: Path) -> bool:
 
 
 def _mask() -> int:
-    """Return the user's mask of rights, which can be read but by setting it."""
+    """Return the user's umask, which can only be read by setting it."""
     mask = os.umask(0o077)
     os.umask(mask)
     return mask

@@ -1,14 +1,14 @@
-"""From the receiver's bytes to the aircraft they are of: `wire → sensing → estimation → vehicle`.
+"""From the receiver's bytes to each aircraft: `wire → sensing → estimation → vehicle`.
 
     receiver's bytes ─ Link ─ raw records ─┬─ Aircraft 1: SensorChain ─ Estimator ─ Vehicle ─┐
                                            └─ Aircraft 2: …                                  │
     client's frames ──────────────────────────────────────────────────────────── Vehicle ────┤
                                                                                           actions
 
-Pure: time is an argument, and what should happen outside comes back as a list of actions, in
-order. An aircraft comes into being with its first record. One that is silent for `GONE_US` goes,
-and comes back as it was when it is heard again. Live, demo and playback differ only in who calls
-`feed` (bytes) or `take` (raw records of a recording).
+Pure: time is an argument, and effects are returned as a list of actions, in order. An aircraft is
+created with its first record. One that is silent for `GONE_US` disappears, and returns with its
+state when it is heard again. Live, demo and playback differ only in who calls `feed` (bytes) or
+`take` (raw records of a recording).
 """
 
 from collections.abc import Callable, Mapping
@@ -39,7 +39,7 @@ from gateway.wire.mavlink_splitter import origin_of, restamp
 
 REPORT_INTERVAL_US: Final = US_PER_S
 GONE_US: Final = 600 * US_PER_S
-"""An aircraft that was silent for so long is no longer told; longer than a change of batteries."""
+"""An aircraft that was silent for so long disappears; longer than a change of batteries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +50,17 @@ class PipelineSettings:
     aircraft: Mapping[int, AircraftSettings] = field(default_factory=dict)
     """By vehicle id, in place of the default."""
     unix_us_at_zero: int = 0
-    """Civil time at the gateway clock's zero, as well as it is known."""
+    """Civil time at the gateway clock's zero, as far as known."""
     correct: Callable[[NavState], NavState] | None = None
-    """Changes the states before they are told: for a playback that knows what comes."""
+    """Changes the states before they are sent: for a playback, which knows the future."""
     places: Mapping[int, StoredPlaces] = field(default_factory=dict)
-    """Missions, marks and homes kept of an earlier run, by vehicle id."""
+    """Missions, marks and homes kept from an earlier run, by vehicle id."""
     stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
-    """Signing stamps kept of an earlier run, by vehicle id; see `StampBook`."""
+    """Signing time stamps kept from an earlier run, by vehicle id; see `StampBook`."""
 
 
 class Pipeline:
-    """Everything between the source's bytes and the clients' frames.
+    """All stages between the source's bytes and the clients' frames.
 
     Parameters
     ----------
@@ -79,21 +79,21 @@ class Pipeline:
         self._port = ""
         self._report_due_us = 0
         self.aircraft: dict[int, Aircraft] = {}
-        """Those that are there, by vehicle id."""
+        """The present aircraft, by vehicle id."""
         self._gone: dict[int, Aircraft] = {}
         self._heard_us: dict[int, int] = {}
         self.report: LinkReport = self._link.report(0, connected=False, port="")
         """The newest link report, renewed once a second."""
 
     def feed(self, data: bytes, now_us: int) -> list[Action]:
-        """Take bytes of the receiver, read at `now_us`."""
+        """Process bytes of the receiver, read at `now_us`."""
         actions: list[Action] = []
         for record in self._link.feed(data, now_us):
             actions += self.take(record, now_us)
         return actions
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
-        """Take one raw record, from the link or from a recording."""
+        """Process one raw record, from the link or from a recording."""
         if isinstance(record, GpsFix) and record.utc_us is not None:
             vehicle_id = record.node.vehicle_id
             at_zero_us = self._gps_time.hear(vehicle_id, record.utc_us, record.time_us)
@@ -102,7 +102,7 @@ class Pipeline:
         is_new = record.node.vehicle_id not in self.aircraft
         self._heard_us[record.node.vehicle_id] = now_us
         aircraft = self._aircraft_of(record.node.vehicle_id)
-        # Its heartbeat comes first: before it ground stations hear nothing of an aircraft.
+        # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
         first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us) if is_new else []
         return first + aircraft.take(record, now_us)
 
@@ -125,7 +125,7 @@ class Pipeline:
         )
 
     def find(self, vehicle_id: int) -> Aircraft:
-        """Give an aircraft that was heard, also one that has gone; raises KeyError for another."""
+        """Return an aircraft that was ever heard; raises KeyError for another."""
         found = self.aircraft.get(vehicle_id)
         return self._gone[vehicle_id] if found is None else found
 
@@ -133,21 +133,21 @@ class Pipeline:
         return [*self.aircraft.values(), *self._gone.values()]
 
     def change(self, vehicle_id: int, settings: AircraftSettings, now_us: int) -> list[Action]:
-        """Let an aircraft go on with other settings, as it did when it was recorded."""
+        """Change an aircraft's settings, as when it was recorded."""
         aircraft = self.aircraft.get(vehicle_id)
         return [] if aircraft is None else aircraft.change(settings, now_us)
 
     def restore(self, state: FusionState) -> None:
-        """Let an aircraft's fusion go on from a state; raises ValueError as `make_fusion`."""
+        """Restore an aircraft's fusion from a state; raises ValueError as `make_fusion`."""
         self._aircraft_of(state.vehicle_id).restore(state)
 
     def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> list[Action]:
-        """Sign, and check signatures, by other passphrases from now on.
+        """Sign, and check signatures, with other passphrases from now on.
 
         Parameters
         ----------
         common : str
-            Of every aircraft that has none of its own; empty for none.
+            Of every aircraft without its own; empty for none.
         own : mapping of int to str
             By vehicle id.
         now_us : int
@@ -170,17 +170,17 @@ class Pipeline:
         return actions
 
     def stamps_to_keep(self) -> dict[int, Stamps] | None:
-        """Return the signing stamps of all aircraft if they must be written now."""
+        """Return the signing time stamps of all aircraft if they must be written now."""
         if not any(book.is_due for book in self._stamps.values()):
             return None
         return {key: book.to_keep() for key, book in self._stamps.items()}
 
     def newest_stamps(self) -> dict[int, Stamps]:
-        """Return the signing stamps of all aircraft, for an orderly end."""
+        """Return the signing time stamps of all aircraft, for a clean shutdown."""
         return {key: found for key, book in self._stamps.items() if (found := book.exact())}
 
     def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
-        """Give a frame of ours that leaves its number, and a signature if its aircraft signs."""
+        """Set a leaving frame's sequence number, and sign it if its aircraft signs."""
         aircraft = self.aircraft.get(origin_of(frame)[0])
         key = None if aircraft is None else aircraft.vehicle.signing_key
         if key is None:
@@ -188,7 +188,7 @@ class Pipeline:
         return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us))
 
     def connect(self, port: str) -> None:
-        """Note that the source was opened; what was half received is forgotten."""
+        """Note that the source was opened; partly received data is dropped."""
         self._link.reopened()
         self._connected, self._port = True, port
         self._report_due_us = 0
@@ -199,7 +199,7 @@ class Pipeline:
         self._report_due_us = 0
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
-        """Let every aircraft answer a client's frame if it is the one addressed."""
+        """Pass a client's frame to every aircraft; the addressed one answers."""
         actions: list[Action] = []
         for aircraft in self.aircraft.values():
             actions += aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us)
@@ -211,7 +211,7 @@ class Pipeline:
             aircraft.vehicle.forget_client(client_id)
 
     def say(self, status: StatusText, now_us: int) -> list[Action]:
-        """Let every aircraft tell its clients a text."""
+        """Send a text from every aircraft."""
         actions: list[Action] = []
         for aircraft in self.aircraft.values():
             actions += aircraft.perform(aircraft.vehicle.say(status, now_us), now_us)
@@ -223,7 +223,7 @@ class Pipeline:
         Raises
         ------
         ValueError
-            If the place is not on earth, or nothing has been heard of the aircraft.
+            If the position is invalid, or the aircraft was never heard.
         """
         wanted = [a for a in self.aircraft.values() if vehicle_id in (None, a.vehicle_id)]
         if not wanted:
@@ -241,16 +241,16 @@ class Pipeline:
 
     @property
     def refused(self) -> int:
-        """Requests to change something, of clients that may not."""
+        """Requests to change something from clients that may not."""
         return sum(aircraft.vehicle.refusals for aircraft in self._ever())
 
     @property
     def forged(self) -> int:
-        """Requests whose signature was wrong, old, or there before."""
+        """Requests whose signature was wrong, old, or repeated."""
         return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self._ever())
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
-        """Note whether a recording runs, or why not; ground stations are told."""
+        """Note whether a recording runs, or why not; this is announced."""
         actions: list[Action] = []
         for each in self.aircraft.values():
             found = each.vehicle.on_recorder(trouble, now_us, recording=recording)
@@ -258,7 +258,7 @@ class Pipeline:
         return actions
 
     def poll(self, now_us: int) -> list[Action]:
-        """Do what is due by time."""
+        """Return the actions that are due by time."""
         actions: list[Action] = []
         reporting = now_us >= self._report_due_us
         if reporting:

@@ -1,6 +1,6 @@
-"""The player's composition root: recordings opened, laid out as vehicles, played to a hub.
+"""The player's composition root: opens recordings and plays their vehicles to a hub.
 
-It stands beside `daemon.py`, for whoever starts a playback: the command line, a page, a test.
+The counterpart of `daemon.py` for playback: from the command line, the panel, a test.
 """
 
 import asyncio
@@ -34,7 +34,7 @@ RESOLVING: Final = "resolving"
 
 @dataclass(frozen=True, slots=True)
 class PlayPlan:
-    """How to play: range, speed, silences, and what of the recording."""
+    """How to play: range, speed, gaps, and which part of the recording."""
 
     begin: Moment | None = None
     end: Moment | None = None
@@ -43,13 +43,13 @@ class PlayPlan:
     loop: bool = False
     paused: bool = False
     with_commands: bool = False
-    """Play too what stations said and what else asks something of a vehicle."""
+    """Play messages of stations and other requests to a vehicle too."""
     commands_anywhere: bool = False
     """Let recorded commands leave this machine; the user was asked."""
 
 
 def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
-    """Fuse tables up to the begin that the user wants."""
+    """Fuse tables up to the requested start."""
     tracks = [track for flight in flights for track in flight.tracks]
     if plan.begin is not None:
         begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
@@ -58,19 +58,19 @@ def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
 
 
 def endpoints_beyond(settings: HubSettings) -> list[str]:
-    """Return the endpoints that are not on this machine alone."""
+    """Return the endpoints that lead to other machines."""
     return [url for url in settings.endpoints if not stays_here(parse_endpoint(url))]
 
 
 class PlayerDaemon:
-    """A player with its clients: frames of recordings out, answers to what clients ask.
+    """A player with its clients: sends frames of recordings, answers clients' requests.
 
     Parameters
     ----------
     settings : GatewaySettings
         The hub's.
     flights : sequence of PlayedFlight
-        What is played.
+        The flights to play.
     plan : PlayPlan
         How.
     files : sequence of str
@@ -79,7 +79,7 @@ class PlayerDaemon:
     Raises
     ------
     ValueError
-        If recorded commands would leave this machine and nobody was asked.
+        If recorded commands would leave this machine without the user's consent.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class PlayerDaemon:
         PlayerVerbs(self.edge).register(self._control)
 
     async def start(self) -> None:
-        """Open everything and begin; raises ControlError if another player runs."""
+        """Open everything and start; raises ControlError if another player runs."""
         await self._control.start()
         self._hub.start()
         with contextlib.suppress(TimeoutError):
@@ -122,7 +122,7 @@ class PlayerDaemon:
             self.edge.resume()
 
     def close(self) -> None:
-        """End everything."""
+        """Close everything."""
         if self._timer is not None:
             self._timer.cancel()
         self.edge.close()
@@ -142,7 +142,7 @@ class PlayerDaemon:
             max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
             loop=plan.loop,
         )
-        # It waits for the network, and then if the user wants it to.
+        # It waits for the network, and then if the user wants to start paused.
         player.pause(self._now_us())
         return player
 
@@ -176,7 +176,7 @@ class PlayerDaemon:
                 self._hub.send(Outgoing(frame, action.message_id, action.client_id))
 
     def _poll(self) -> None:
-        """Send what is due of long answers, and come again when more is."""
+        """Send the due frames of long answers, and schedule the next call."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -202,14 +202,14 @@ class _Numbering:
         self._added: dict[tuple[int, int], int] = {}
 
     def played(self, frame: bytes) -> bytes:
-        """Give a recorded frame its number behind what was added."""
+        """Return a recorded frame, renumbered after inserted answers."""
         origin = origin_of(frame)
         sequence = sequence_of(frame) + self._added.get(origin, 0) & 0xFF
         self._last[origin] = sequence
         return restamp(frame, sequence)
 
     def inserted(self, frame: bytes) -> bytes:
-        """Give an answer its number, in addition to what was recorded."""
+        """Return an answer, numbered in between the recorded frames."""
         origin = origin_of(frame)
         sequence = self._last[origin] = self._last.get(origin, 0xFF) + 1 & 0xFF
         self._added[origin] = self._added.get(origin, 0) + 1

@@ -5,8 +5,8 @@ navigation frame `_n` is NED. Times are integers in microseconds: `time_us` on t
 (monotonic, zero when the daemon starts), `node_time_us` on a node's own clock. A float that is not
 known is NaN; a whole record that does not exist yet is None.
 
-They are msgspec's structs: made for every sample, they cost an eighth of a frozen dataclass, and
-are none of the garbage collector's business. `msgspec.structs.replace` copies one with changes.
+They are msgspec structs: created for every sample, they cost an eighth of a frozen dataclass, and
+are not tracked by the garbage collector. `msgspec.structs.replace` copies one with changes.
 """
 
 from enum import IntEnum, IntFlag
@@ -22,14 +22,14 @@ UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
 
 class ImuFlags(IntFlag):
-    """State of an IMU node, one bit each; the same bits travel in the radio payload."""
+    """State of an IMU node, one bit each; the same bits as in the radio payload."""
 
     ACCEL_FILTERED = 1 << 0
     """The node has low-passed the acceleration; the gateway must not do it again."""
     GYRO_FILTERED = 1 << 1
     """The node has high-passed the angular rate; the gateway must not do it again."""
     MAG_NEW = 1 << 2
-    """The magnetometer words were sampled since the previous IMU payload."""
+    """The magnetometer values were sampled since the previous IMU payload."""
     MAG_ABSENT = 1 << 3
     BARO_ABSENT = 1 << 4
     SELF_TEST_FAILED = 1 << 5
@@ -37,7 +37,7 @@ class ImuFlags(IntFlag):
     GYRO_CLIPPED = 1 << 7
 
     __and__ = int.__and__  # type: ignore[assignment]
-    """To test a bit is all that it is for: making a flag of the answer costs six times as much."""
+    """Returns a plain int to test a bit: building a flag would cost six times as much."""
 
 
 class GpsFixType(IntEnum):
@@ -52,7 +52,7 @@ class GpsFixType(IntEnum):
 
 
 class NavFlags(IntFlag):
-    """What an estimator is doing and which of its outputs hold."""
+    """State of an estimator, and which of its outputs are valid."""
 
     ATTITUDE_VALID = 1 << 0
     """Roll and pitch have converged."""
@@ -70,7 +70,7 @@ class NavFlags(IntFlag):
     GPS_REJECTED = 1 << 10
     """The newest fixes failed the innovation check and were not used."""
     DEAD_RECKONING = 1 << 11
-    """Position and velocity run on inertial data alone since the last fix is old."""
+    """Position and velocity run on inertial data only, because the last fix is old."""
     SENSOR_FAULT = 1 << 12
     """A sensor is stuck, saturated or not finite, and was left out."""
     DEGRADED = 1 << 13
@@ -106,20 +106,20 @@ class ImuRaw(msgspec.Struct, frozen=True, gc=False):
 
 
 class ImuCalibrated(msgspec.Struct, frozen=True, gc=False):
-    """One IMU sample in SI and body FRD without counts: all that other people's logs have."""
+    """One IMU sample in SI and body FRD without counts, as from other programs' logs."""
 
     time_us: int
     node: NodeId
     accel_b_mps2: Vec3
     gyro_b_radps: Vec3
     mag_b_ut: Vec3 | None
-    """None unless sampled anew."""
+    """None unless newly sampled."""
     temperature_degc: float
     flags: ImuFlags
 
 
 class BaroRaw(msgspec.Struct, frozen=True, gc=False):
-    """One barometer payload on the gateway clock; the node has applied the BMP180's own words."""
+    """One barometer payload on the gateway clock; the node has applied the BMP180's calibration."""
 
     time_us: int
     node: NodeId
@@ -144,14 +144,14 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
     alt_amsl_m: float
     vel_n_mps: Vec3
     alt_ellipsoid_m: float
-    """NaN until a quality payload has told the geoid separation."""
+    """NaN until a quality payload has given the geoid separation."""
     h_acc_m: float
     v_acc_m: float
     speed_acc_mps: float
     course_acc_deg: float
     pdop: float
     utc_us: int | None
-    """Unix time of the fix, or None while the receiver does not vouch for date and time."""
+    """Unix time of the fix, or None while the receiver does not report date and time as valid."""
 
 
 class NodeStatus(msgspec.Struct, frozen=True, gc=False):
@@ -197,19 +197,19 @@ RawRecord = ImuRaw | BaroRaw | GpsFix | NodeStatus
 
 
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
-    """One calibrated IMU sample in body FRD, with its filtered twins."""
+    """One calibrated IMU sample in body FRD, unfiltered and filtered."""
 
     time_us: int
     accel_b_mps2: Vec3
-    """Specific force, calibrated, as wide as the node sends it; level at rest (0, 0, -9.81)."""
+    """Specific force, calibrated, in the node's bandwidth; level at rest (0, 0, -9.81)."""
     gyro_b_radps: Vec3
     accel_lowpass_b_mps2: Vec3
-    """Specific force behind the second-order low-pass; equals `accel_b_mps2` if filtered on the
+    """Specific force after the second-order low-pass; equals `accel_b_mps2` if filtered on the
     node."""
     gyro_highpass_b_radps: Vec3
-    """Angular rate behind the high-pass; equals `gyro_b_radps` if filtered on the node."""
+    """Angular rate after the high-pass; equals `gyro_b_radps` if filtered on the node."""
     mag_b_ut: Vec3 | None
-    """Calibrated magnetic field, None unless sampled anew."""
+    """Calibrated magnetic field, None unless newly sampled."""
     temperature_degc: float
     flags: ImuFlags
 
@@ -225,7 +225,7 @@ class BaroSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class NavState(msgspec.Struct, frozen=True, gc=False):
-    """What an estimator believes at the time of one IMU sample; unknown values are NaN."""
+    """The estimate at the time of one IMU sample; unknown values are NaN."""
 
     time_us: int
     q_nb: Quat
@@ -247,8 +247,8 @@ class NavState(msgspec.Struct, frozen=True, gc=False):
 class FusedSample(msgspec.Struct, frozen=True, gc=False):
     """One IMU sample and the state it led to.
 
-    With the `BaroRaw` and `GpsFix` records that came between two of these, in their order, it is
-    all that a recording needs to be fused again to the same bits.
+    Together with the `BaroRaw` and `GpsFix` records in between, in their order, it is all that a
+    recording needs to be fused again bit for bit.
     """
 
     vehicle_id: int
@@ -259,14 +259,14 @@ class FusedSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class FusionState(msgspec.Struct, frozen=True, gc=False):
-    """All that must be known of one aircraft between two samples to go on as if nothing was."""
+    """The state of one aircraft between two samples that is needed to continue exactly."""
 
     vehicle_id: int
     fits: str
-    """Program and settings that it can be given back to; compared, never read."""
+    """Checksum of version and settings that it can be restored with."""
     sensing: bytes
     estimation: bytes
-    """Written by the stages, and read by nobody else."""
+    """Private to the stages that write them."""
     home: tuple[float, float, float, int] | None = None
     """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
 
@@ -278,7 +278,7 @@ class NodeLink(msgspec.Struct, frozen=True, gc=False):
     pipe: int
     received: int
     lost: int
-    """Gaps in the node's sequence, less what came late."""
+    """Gaps in the node's sequence, less late payloads."""
     duplicates: int
     reordered: int
     restarts: int
@@ -301,7 +301,7 @@ class LinkReport(msgspec.Struct, frozen=True, gc=False):
     frames_lost: int
     """Gaps in the receiver's own frame sequence."""
     faults: tuple[tuple[str, int], ...]
-    """Kind of fault and how often, only kinds that happened."""
+    """Kind and number of faults, only of kinds that occurred."""
     nodes: tuple[NodeLink, ...]
     receiver: ReceiverStatus | None
 
@@ -316,7 +316,7 @@ class Outgoing(msgspec.Struct, frozen=True, gc=False):
 
 
 class ClientInterval(msgspec.Struct, frozen=True, gc=False):
-    """A client's wish for the rate at which it is sent one message of one system."""
+    """A client's requested rate for one message of one system."""
 
     client_id: int
     system_id: int
@@ -333,4 +333,4 @@ class Incoming(msgspec.Struct, frozen=True, gc=False):
     trusted: bool
     """Whether the settings let this client change state."""
     forwarded: bool = False
-    """Whether it also goes to other systems, and so past whoever sees what passes."""
+    """Whether it is forwarded to other systems too, and so recorded there."""

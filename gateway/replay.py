@@ -25,11 +25,11 @@ from gateway.vehicle.telemetry.events import INFO, StatusText
 
 HALF_TURN_DEGE7: Final = 1_800_000_000
 LONGEST_SILENCE_US: Final = 1_000_000
-"""In a longer one the pipeline's timers are not run through one by one."""
+"""In a longer gap the pipeline's timers are not run one by one."""
 
 
 class Replay:
-    """Feeds rows to a pipeline as if they arrived now.
+    """Feed rows to a pipeline as if they arrived now.
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ class Replay:
         self._now_us: int | None = None
 
         self.refused: list[str] = []
-        """Why states of the file were not gone on from: it then settles like a cold start."""
+        """Why states of the file were not restored; then the estimator starts cold."""
 
     def take(
         self, row: TableRow | TableHeader | TableMark | FusionState | NodeStatus
     ) -> Iterator[tuple[int, Action]]:
-        """Take one row, a change of settings, a mark, or a state to go on from.
+        """Process one row, a change of settings, a mark, or a state to restore.
 
         Parameters
         ----------
@@ -60,7 +60,7 @@ class Replay:
         Yields
         ------
         tuple of int and Action
-            Time on the recorded gateway clock, and what the pipeline decided.
+            Time on the recorded gateway clock, and the pipeline's action.
         """
         if isinstance(row, TableHeader):
             if self._follow:
@@ -84,7 +84,7 @@ class Replay:
                 yield now_us, action
 
     def restore(self, state: FusionState) -> bool:
-        """Go on from a state of the file, if it fits; tells whether it does."""
+        """Restore a state of the file, if it fits; return whether it does."""
         try:
             self._pipeline.restore(state)
         except ValueError as error:
@@ -93,7 +93,7 @@ class Replay:
         return True
 
     def _wait(self, until_us: int) -> Iterator[tuple[int, Action]]:
-        """Run what is due by time before the next record; the clock never falls."""
+        """Run the timed actions before the next record; the clock never goes back."""
         now_us = until_us if self._now_us is None else max(self._now_us, until_us)
         if self._now_us is None or now_us - self._now_us > LONGEST_SILENCE_US:
             self._now_us = now_us
@@ -107,13 +107,13 @@ class Replay:
 
 
 def records_of(row: TableRow) -> list[BaroRaw | GpsFix | ImuRaw | ImuCalibrated]:
-    """List a row's records in the order in which they were taken; counts before SI values."""
+    """List a row's records in the order in which they were processed; counts before SI values."""
     records = (row.baro, row.gps, row.raw or row.imu)
     return [record for record in records if record is not None]
 
 
 def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
-    """Return what a table must say of the settings so that it can be fused again.
+    """Return the header that a table needs to be fused again.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 
 
 def settings_of(header: TableHeader) -> AircraftSettings:
-    """Read the settings back with which a table was recorded.
+    """Return the settings with which a table was recorded.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def settings_of(header: TableHeader) -> AircraftSettings:
     Returns
     -------
     AircraftSettings
-        Sections that it does not have keep their defaults.
+        Absent sections keep their defaults.
 
     Raises
     ------
@@ -161,12 +161,12 @@ def settings_of(header: TableHeader) -> AircraftSettings:
 
 
 class InterpolatedPosition:
-    """The paper's playback: straight lines from fix to fix in place of the fused position.
+    """The paper's playback: straight lines between fixes instead of the fused position.
 
     Parameters
     ----------
     fixes : iterable of GpsFix
-        Of one aircraft, in the order of their arrival; taken only as far as the states go.
+        Of one aircraft, in the order of their arrival; read only as far as the states go.
     latency_s : float
         How much earlier than its arrival a fix was valid.
     """
@@ -182,7 +182,7 @@ class InterpolatedPosition:
         self._after = next(self._fixes, None)
 
     def __call__(self, state: NavState) -> NavState:
-        """Put the interpolated position into a state; before and after the fixes it stays."""
+        """Replace a state's position by the interpolated one, except before and after the fixes."""
         arrival_us = state.time_us + self._latency_us
         while self._after is not None and self._after.time_us < arrival_us:
             self._before, self._after = self._after, next(self._fixes, None)
@@ -190,7 +190,7 @@ class InterpolatedPosition:
         if a is None or b is None or arrival_us < a.time_us:
             return state
         way = (arrival_us - a.time_us) / max(b.time_us - a.time_us, 1)
-        # The short way round, so that a flight over the date line does not go round the earth.
+        # The shorter way, so that a flight over the date line does not go around the earth.
         east_dege7 = (b.lon_dege7 - a.lon_dege7 + HALF_TURN_DEGE7) % (2 * HALF_TURN_DEGE7)
         lon_dege7 = a.lon_dege7 + way * (east_dege7 - HALF_TURN_DEGE7)
         return msgspec.structs.replace(

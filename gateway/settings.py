@@ -1,4 +1,4 @@
-"""What every stage's settings share: frozen, strict, and documented where they stand.
+"""Base of every stage's settings: frozen, strict, and documented where they are declared.
 
 A stage declares its own `…Settings(Settings)` beside the code that uses it; each field is
 `Annotated` with `Setting(...)`, which carries its unit, meaning and range. `config.py` only fills
@@ -29,7 +29,7 @@ def setting(
     path: bool = False,
     choices: Collection[str] = (),
 ) -> msgspec.Meta:
-    """Describe one setting: meaning, unit and what is allowed.
+    """Describe one setting: meaning, unit and allowed values.
 
     Parameters
     ----------
@@ -42,11 +42,11 @@ def setting(
     pattern : str, optional
         Regular expression that a text must match.
     rotation : bool
-        Whether the value is the matrix of a rotation, for which people rather give angles.
+        Whether the value is a rotation matrix, which is set by angles as a parameter.
     path : bool
-        Whether the value names a file or folder, where `~` stands for a home.
+        Whether the value is a file or folder, where `~` is the home folder.
     choices : collection of str, optional
-        The allowed texts where they are not known to the type: a registry that may grow. The
+        The allowed texts if the type does not list them, as for a registry that may grow. The
         settings class checks them itself.
 
     Returns
@@ -61,13 +61,13 @@ def setting(
 
 
 def _exact(bound: float | None) -> float | None:
-    """Write a whole bound as an integer: msgspec takes no other for an integer field."""
+    """Return a whole bound as an integer, which msgspec needs for an integer field."""
     return int(bound) if bound is not None and float(bound).is_integer() else bound
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One key of a settings class, with what its annotation tells."""
+    """One key of a settings class, with the facts of its annotation."""
 
     name: str
     type: Any
@@ -89,7 +89,7 @@ class Field:
 
 
 def fields_of(kind: type[Settings]) -> list[Field]:
-    """List the keys of a settings class, plain keys before sections as TOML wants them."""
+    """List the keys of a settings class, plain keys before sections as TOML requires."""
     found = []
     for info in msgspec.structs.fields(kind):
         factory = info.default_factory

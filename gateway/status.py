@@ -1,4 +1,4 @@
-"""One moment of the daemon: what the live view, the status command and the metrics show."""
+"""Status of the daemon at one moment, for the live view, the status command and the metrics."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
 
 @dataclass(frozen=True, slots=True)
 class RecorderStatus:
-    """What the recorder does."""
+    """Status of the recorder."""
 
     state: str
     name: str
@@ -21,19 +21,19 @@ class RecorderStatus:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """The way to a place."""
+    """Distance and bearing to a place."""
 
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
     distance_m: float | None
-    """Over ground; None while the aircraft's own place is not known."""
+    """Over ground; None while the aircraft's position is not known."""
     bearing_deg: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class AircraftStatus:
-    """What is known of one aircraft beside its state."""
+    """Status of one aircraft besides its navigation state."""
 
     vehicle_id: int
     fix: GpsFix | None
@@ -46,7 +46,7 @@ class AircraftStatus:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """All that there is to see of the daemon at one moment."""
+    """Status of the daemon at one moment."""
 
     time_us: int
     report: LinkReport
@@ -60,9 +60,9 @@ class Snapshot:
     places_not_kept: int = 0
     """Changes of missions, marks and homes that could not be written since the start."""
     refused: int = 0
-    """Requests to change something, of clients that may not."""
+    """Requests to change something from clients that may not."""
     forged: int = 0
-    """Requests whose signature was wrong, old, or there before."""
+    """Requests whose signature was wrong, old, or repeated."""
     simulated: bool = False
     """Whether the receiver is the simulated one."""
     aircraft: tuple[AircraftStatus, ...] = ()

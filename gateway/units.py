@@ -1,4 +1,4 @@
-"""Physical constants and the scales between the rim's units and SI."""
+"""Physical constants and the factors between external units and SI."""
 
 from typing import Final
 

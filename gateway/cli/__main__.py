@@ -4,13 +4,13 @@ import os
 import sys
 
 INTERRUPTED = 128 + 2
-"""What a shell tells of a program that Ctrl-C ended."""
+"""Exit code of a program that Ctrl-C ended, as in shells."""
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it without a word at any time."""
+    """Run the command line; Ctrl-C ends it without a message at any time."""
     try:
-        # Not above: half a second of imports is when people think again.
+        # Imported here, so that Ctrl-C works during half a second of imports.
         from gateway.cli.app import main as run
 
         run()

@@ -1,4 +1,4 @@
-"""The command `mavgate`: one group of commands a file."""
+"""The command `mavgate`: one file per group of commands."""
 
 import logging
 import sys

@@ -1,8 +1,8 @@
-"""Every command of `mavgate`, and the file that holds it: imported when it is called.
+"""Every command of `mavgate`, and its file, which is imported when the command is called.
 
-A command imports what it needs, some of it large; to list all of them or to run a small one must
-not cost that. Summaries and panels stand here for the list and, as the first line of the command's
-own text, in its file.
+A command imports what it needs, some of it large; listing all commands or running a small one must
+not cost that. Summaries and panels are here for the list, and again as the first line of the
+command's docstring in its file.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 RECORDINGS: Final = "Recordings"
-GATEWAY: Final = "A gateway that runs"
+GATEWAY: Final = "A running gateway"
 
 
 @dataclass(frozen=True, slots=True)
 class CommandEntry:
-    """Where a command is, and what the list says of it."""
+    """Module and summary of a command."""
 
     module: str
     """Below `gateway.cli`."""
@@ -44,18 +44,18 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "live.calibrate",
         "Calibrate an aircraft's sensors and save the result with its residuals.",
     ),
-    "ports": CommandEntry("live.setup", "List the serial ports, and the one that `auto` takes."),
+    "ports": CommandEntry("live.setup", "List the serial ports, and the one that `auto` selects."),
     "check-config": CommandEntry(
         "live.setup",
-        "Check settings and those of the aircraft, or print all settings with their defaults.",
+        "Check the settings and those of the aircraft, or print all settings with their defaults.",
     ),
     "doctor": CommandEntry(
         "live.doctor",
-        "Tell what is missing here, and what helps: rights, ports, latency, cache, time, disk.",
+        "Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.",
     ),
     "report": CommandEntry(
         "recorded.report",
-        "Make a page of figures and tables of a flight: the paper's own, and more.",
+        "Make a page of figures and tables of a flight, those of the paper included.",
     ),
     "sweep": CommandEntry(
         "recorded.sweep",
@@ -69,8 +69,8 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "Play recordings to the ground stations, several at once if you like.",
         RECORDINGS,
     ),
-    "seek": CommandEntry("recorded.play", "Move the player to a moment.", RECORDINGS),
-    "player": CommandEntry("recorded.play", "Steer the player that runs.", RECORDINGS),
+    "seek": CommandEntry("recorded.play", "Seek in the running player.", RECORDINGS),
+    "player": CommandEntry("recorded.play", "Control the running player.", RECORDINGS),
     "convert": CommandEntry("recorded.convert", "Convert, trim and join recordings.", RECORDINGS),
     "fuse": CommandEntry(
         "recorded.fuse",
@@ -94,12 +94,12 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "recover": CommandEntry(
         "recorded.info",
-        "Write what is sound in a damaged recording to a new file, and tell what was left out.",
+        "Write the intact part of a damaged recording to a new file, and list what was left out.",
         RECORDINGS,
     ),
     "status": CommandEntry(
         "live.clients",
-        "Show how the gateway fares: receiver, nodes, aircraft, clients.",
+        "Show the status of the gateway: receiver, nodes, aircraft, clients.",
         GATEWAY,
     ),
     "clients": CommandEntry("live.clients", "List, add and remove clients and sources.", GATEWAY),
@@ -110,14 +110,14 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "reload": CommandEntry(
         "live.clients",
-        "Apply changed settings of the hub and of signing; clients that stay notice nothing.",
+        "Apply changed settings of the hub and of signing; other clients stay connected.",
         GATEWAY,
     ),
 }
 
 
 def load_command(name: str) -> Any:
-    """Import the file of a command and make it.
+    """Import the file of a command and create it.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Commands for a gateway that runs."""
+"""Commands for a running gateway."""

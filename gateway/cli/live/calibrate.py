@@ -44,15 +44,15 @@ from gateway.units import US_PER_S
 from gateway.wire.link import Link
 
 PATIENCE_S: Final = 10.0
-"""Without a sample for so long, nothing will come."""
+"""Without a sample for so long, give up."""
 POSE_S: Final = 3.0
 REST_S: Final = 5.0
 MAG_S: Final = 45.0
 MAX_TRIES: Final = 24
 MOVING_MPS: Final = 1.0
-"""GPS speed of what is not at rest; a receiver that lies still tells up to 0.3 m/s."""
+"""GPS speed that is not rest; a receiver at rest reports up to 0.3 m/s."""
 MOVING_US: Final = 3 * US_PER_S
-"""For so long after its last word GPS is believed that it moves."""
+"""A movement by GPS counts for this long."""
 
 console = console_of()
 
@@ -80,22 +80,24 @@ def register(app: typer.Typer) -> None:
 
 def calibrate(
     steps: Annotated[
-        list[Step] | None, typer.Argument(help="Which; by default gyro accel mag level.")
+        list[Step] | None, typer.Argument(help="Steps; by default gyro accel mag level.")
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
     log: Annotated[
         Path | None,
-        typer.Option("--log", help="Solve what a recording holds, in place of the live link."),
+        typer.Option("--log", help="Calibrate from a recording instead of the live link."),
     ] = None,
     port: Annotated[
-        str | None, typer.Option("--port", "-p", help="Receiver's port, in place of the settings'.")
+        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
     ] = None,
     field_ut: Annotated[
         float | None,
         typer.Option("--field", min=10.0, max=100.0, help="Strength of the field here, uT."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show, but do not save.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show the result, but do not save it.")
+    ] = False,
     config: ConfigOption = None,
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
@@ -129,9 +131,9 @@ def calibrate(
 def _each(
     steps: list[Step], solve: Solve, calibration: NodeCalibration, save: Save
 ) -> NodeCalibration:
-    """Go through the steps, each saved when it is done: whoever breaks off keeps the others.
+    """Run the steps; each is saved when it is done, so aborting loses only the present one.
 
-    One that fails is said, and the next begun.
+    A failed step is reported, and the next one starts.
     """
     for number, step in enumerate(steps):
         if len(steps) > 1:
@@ -207,7 +209,7 @@ def _log_step(
         case Step.MAG:
             return calibrate_magnetometer(samples, calibration, field_ut)
         case Step.MOUNTING | Step.LEVEL:
-            raise CalibrationError("a recording does not tell which pose was level")
+            raise CalibrationError("a recording does not show which pose was level")
 
 
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
@@ -227,7 +229,7 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
 
 @dataclass(frozen=True, slots=True)
 class _Fix:
-    """What the newest fix tells."""
+    """Data of the newest fix."""
 
     time_us: int = 0
     moving: bool = False
@@ -244,7 +246,7 @@ def _capture_from(serial: SerialSettings, vehicle: int) -> Capture:
 
 @dataclass(slots=True)
 class _Listening:
-    """Reads the receiver until one aircraft's samples span a time."""
+    """Read the receiver until one aircraft's samples span a time."""
 
     serial: SerialSettings
     vehicle: int

@@ -1,4 +1,4 @@
-"""`mavgate status`, `clients …`, `mark`, `reload`: a gateway that runs, and its clients."""
+"""`mavgate status`, `clients …`, `mark`, `reload`: a running gateway and its clients."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,13 +16,13 @@ from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, JsonOption, console_of, table_of
 from gateway.units import US_PER_S
 
-PANEL: Final = "A gateway that runs"
+PANEL: Final = "A running gateway"
 UNKNOWN: Final = "—"
 US_PER_MS: Final = 1000
 MV_PER_V: Final = 1000
 
 Record = Mapping[str, Any]
-"""What a dataclass becomes on the control socket."""
+"""A dataclass, as decoded from the control socket."""
 
 group = AskingTyper(help="List, add and remove clients and sources.", no_args_is_help=True)
 
@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 
 def status(*, json: JsonOption = False) -> None:
-    """Show how the gateway fares: receiver, nodes, aircraft, clients."""
+    """Show the status of the gateway: receiver, nodes, aircraft, clients."""
     snapshot = ask("status")
     if json:
         print(msgspec.json.encode(snapshot).decode())
@@ -51,7 +51,7 @@ def status(*, json: JsonOption = False) -> None:
 
 @group.command("list")
 def list_clients(*, json: JsonOption = False) -> None:
-    """List the clients with what was sent to them, and what got lost on this side."""
+    """List the clients with the frames sent to them and dropped on this side."""
     if json:
         print(msgspec.json.encode(ask("clients.list")).decode())
         return
@@ -63,11 +63,11 @@ def add(
     url: Annotated[str, typer.Argument(help="As in the settings: udp:192.168.1.7:14550?name=…")],
     *,
     save: Annotated[
-        bool, typer.Option("--save", help="Into the settings file too, for the next start.")
+        bool, typer.Option("--save", help="Save it in the settings file too, for the next start.")
     ] = False,
     config: ConfigOption = None,
 ) -> None:
-    """Add a client or a source until the gateway ends, or for good."""
+    """Add a client or a source, until the gateway ends or permanently."""
     _show_endpoints(ask("clients.add", {"url": url}))
     if save:
         _save(config or USER_CONFIG.expanduser(), url)
@@ -78,7 +78,7 @@ def add(
 
 
 def _save(file: Path, url: str) -> None:
-    # Not above: the settings import every stage.
+    # Imported here: the settings import every stage.
     from gateway.config import ConfigError, save_endpoint
 
     try:
@@ -100,7 +100,7 @@ def mark(
     *,
     alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
     aircraft: Annotated[
-        int | None, typer.Option("--aircraft", help="For this one only; by default all.")
+        int | None, typer.Option("--aircraft", help="For this aircraft only; by default all.")
     ] = None,
 ) -> None:
     """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""
@@ -114,7 +114,7 @@ def mark(
 
 
 def reload() -> None:
-    """Apply changed settings of the hub and of signing; clients that stay notice nothing."""
+    """Apply changed settings of the hub and of signing; other clients stay connected."""
     print(ask("reload"))
 
 
@@ -171,7 +171,7 @@ def _node_name(record: Record) -> str:
 
 
 def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
-    """Show what a node reported of itself."""
+    """Show a node's report of its board."""
     if board is None:
         return (*(UNKNOWN,) * 4, overruns, UNKNOWN)
     counts = (str(board[key]) for key in ("bus_errors", "radio_failed", "radio_retries"))

@@ -63,22 +63,18 @@ def demo(
     record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
     flight: Annotated[
         Path | None,
-        typer.Option(
-            "--flight", "-f", help="Send a recording in its place: by its name, or any file."
-        ),
+        typer.Option("--flight", "-f", help="Fly a recording instead: by its name, or any file."),
     ] = None,
     columns: ColumnsOption = None,
     firmware: Annotated[
         bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
     ] = False,
-    panel: Annotated[
-        bool, typer.Option("--panel/--no-panel", help="Show it in a browser too.")
-    ] = True,
+    panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
-    The simulated receiver speaks the real protocol on a pseudo-terminal, at true rates. A recording
-    that is flown in its place begins anew at its end, and says so.
+    The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
+    that is flown instead restarts at its end, with a message.
     """
 
     def read() -> GatewaySettings:
@@ -88,14 +84,14 @@ def demo(
     make_ready(settings.estimation.estimator)
     daemons: list[Daemon] = []
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         log.info(text)
         for daemon in daemons:
             daemon.announce(text)
 
     try:
         if flight is not None:
-            line, aircraft = recorded_line(settings, flight, columns, tell)
+            line, aircraft = recorded_line(settings, flight, columns, report)
         elif firmware:
             line = firmware_line(settings.simulator, unix_time_us())
             aircraft = calibrated_aircraft(settings)
@@ -104,11 +100,11 @@ def demo(
             aircraft = calibrated_aircraft(settings)
     except (FlightFileError, BenchError, ValueError) as error:
         refuse(str(error))
-    # What a ground station has the demo save must not become the real aircraft's calibration.
+    # Settings that a ground station stores in the demo must not become the real aircraft's.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
 
         def apart(settings: GatewaySettings) -> GatewaySettings:
-            # Nor is a flight that goes round and round worth a disk, unless it is asked for.
+            # Nor is an endless demo flight recorded, unless requested.
             recording = replace(settings.recording, mode="always" if record else "manual")
             return replace(settings, aircraft_folder=folder, recording=recording)
 
@@ -124,9 +120,9 @@ def recorded_line(
     settings: GatewaySettings,
     name: Path,
     columns: Path | None = None,
-    tell: Callable[[str], None] = log.info,
+    report: Callable[[str], None] = log.info,
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
-    """Send a recording as its nodes would have, and take its calibrated values as they are.
+    """Send a recording as its nodes would have, with its calibrated values unchanged.
 
     Parameters
     ----------
@@ -136,8 +132,8 @@ def recorded_line(
         Name of a recording, or a file.
     columns : Path, optional
         Column map of another program's CSV.
-    tell : callable
-        Told of every end.
+    report : callable
+        Called with a text at every end.
     """
     with refusing():
         files = files_of([name], folder_of(settings), "tables")
@@ -153,14 +149,14 @@ def recorded_line(
     )
 
     def on_round(number: int) -> None:
-        tell(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")
+        report(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")
 
     frames = fly_again(settings.simulator, flight, on_round, unix_time_us())
     return frames, {settings.simulator.vehicle_id: aircraft}
 
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Calibrate the simulated aircraft as their owner would have done before the flight."""
+    """Calibrate the simulated aircraft, as their owner would do before the flight."""
     found = {}
     for index in range(settings.simulator.vehicles):
         simulated = SimulatedAircraft(settings.simulator, index)

@@ -1,4 +1,4 @@
-"""`mavgate doctor`: what is missing on this machine, and what helps."""
+"""`mavgate doctor`: what is missing on this machine, and how to fix it."""
 
 from typing import Final
 
@@ -17,7 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(*, config: ConfigOption = None) -> None:
-    """Tell what is missing here, and what helps: rights, ports, latency, cache, time, disk.
+    """Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.
 
     It changes nothing. The exit code is 1 if something is wrong.
     """

@@ -106,9 +106,7 @@ def status(*, json: JsonOption = False) -> None:
 @group.command("id")
 def set_id(
     vehicle: Annotated[str, typer.Argument(help="SITE/SYSTEM, as in field-1/1.")],
-    own_id: Annotated[
-        int, typer.Argument(help="System id that it shall have here; 0 leaves it out.")
-    ],
+    own_id: Annotated[int, typer.Argument(help="Its system id here; 0 leaves it out.")],
 ) -> None:
     """Give a vehicle of a site a system id by hand, or none; it is kept."""
     name, _, system = vehicle.rpartition("/")

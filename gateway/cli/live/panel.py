@@ -40,8 +40,8 @@ def panel(
 ) -> None:
     """Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.
 
-    Without --connect it shows the gateway that runs on this machine, and finds it again whenever
-    that is started anew.
+    Without --connect it shows the gateway that runs on this machine, and reconnects whenever that
+    is restarted.
     """
     try:
         from gateway.panel.panel_server import PanelError, run_panel
@@ -53,7 +53,7 @@ def panel(
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
     if attached:
-        # What is worth a line there comes into the gateway's own log.
+        # Its important lines come into the gateway's own log.
         logging.getLogger().setLevel(logging.WARNING)
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)

@@ -1,4 +1,4 @@
-"""`mavgate record …`: orders to the recorder of a gateway that runs."""
+"""`mavgate record …`: control the recorder of a running gateway."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,19 +46,19 @@ def register(app: typer.Typer) -> None:
 
 @group.command()
 def start() -> None:
-    """Record from now on, whatever the settings say."""
+    """Record from now on, whatever the setting `mode`."""
     _show(ask("record.start"))
 
 
 @group.command()
 def stop() -> None:
-    """Stop recording until the next order or flight."""
+    """Stop recording until the next start or flight."""
     _show(ask("record.stop"))
 
 
 @group.command()
 def status(*, json: JsonOption = False) -> None:
-    """Show what the recorder does."""
+    """Show the status of the recorder."""
     found = ask("record.status")
     if json:
         print(msgspec.json.encode(found).decode())
@@ -72,11 +72,11 @@ def save(
     *,
     recording: Annotated[
         str | None,
-        typer.Option("--recording", help="Which one; by default the one that runs, or ran last."),
+        typer.Option("--recording", help="Recording; by default the current or last one."),
     ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Give a recording a name; nothing is ever overwritten."""
+    """Rename a recording; nothing is ever overwritten."""
     if recording is None and is_running():
         _show(ask("record.save", {"name": name}))
         return
@@ -98,7 +98,7 @@ def delete(
     running = is_running()
     folder = Path(ask("record.status")["folder"]) if running else _folder(config)
     try:
-        # `last` may have become another one while the person thinks.
+        # `last` may have become another one while the user was asked.
         found = find_recording(folder, name)
         if not yes:
             what = f"{found.name!r}: {len(found.files)} files, {found.size / 1e6:.2f} MB"
@@ -132,7 +132,7 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
 
 @group.command()
 def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
-    """Put a remark at this moment into the recording, and tell the ground stations."""
+    """Add a remark to the recording at this moment, and send it to the ground stations."""
     ask("record.note", {"text": text})
 
 
@@ -158,7 +158,7 @@ def _show(status: dict[str, Any]) -> None:
 
 
 def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":
-    # Not above: it brings the compiler along, which an order to the recorder must not wait for.
+    # Imported here: it imports the compiler, for which the other commands must not wait.
     from gateway.flights.glance import glance
 
     return ((recording, glance(recording.files)) for recording in recordings)
@@ -185,6 +185,6 @@ def _clock(seconds: float) -> str:
 
 
 def _path(recording: Recording) -> str:
-    """Return what a shell makes all its files of."""
+    """Return a shell pattern of all its files."""
     first = str(recording.files[0])
     return first if len(recording.files) == 1 else f"{recording.files[0].parent / recording.name}_*"

@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VIEW_INTERVAL_S: Final = 0.5
-"""Twice a second: drawing takes some milliseconds, in which no frame is passed on."""
+"""Twice a second: drawing takes some milliseconds, during which no frame is sent."""
 LOG_INTERVAL_S: Final = 10.0
 
-PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines in place of the live view.")]
+PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
 EndpointOption = Annotated[
     list[str] | None,
-    typer.Option("--endpoint", "-e", help="Where MAVLink goes, in place of the settings'."),
+    typer.Option("--endpoint", "-e", help="Where MAVLink goes, instead of the settings'."),
 ]
 
 
@@ -50,12 +50,12 @@ def run_gateway(
     *,
     config: ConfigOption = None,
     port: Annotated[
-        str | None, typer.Option("--port", "-p", help="Receiver's port, in place of the settings'.")
+        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
     ] = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
     panel: Annotated[
-        bool, typer.Option("--panel", help="Show it in a browser too, whatever the settings say.")
+        bool, typer.Option("--panel", help="Start the panel too, whatever the settings.")
     ] = False,
 ) -> None:
     """Run the gateway on the receiver's serial port until interrupted."""
@@ -75,7 +75,7 @@ def run_gateway(
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
-    """Put the endpoints of the command line in place of the settings'."""
+    """Replace the settings' endpoints by those of the command line."""
     if not endpoints:
         return settings
     try:
@@ -88,7 +88,7 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
 async def serve(
     daemon_of: Callable[[], Daemon], *, plain: bool, panel: PanelProcess | None = None
 ) -> None:
-    """Run a daemon until SIGINT or SIGTERM, showing what it does; SIGHUP reloads the settings.
+    """Run a daemon until SIGINT or SIGTERM, showing its status; SIGHUP reloads the settings.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
-    # What is here by now stays: a full collection that walks all of it stops telemetry for 0.1 s.
+    # Freeze what exists by now: a full garbage collection of it stops telemetry for 0.1 s.
     gc.collect()
     gc.freeze()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
@@ -123,7 +123,7 @@ async def serve(
 
 
 def _open_view() -> "LiveView":
-    # Not above: a service draws nothing.
+    # Imported here: a service draws nothing.
     from gateway.edges.operator.live_view import LiveView
 
     view = LiveView()
@@ -155,7 +155,7 @@ async def _live_view(
             held = not held
 
     keyboard = Keyboard(on_key)
-    # No thread of rich's own: it draws when it is told to, between two samples.
+    # Without rich's own thread: it draws on request, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
         keyboard.start()
         try:

@@ -17,7 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def ports() -> None:
-    """List the serial ports, and the one that `auto` takes."""
+    """List the serial ports, and the one that `auto` selects."""
     found = list_serial_ports()
     table = table_of("device", "setting by USB id", "serial number", "description", left=4)
     for port in found:
@@ -37,11 +37,11 @@ def check_config(
         Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
     ] = None,
 ) -> None:
-    """Check settings and those of the aircraft, or print all settings with their defaults.
+    """Check the settings and those of the aircraft, or print all settings with their defaults.
 
-    All that is wrong is told at once, each with what is allowed.
+    All errors are listed at once, each with the allowed values.
     """
-    # Not above: the settings import every stage, and `ports` must not wait for that.
+    # Imported here: the settings import every stage, and `ports` must not wait for that.
     from gateway.config import (
         ConfigError,
         GatewaySettings,

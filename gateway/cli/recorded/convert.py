@@ -17,11 +17,11 @@ from gateway.cli.support.recording_options import (
     SettingsOption,
     SmoothOption,
     ToOption,
+    print_remarks,
     progress_of,
     read_column_map,
     read_moment,
     refusing,
-    tell_remarks,
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -35,7 +35,7 @@ from gateway.output import write_new
 
 ONE_KIND: Final = ".parquet"
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
-"""What is made of a recording's tlogs: they hold all its vehicles, and what was said."""
+"""Formats made from a recording's tlogs, which hold all its vehicles and messages."""
 
 
 def register(app: typer.Typer) -> None:
@@ -46,31 +46,34 @@ def register(app: typer.Typer) -> None:
 def convert(
     files: Files,
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output; its ending tells the format.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Output; its ending selects the format.")
+    ],
     begin: FromOption = None,
     end: ToOption = None,
     columns: ColumnsOption = None,
     fuse: Annotated[
-        bool, typer.Option("--fuse", help="Fuse a table again in place of its recorded states.")
+        bool,
+        typer.Option("--fuse", help="Fuse a table again instead of using its recorded states."),
     ] = False,
     smooth: SmoothOption = False,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
     system: Annotated[
-        int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to take.")
+        int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
     ] = None,
     message: Annotated[
         str | None,
-        typer.Option("--message", help="For Parquet: this MAVLink message in place of the table."),
+        typer.Option("--message", help="For Parquet: this MAVLink message instead of the table."),
     ] = None,
     config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
     """Convert, trim and join recordings.
 
-    Tlogs and tables become one another, a track for a map, MCAP for Foxglove, or Parquet. Logs of
-    other autopilots (tlog, ULog, DataFlash) become tables that can be fused; a CSV of another
-    program does by its column map.
+    Convert between tlogs and tables, or to a track for a map, MCAP for Foxglove, or Parquet. Logs
+    of other autopilots (tlog, ULog, DataFlash) become tables that can be fused, and so does a CSV
+    of another program, by its column map.
     """
     write = WRITERS.get(out.suffix)
     if write is None:
@@ -104,8 +107,8 @@ def convert(
         )
         inputs = [*files, columns, config]
         size = write_new(out, write(flight), overwrite=force, inputs=inputs)
-    tell_remarks(flight.remarks)
+    print_remarks(flight.remarks)
     lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
     if lacks and message is None:
-        tell_remarks([f"{out} does not hold {lacks}"])
+        print_remarks([f"{out} does not hold {lacks}"])
     console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)

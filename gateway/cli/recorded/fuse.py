@@ -1,4 +1,4 @@
-"""`mavgate fuse`: run an estimator causally over a log, a CSV in and a CSV out."""
+"""`mavgate fuse`: run an estimator causally over a log, from CSV to CSV."""
 
 import itertools
 import re
@@ -18,10 +18,10 @@ from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
     SmoothOption,
+    print_remarks,
     progress_of,
     read_column_map,
     refusing,
-    tell_remarks,
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -76,15 +76,16 @@ def fuse_log(
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write.")],
     estimator: Annotated[
         str | None,
-        typer.Option("--estimator", help="In place of the settings'.", callback=_known_estimator),
+        typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
     ] = None,
     columns: ColumnsOption = None,
     gps_latency_s: Annotated[
         float | None,
-        typer.Option("--gps-latency", min=0.0, max=2.0, help="In place of the settings', s."),
+        typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
     ] = None,
     settings: Annotated[
-        SettingsChoice, typer.Option("--settings", help="For recordings: those of then or today.")
+        SettingsChoice,
+        typer.Option("--settings", help="For recordings: the recorded or the current settings."),
     ] = "recorded",
     smooth: SmoothOption = False,
     config: ConfigOption = None,
@@ -92,11 +93,11 @@ def fuse_log(
 ) -> None:
     """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
 
-    The columns are those of a recording's table, so every command takes the file as one.
+    The columns are those of a recording's table, so every command accepts the file as one.
     Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
     ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
-    Without --config, the words gps_latency_s and declination_deg of such a file's # line count; a
-    latency that it does not tell is estimated from its manoeuvres, or assumed, which is said.
+    Without --config, gps_latency_s and declination_deg in such a file's # lines are used; a
+    latency that is not given there is estimated from its manoeuvres, or assumed, with a message.
     """
     current = read_settings(config)
     with refusing():
@@ -132,26 +133,26 @@ def fuse_log(
             header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
         )
         write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
-    tell_remarks(table.remarks)
+    print_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
 
 
-def _found_latency_s(file: Path, told_s: float | None, options: ReadOptions) -> float:
-    """Estimate the latency that neither a log nor the user tells, or assume the usual; say so."""
-    if told_s is not None:
-        return told_s
+def _found_latency_s(file: Path, given_s: float | None, options: ReadOptions) -> float:
+    """Estimate the latency if neither the log nor the user gives it, or assume the usual one."""
+    if given_s is not None:
+        return given_s
     table = open_rows(file, replace(options, progress=None))
     aircraft = aircraft_of(table, options)
     found = estimate_latency(gather_samples(_records(table), aircraft)[0])
     latency_s = aircraft.estimation.reference.gps_latency_s if found is None else found.latency_s
     how = (
-        f"{latency_s:.2f} s is assumed, for no manoeuvre tells it"
+        f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
         if found is None
-        else f"its manoeuvres tell {latency_s:.3f} s +- {found.std_s:.3f} s, which is taken"
+        else f"{latency_s:.3f} s +- {found.std_s:.3f} s is estimated from its manoeuvres"
     )
     console_of(stderr=True).print(
-        f"{file}: tells no GPS latency; {how}; --gps-latency sets it", markup=False
+        f"{file}: gives no GPS latency; {how}; --gps-latency sets it", markup=False
     )
     return latency_s
 
@@ -161,7 +162,7 @@ def _records(table: RecordedTable) -> Iterator[Record]:
 
 
 def _begin(table: RecordedTable, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
-    """Go on from the state at the table's begin where there is one that fits."""
+    """Start from the state at the table's start if there is one that fits."""
     first = next(table.rows)
     if isinstance(first, FusionState):
         try:
@@ -186,7 +187,7 @@ def fuse(
     chain : SensorChain
         Calibration and filters.
     estimator : Estimator
-        Fresh, or in a state to go on from.
+        Fresh, or restored to a state.
 
     Returns
     -------
@@ -222,7 +223,7 @@ def _sample(chain: SensorChain, record: ImuRaw | ImuCalibrated) -> ImuSample:
 
 
 def _facts_of(path: Path) -> dict[str, float]:
-    """Read the `key=value` words of a foreign file's comments."""
+    """Read the `key=value` pairs in a foreign file's comments."""
     facts: dict[str, float] = {}
     head = next(read_chunks(path), b"").decode("utf-8-sig", errors="replace")
     for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
@@ -255,5 +256,5 @@ def _adjusted(
     try:
         msgspec.convert(msgspec.to_builtins(reference), ReferenceSettings)
     except msgspec.ValidationError as error:
-        raise FlightError(f"what the file's # line says cannot be: {error}") from error
+        raise FlightError(f"its # line has an invalid value: {error}") from error
     return msgspec.structs.replace(aircraft, estimation=estimation)

@@ -1,4 +1,4 @@
-"""`mavgate info` and `mavgate recover`: what a recording holds, and what can be saved of it."""
+"""`mavgate info` and `mavgate recover`: summarise a recording, and repair a damaged one."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -43,9 +43,9 @@ from gateway.output import write_new
 from gateway.units import US_PER_S
 
 SHOWN: Final = 8
-"""Gaps and damaged places that are told one by one."""
+"""Gaps and damaged places that are listed one by one."""
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 def register(app: typer.Typer) -> None:
@@ -60,7 +60,7 @@ def info(
     ],
     *,
     columns: ColumnsOption = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: a line a file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
     config: ConfigOption = None,
 ) -> None:
     """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
@@ -89,7 +89,7 @@ def recover(
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Write what is sound in a damaged recording to a new file, and tell what was left out.
+    """Write the intact part of a damaged recording to a new file, and list what was left out.
 
     The checksum of every frame is checked. The damaged file is never changed.
     """
@@ -110,28 +110,28 @@ def recover(
     console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
 
 
-def _sound_records(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
     found = False
     for batch in read_batches(file, advance, strict=True):
         for run in batch.damage:
-            tell(f"at byte {run.offset}: {run.size} bytes that are no record")
+            report(f"at byte {run.offset}: {run.size} bytes that are no record")
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
         found = found or len(batch.starts) > 0
     if not found:
         raise FlightError(f"{file}: {NO_RECORDING}")
 
 
-def _sound_lines(file: Path, advance: Progress, tell: Tell) -> Iterator[bytes]:
+def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
     reader = TableReader()
     begun = False
     for event in read_events(file, reader, advance):
         if not begun and not isinstance(event, TableFault):
             begun = True
             if reader.header is None:
-                tell("the head is lost: settings and calibration of today will take its place")
+                report("the head is lost: the current settings and calibration will be used")
             yield encode_head(reader.header or TableHeader()).encode()
         if isinstance(event, TableFault):
-            tell(f"line {event.line}: {event.size} bytes: {event.reason}")
+            report(f"line {event.line}: {event.size} bytes: {event.reason}")
         else:
             yield encode_line(event).encode()
     if not begun:

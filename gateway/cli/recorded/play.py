@@ -1,4 +1,4 @@
-"""`mavgate play` and the orders to a player that runs."""
+"""`mavgate play`, and commands for a running player."""
 
 import asyncio
 import signal
@@ -80,10 +80,10 @@ def play(
     speed: Annotated[str, typer.Option("--speed", "-s", help="0.1 to 100, or max.")] = "1",
     begin: FromOption = None,
     end: ToOption = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Start anew at the end.")] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Wait at the start.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
     skip_gaps: Annotated[
-        float | None, typer.Option("--skip-gaps", min=0, help="Shorten silences to so many s.")
+        float | None, typer.Option("--skip-gaps", min=0, help="Shorten gaps to this many seconds.")
     ] = None,
     system: Annotated[
         list[int] | None,
@@ -91,7 +91,7 @@ def play(
             "--as",
             min=1,
             max=249,
-            help="System id for each recording's vehicle; its others follow.",
+            help="System id for each recording's first vehicle; its others get the next ids.",
         ),
     ] = None,
     settings: SettingsOption = "recorded",
@@ -100,7 +100,8 @@ def play(
     with_commands: Annotated[
         bool,
         typer.Option(
-            "--with-commands", help="Send what ground stations said, too: live vehicles obey it."
+            "--with-commands",
+            help="Send the ground stations' messages too: live vehicles obey them.",
         ),
     ] = False,
     yes: Annotated[
@@ -111,10 +112,10 @@ def play(
 ) -> None:
     """Play recordings to the ground stations, several at once if you like.
 
-    What the vehicles of a tlog told is sent byte for byte, and they answer what is asked of them as
-    they did on that day. A table is fused again while it plays, so the recorded flight and its
-    re-fused twin can fly on one map; the parts of a recording are one flight. `mavgate seek` and
-    `mavgate player` steer it meanwhile.
+    Messages of the vehicles of a tlog are sent byte for byte, and requests are answered from the
+    recording. A table is fused again while it plays, so the recorded and the re-fused flight can
+    be compared on one map; the parts of a recording are one flight. `mavgate seek` and `mavgate
+    player` control it meanwhile.
     """
     gateway = with_endpoints(read_settings(config), endpoint)
     if with_commands and not yes:
@@ -141,7 +142,7 @@ def play(
 
 
 def _ask_for_commands(settings: GatewaySettings) -> None:
-    """Ask before recorded commands leave this machine; the command ends without a yes."""
+    """Ask before recorded commands leave this machine; end the command without a yes."""
     if away := endpoints_beyond(settings.hub):
         typer.confirm(
             "Recorded commands (arming, steering, parameters, missions) would go to "
@@ -150,7 +151,7 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
         )
 
 
-group = AskingTyper(help="Steer the player that runs.", no_args_is_help=True)
+group = AskingTyper(help="Control the running player.", no_args_is_help=True)
 
 
 def seek(
@@ -158,19 +159,19 @@ def seek(
         str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")
     ],
 ) -> None:
-    """Move the player to a moment."""
+    """Seek in the running player."""
     _show(ask("seek", {"to": to}, of="play"))
 
 
 @group.command()
 def pause() -> None:
-    """Hold."""
+    """Pause."""
     _show(ask("play.pause", of="play"))
 
 
 @group.command()
 def resume() -> None:
-    """Go on."""
+    """Resume."""
     _show(ask("play.resume", of="play"))
 
 
@@ -182,7 +183,7 @@ def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> No
 
 @group.command("speed")
 def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
-    """Go on at another speed."""
+    """Set the speed."""
     with refusing():
         value = _speed(speed)
     wanted = None if value == AS_FAST_AS_POSSIBLE else value
@@ -191,15 +192,15 @@ def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")])
 
 @group.command("loop")
 def set_loop(
-    *, on: Annotated[bool, typer.Option("--on/--off", help="Start anew at the end.")] = True
+    *, on: Annotated[bool, typer.Option("--on/--off", help="Restart at the end.")] = True
 ) -> None:
-    """Start anew at the end, or not."""
+    """Set whether to restart at the end."""
     _show(ask("play.loop", {"on": on}, of="play"))
 
 
 @group.command()
 def status() -> None:
-    """Tell what the player does."""
+    """Show the status of the player."""
     _show(ask("play.status", of="play"))
 
 
@@ -215,7 +216,7 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
 
 
 def steer(daemon: PlayerDaemon, key: str) -> None:
-    """Do what a key of the terminal says; other keys do nothing."""
+    """Carry out a key of the terminal; other keys do nothing."""
     edge = daemon.edge
     match key:
         case "q":
@@ -237,14 +238,14 @@ def steer(daemon: PlayerDaemon, key: str) -> None:
 
 
 def _next_speed(speed: float | None, *, faster: bool) -> float:
-    """Return twice or half the speed, within what is offered; None is as fast as possible."""
+    """Return twice or half the speed, within its range; None is as fast as possible."""
     if speed is None:
         return AS_FAST_AS_POSSIBLE if faster else GREATEST_SPEED
     return min(max(speed * (2.0 if faster else 0.5), LEAST_SPEED), GREATEST_SPEED)
 
 
 async def _watch(daemon: PlayerDaemon) -> None:
-    """Show the place until the end."""
+    """Show the position until the end."""
     console = console_of()
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}")

@@ -65,12 +65,12 @@ def report(
     config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Make a page of figures and tables of a flight: the paper's own, and more.
+    """Make a page of figures and tables of a flight, those of the paper included.
 
-    Without a flight the built-in simulated one is taken.
+    Without a flight the built-in simulated one is used.
     """
     _refuse_without_packages()
-    # These need what may be missing, and take a second to load.
+    # These need an extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
@@ -100,7 +100,7 @@ def report(
         progress.update(task, description="drawing", total=count_pictures(made.sections))
 
         def advance() -> None:
-            # The bar has no thread of its own: the processes that draw are copies of this one.
+            # The bar has no thread: the processes that draw are forked from this one.
             progress.advance(task)
             progress.refresh()
 

@@ -42,22 +42,20 @@ def sweep(
         typer.Option(help="Any other setting: gps_latency_s=0:0.4:9, accel_filter=chebyshev,…"),
     ] = None,
     optimise: Annotated[
-        int, typer.Option(help="Search the ranges for so many generations, in place of a grid.")
+        int, typer.Option(help="Search the ranges for this many generations, instead of a grid.")
     ] = 0,
     metric: Annotated[
         Metric,
         typer.Option(
-            help="Judge by withheld fixes, by interpolated GPS as the paper does, or by the "
-            "reference's place or attitude."
+            help="Minimise the error at withheld fixes, against interpolated GPS, as in the paper, "
+            "or against the reference's position or attitude."
         ),
     ] = "held",
-    hold_out: Annotated[
-        int, typer.Option(help="Withhold every so many-th fix; 0 for none.", min=0)
-    ] = 5,
+    hold_out: Annotated[int, typer.Option(help="Withhold every n-th fix; 0 for none.", min=0)] = 5,
     gps_interval: Annotated[
         float,
         typer.Option(
-            help="Fuse one fix in so many seconds, and let all others judge; 0 for all.", min=0.0
+            help="Fuse one fix in this many seconds, and withhold all others; 0 for all.", min=0.0
         ),
     ] = 0.0,
     jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
@@ -74,10 +72,11 @@ def sweep(
 ) -> None:
     """Try settings on one flight or many, and write the best as a settings file.
 
-    Without a flight the built-in simulated one is taken. The filter is run causally; fixes that
-    it never sees judge it. Of many flights, those of other aircraft and days judge what was chosen.
+    Without a flight the built-in simulated one is used. The filter runs causally and is scored by
+    fixes that are withheld from it. With many flights, the choice is scored by flights of other
+    aircraft and days.
     """
-    # It loads pandas and the optimisers, which no other command should wait for.
+    # It imports pandas and the optimisers, for which no other command should wait.
     from gateway.cli.support.sweeping import SweepOptions, run_sweep
 
     current = or_refuse(lambda: load_settings(config))

@@ -41,7 +41,7 @@ SeasonFiles = Annotated[
 ]
 
 SHOWN: Final = 12
-"""Failures that are told one by one."""
+"""Failures that are listed one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,10 @@ class SeasonWork:
 
     @contextmanager
     def executor(self) -> Iterator[Executor]:
-        """Have somebody who does the work; a cluster that cannot be used ends the command."""
+        """Open the executor; a cluster that cannot be used ends the command."""
         if self.scheduler is None:
             console = console_of(stderr=True)
-            # After an upgrade the compiler works for a minute: once, and not in every process.
+            # After an upgrade the compiler runs for a minute: once here, not in every process.
             with console.status("making the estimators ready"):
                 warm_up()
             yield LocalProcesses(self.jobs)
@@ -101,7 +101,7 @@ class SeasonWork:
     def run(
         self, task: FlightTask, items: Sequence[BatchItem], output: Path | None
     ) -> list[FlightResult]:
-        """Do a task on all, with a bar, and tell what failed."""
+        """Run a task on all, with a progress bar, and list what failed."""
         console = console_of(stderr=True)
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
@@ -116,12 +116,12 @@ class SeasonWork:
         ) as progress, refusing():  # fmt: skip
             bar = progress.add_task(task.name, total=len(items))
 
-            def tell(what: str, done: int, total: int) -> None:
+            def report(what: str, done: int, total: int) -> None:
                 text = f"{task.name}: {what.rsplit('/', 1)[-1][-40:]}"
                 progress.update(bar, description=text, completed=done, total=total, refresh=True)
 
-            results = run_season(task, items, executor, folder, tell)
-        _tell_failures(results)
+            results = run_season(task, items, executor, folder, report)
+        _print_failures(results)
         return results
 
 
@@ -151,12 +151,12 @@ def failures(results: Sequence[FlightResult]) -> int:
     return sum(result.error is not None for result in results)
 
 
-def _tell_failures(results: Sequence[FlightResult]) -> None:
+def _print_failures(results: Sequence[FlightResult]) -> None:
     console = console_of(stderr=True)
     failed = [result for result in results if result.error is not None]
     for result in failed[:SHOWN]:
         text = result.error or ""
-        told = text if text.startswith(result.place) else f"{result.place}: {text}"
-        console.print(told, style="red", markup=False)
+        line = text if text.startswith(result.place) else f"{result.place}: {text}"
+        console.print(line, style="red", markup=False)
     if len(failed) > SHOWN:
         console.print(f"and {len(failed) - SHOWN} more that failed")

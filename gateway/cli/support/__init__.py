@@ -1,1 +1,1 @@
-"""What the commands share."""
+"""Parts shared by the commands."""

@@ -1,4 +1,4 @@
-"""How a command asks a gateway that runs, and how it is told which one."""
+"""Requests of a command to a running gateway, and the option that selects it."""
 
 import functools
 import inspect
@@ -18,7 +18,7 @@ SocketOption = Annotated[
     typer.Option(
         "--socket",
         envvar="MAVGATE_SOCKET",
-        help="Control socket of the gateway that is meant, where several run.",
+        help="Control socket of the gateway, if several run.",
     ),
 ]
 Command = TypeVar("Command", bound=Callable[..., object])
@@ -27,7 +27,7 @@ _named: ContextVar[Path | None] = ContextVar("socket", default=None)
 
 
 def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
-    """Ask the gateway (or the player) that runs; end the command if that fails.
+    """Send a request to the running gateway (or player); end the command if that fails.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> 
 
 
 def socket_of(of: str) -> Path:
-    """Return the socket of the gateway that is meant; end the command if there is none."""
+    """Return the selected gateway's socket; end the command if there is none."""
     try:
         return _named.get() or find_socket(of)
     except ControlError as error:
@@ -53,7 +53,7 @@ def socket_of(of: str) -> Path:
 
 
 def is_running() -> bool:
-    """Tell whether there is a gateway of this user to ask."""
+    """Return whether a gateway of this user runs."""
     return _named.get() is not None or bool(live_sockets("run"))
 
 
@@ -72,7 +72,7 @@ class AskingTyper(typer.Typer):
 
 
 def with_socket(function: Command) -> Command:
-    """Give a command the option `--socket`, which tells `ask` which gateway is meant."""
+    """Give a command the option `--socket`, which selects the gateway for `ask`."""
     own = inspect.signature(function)
     option = inspect.Parameter(
         "socket", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=SocketOption

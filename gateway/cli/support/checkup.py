@@ -1,4 +1,4 @@
-"""What may be wrong with this machine, or with what it is told: the checks of `mavgate doctor`."""
+"""The checks of `mavgate doctor`: what may be wrong with this machine or the settings."""
 
 import grp
 import os
@@ -25,7 +25,7 @@ from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
 
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4
-"""FTDI's timer: bytes wait for so long in the adapter; 16 is its default."""
+"""FTDI's timer: how long bytes wait in the adapter; 16 is its default."""
 EXTRAS: Final = {
     "plot": ("jinja2", "matplotlib"),
     "panel": ("nicegui", "pmtiles"),
@@ -38,7 +38,7 @@ MB_PER_HOUR: Final = 100.0
 
 
 class Grade(StrEnum):
-    """How well a thing is."""
+    """Result of a check."""
 
     GOOD = "good"
     NOTE = "note"
@@ -47,25 +47,25 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """One thing that was looked at."""
+    """One check and its result."""
 
     grade: Grade
     what: str
     text: str
-    """How it is, and what helps."""
+    """The result, and how to fix it."""
 
 
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
 
 
 def check_machine(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look at everything that a gateway with these settings needs, one after another."""
+    """Check everything that a gateway with these settings needs, one after another."""
     for check in CHECKS:
         yield from check(settings)
 
 
 def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look at the aircraft's files, and whether they can be written."""
+    """Check the aircraft's files, and whether they can be written."""
     folder = aircraft_folder(settings)
     try:
         found = load_aircraft(settings)
@@ -76,7 +76,7 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look for the receiver's port, and whether it may be opened."""
+    """Check for the receiver's port, and whether it may be opened."""
     try:
         device = find_port(settings.serial.port, list_serial_ports())
     except PortNotFoundError as error:
@@ -123,7 +123,7 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
 
 
 def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look whether compiled estimators are kept, and can be."""
+    """Check whether compiled estimators are cached, and can be."""
     if all(is_kept(step) for step in STEPS.values()):
         yield Diagnosis(Grade.GOOD, "estimators", "compiled")
         return
@@ -132,21 +132,21 @@ def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look whether the civil time is right, which recordings are named by."""
+    """Check whether the system time is right, after which recordings are named."""
     if not shutil.which("timedatectl"):
-        yield Diagnosis(Grade.NOTE, "clock", "nobody tells whether it is right")
+        yield Diagnosis(Grade.NOTE, "clock", "unknown whether it is right")
         return
     asked = ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
     said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=10)
     if said.stdout.strip() == "yes":
         yield Diagnosis(Grade.GOOD, "clock", "synchronised")
     else:
-        text = "not synchronised: recordings get their right times when GPS tells them"
+        text = "not synchronised: recordings get their right times from GPS"
         yield Diagnosis(Grade.NOTE, "clock", text)
 
 
 def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look whether recordings find room."""
+    """Check whether there is room for recordings."""
     folder = Path(settings.recording.folder).expanduser()
     try:
         free_mb = free_bytes_near(folder) / 1e6
@@ -175,7 +175,7 @@ def _writable(what: str, folder: Path, text: str) -> Diagnosis:
 
 
 def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look whether a gateway runs already, and otherwise whether its ports are free."""
+    """Check whether a gateway runs already, and otherwise whether its ports are free."""
     if running := live_sockets("run"):
         yield Diagnosis(
             Grade.GOOD, "gateway", f"runs, and listens at {', '.join(map(str, running))}"
@@ -191,7 +191,7 @@ def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def _trouble_of(endpoint: Endpoint) -> str:
-    """Tell why a listening endpoint could not be bound now."""
+    """Return why a listening endpoint could not be bound now."""
     if endpoint.kind is EndpointKind.SERIAL:
         allowed = os.access(endpoint.host, os.R_OK | os.W_OK)
         there = Path(endpoint.host).exists()
@@ -214,7 +214,7 @@ def _trouble_of(endpoint: Endpoint) -> str:
 
 
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Look which optional parts are installed."""
+    """Check which optional parts are installed."""
     for extra, modules in EXTRAS.items():
         missing = [name for name in modules if find_spec(name) is None]
         if missing:

@@ -1,4 +1,4 @@
-"""How a command says that it cannot do what was asked."""
+"""Errors of a command."""
 
 import sys
 from typing import NoReturn

@@ -1,8 +1,8 @@
-"""Files of a site's recordings, fetched in pieces through a fleet that runs.
+"""Files of a site's recordings, fetched in pieces through a running fleet.
 
-What has come is beside the target as `.NAME.part` until all of it has come and its SHA-256 is that
-of the site's file: nothing incomplete ever looks whole. What is there already is gone on with, if
-it is the beginning of the site's file.
+A partial file is kept beside the target as `.NAME.part` until it is complete and its SHA-256 is
+that of the site's file: an incomplete file never looks complete. An existing partial file is
+continued, if it is the beginning of the site's file.
 """
 
 import base64
@@ -38,10 +38,10 @@ class FetchError(Exception):
 
 
 class PiecePace:
-    """How much to ask for at once: what takes about a tenth of a second.
+    """Size of a piece, so that it takes about a tenth of a second.
 
-    Telemetry that comes while a piece is on a narrow link waits behind it, so pieces are small
-    there; where they come at once they grow.
+    On a narrow link telemetry waits behind a piece, so pieces are small there; on a fast link they
+    grow.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class RecordingFetch:
         FetchError
             If it cannot be fetched.
         OSError
-            What the disk does not like.
+            If the disk fails.
         """
         if not is_file_name(name):
             raise FetchError(f"the site lists {name!r}, which is no file of a recording")
@@ -166,7 +166,7 @@ class RecordingFetch:
         data = base64.b64decode(self._persist("fleet.piece", params, "data", PIECE_WAIT_S))
         took_s = time.monotonic() - begin_s
         self._pace.note(took_s)
-        # The other half of the time is the telemetry's.
+        # Leave the other half of the time to telemetry.
         self._wait(min(took_s, SLOW_S))
         return data
 
@@ -175,7 +175,7 @@ class RecordingFetch:
         return self._persist("fleet.digest", params, "sha256", DIGEST_WAIT_S)
 
     def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
-        """Ask until there is an answer: links break, and come again."""
+        """Retry until there is an answer: links break and come back."""
         end_s = time.monotonic() + PATIENCE_S
         while True:
             answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]

@@ -1,4 +1,4 @@
-"""The boards' own programs behind the demo: found in the checkout, which no package carries."""
+"""The boards' own programs for the demo: from the checkout, not in the package."""
 
 import importlib
 import sys
@@ -13,7 +13,7 @@ CHECKOUT: Final = Path(__file__).resolve().parents[3]
 
 
 class BenchError(RuntimeError):
-    """The bench is not here, or cannot be built."""
+    """The bench is missing, or cannot be built."""
 
 
 def firmware_line(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:

@@ -1,4 +1,4 @@
-"""How the commands of the analysis come by their flight."""
+"""Loading of flights for the analysis commands."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
 from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import (
+    print_remarks,
     progress_of,
     read_column_map,
     refusing,
-    tell_remarks,
 )
 from gateway.cli.support.settings_options import (
     pipeline_settings,
@@ -42,11 +42,12 @@ FlightArgument = Annotated[
 ReferenceOption = Annotated[
     Path | None,
     typer.Option(
-        "--reference", help="A CSV of ours on the flight's clock, whose states judge the estimates."
+        "--reference",
+        help="A mavgate CSV on the flight's clock, with whose states the estimates are compared.",
     ),
 ]
 SystemOption = Annotated[
-    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to take.")
+    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
 ]
 
 STORIES: Final = {
@@ -59,7 +60,7 @@ STORIES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Loading:
-    """How a command wants its flights to be read."""
+    """How to read a command's flights."""
 
     settings: GatewaySettings
     choice: SettingsChoice = "recorded"
@@ -69,12 +70,12 @@ class Loading:
 
 
 def fusion_of(settings: GatewaySettings) -> FusionSettings:
-    """Take what fuses a flight out of the whole settings."""
+    """Return the part of the settings that fuses a flight."""
     return FusionSettings(sensing=settings.sensing, estimation=settings.estimation)
 
 
 def load_flight(path: Path | None, loading: Loading) -> Flight:
-    """Read a recording, or fly the simulated flight; a file that holds none ends the command."""
+    """Read a recording, or the simulated flight; a file without one ends the command."""
     settings = loading.settings
     if path is None:
         return simulated_flight(settings.simulator, fusion_of(settings))
@@ -93,7 +94,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
             )
         except ValueError as error:
             raise FlightError(str(error)) from error
-        tell_remarks(table.remarks)
+        print_remarks(table.remarks)
         if loading.reference is None:
             return flight
         return judged_by(

@@ -1,4 +1,4 @@
-"""A recording by its name, as `mavgate record list` shows it, wherever a file is taken."""
+"""Recordings by name, as `mavgate record list` shows them, wherever a file is accepted."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,23 +11,23 @@ from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.flights.reading import FlightError
 
 Wanted = Literal["tlogs", "tables", "all"]
-"""Which files of a recording a command wants; the others where it has none of these."""
+"""Which files of a recording a command uses; the others if it has none of these."""
 
 
 def recordings_folder(config: Path | None) -> Path:
-    """Return where the recordings are: of the gateway that runs, unless settings are named."""
+    """Return the folder of recordings: the running gateway's, unless settings are given."""
     if config is None and is_running():
         return Path(ask("record.status")["folder"])
     return folder_of(read_settings(config))
 
 
 def folder_of(settings: GatewaySettings) -> Path:
-    """Return where these settings put recordings."""
+    """Return the folder of recordings in these settings."""
     return Path(settings.recording.folder).expanduser()
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
-    """Put the files of recordings in the place of their names; a path stays what it is.
+    """Replace names of recordings by their files; paths stay unchanged.
 
     Parameters
     ----------

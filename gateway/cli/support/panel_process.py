@@ -1,4 +1,4 @@
-"""The panel as a child of the gateway: what it does, or that it dies, delays no frame."""
+"""The panel as a child process of the gateway: even if it dies, no frame is delayed."""
 
 import asyncio
 import logging
@@ -14,24 +14,24 @@ log = logging.getLogger(__name__)
 
 HOW_TO_ADD: Final = "the panel is an extra: pip install 'mavgate[panel]'"
 LINK: Final = "panel: "
-"""What the line with the page's address begins with."""
+"""Begin of the line with the page's address."""
 RESTART_S: Final = 5.0
 LONGEST_RESTART_S: Final = 300.0
-"""What cannot even begin is not tried for ever at a pace that fills the log."""
+"""Longest pause between restarts, so that repeated failures do not fill the log."""
 
 
 def is_installed() -> bool:
-    """Tell whether the extra is there."""
+    """Return whether the extra is installed."""
     return find_spec("nicegui") is not None
 
 
 class PanelProcess:
-    """The panel as a child of the gateway; when it dies it is started anew.
+    """The panel as a child process of the gateway; restarted when it dies.
 
     Parameters
     ----------
     config : Path or None
-        Settings file, as the gateway was given it.
+        The gateway's settings file.
     """
 
     def __init__(self, config: Path | None) -> None:
@@ -49,7 +49,7 @@ class PanelProcess:
         Parameters
         ----------
         control_socket : callable
-            Waits for the gateway's control socket and tells where it is.
+            Waits for the gateway's control socket and returns its path.
         """
         self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
 

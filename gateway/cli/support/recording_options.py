@@ -1,4 +1,4 @@
-"""What the commands on recordings share: options, progress, and clear words for bad files."""
+"""Shared by the commands on recordings: options, progress, and errors for bad files."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -36,7 +36,7 @@ ColumnsOption = Annotated[
 ]
 SettingsOption = Annotated[
     SettingsChoice,
-    typer.Option("--settings", help="Fuse tables with the settings of then or of today."),
+    typer.Option("--settings", help="Fuse tables with the recorded or the current settings."),
 ]
 PositionOption = Annotated[
     Position,
@@ -45,7 +45,7 @@ PositionOption = Annotated[
 
 
 def read_column_map(path: Path | None) -> ColumnMap | None:
-    """Read a column map; raises FlightError if it is none."""
+    """Read a column map; raises FlightError if it is invalid."""
     if path is None:
         return None
     try:
@@ -60,7 +60,7 @@ def read_column_map(path: Path | None) -> ColumnMap | None:
 
 
 def read_moment(text: str | None) -> Moment | None:
-    """Read a moment of the command line; raises FlightError if it is none."""
+    """Read a moment of the command line; raises FlightError if it is invalid."""
     try:
         return None if text is None else parse_moment(text)
     except ValueError as error:
@@ -69,7 +69,7 @@ def read_moment(text: str | None) -> Moment | None:
 
 @contextmanager
 def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
-    """Show how far the files are read, on a terminal."""
+    """Show the progress of reading, on a terminal."""
     total = sum(file.stat().st_size for file in files if file.exists())
     columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     console = console_of(stderr=True)
@@ -80,15 +80,15 @@ def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
         yield lambda count: progress.advance(task, count)
 
 
-def tell_remarks(remarks: Iterable[str]) -> None:
-    """Say what the user should know of a file, beside the output."""
+def print_remarks(remarks: Iterable[str]) -> None:
+    """Print remarks about a file to stderr."""
     for remark in remarks:
         console_of(stderr=True).print(remark, markup=False)
 
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """End the command with a clear word where a file is not as it should be."""
+    """End the command with a clear error if a file is not as it should be."""
     try:
         yield
     except FileExistsError as error:

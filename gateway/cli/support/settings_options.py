@@ -1,4 +1,4 @@
-"""The settings of a command: which file, and what becomes of one that is wrong.
+"""The settings of a command: which file, and errors for a wrong one.
 
 The settings import every stage, and with them the compiler: a command that never reads them must
 not wait for that, so they are imported where they are read.
@@ -30,7 +30,7 @@ ConfigOption = Annotated[
 
 
 def load_settings(file: Path | None) -> GatewaySettings:
-    """Load the settings that a command was given, the user's own, or the defaults."""
+    """Load the given settings, the user's own, or the defaults."""
     from gateway.config import GatewaySettings, load
 
     if file is None:
@@ -56,7 +56,7 @@ def read_settings(file: Path | None) -> GatewaySettings:
 
 
 def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Load what is different for single aircraft."""
+    """Load the settings of single aircraft."""
     from gateway.config import ConfigError, load_aircraft
 
     try:
@@ -66,7 +66,7 @@ def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
 
 
 def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:
-    """Take what the pipeline needs, the single aircraft's files included."""
+    """Return the pipeline's settings, the single aircraft's files included."""
     from gateway.pipeline import PipelineSettings
 
     return PipelineSettings(settings.default_aircraft, read_aircraft(settings))

@@ -49,7 +49,7 @@ HEADINGS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SweepOptions:
-    """What the command line asks for."""
+    """Options of the command line."""
 
     named: Sequence[tuple[str, str]]
     """The paper's own weights, with their values as texts."""
@@ -82,7 +82,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             hold_out=options.hold_out,
             interval_s=options.gps_interval_s,
         )
-        _tell_idle(contest, axes)
+        _print_idle(contest, axes)
         with pool(contest, options.jobs) as run:
             if options.generations:
                 trials = _search(axes, run, options.generations, options.metric)
@@ -103,7 +103,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
 
 
 def parse_axes(options: SweepOptions) -> list[Axis]:
-    """Read what is varied; raises SweepError if it cannot be."""
+    """Read the axes to vary; raises SweepError for invalid ones."""
     wanted = list(options.named)
     for item in options.vary:
         name, equals, text = item.partition("=")
@@ -115,8 +115,8 @@ def parse_axes(options: SweepOptions) -> list[Axis]:
     return [sweeping.parse_axis(name, text) for name, text in wanted]
 
 
-def _tell_idle(contest: Contest, axes: Sequence[Axis]) -> None:
-    """Say before the work which settings change nothing."""
+def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
+    """Print in advance which settings change nothing."""
     idle = sweeping.idle_axes(contest, axes)
     if not idle:
         return

@@ -1,4 +1,4 @@
-"""Where the commands print to: a terminal, or a file or program that must get whole lines."""
+"""Output of the commands: a terminal, or a file or program that must get whole lines."""
 
 from typing import Annotated, Final
 
@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 ENDLESS: Final = 1000
-"""Width of what is no terminal: nobody wants a path or a table cut there."""
+"""Width of output that is not a terminal, where paths and tables must not be cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
@@ -23,7 +23,7 @@ def console_of(*, stderr: bool = False) -> Console:
 
 
 def table_of(*columns: str, left: int = 1) -> Table:
-    """Make an empty table; the first `left` columns are text, the others figures.
+    """Create an empty table; the first `left` columns are text, the others figures.
 
     No frame and narrow padding: the table of clients fits a terminal of 80 columns.
     """

@@ -28,30 +28,31 @@ STEPS: Final[dict[str, Callable[..., object]]] = {
     "complementary": COMPLEMENTARY.imu,
     "eskf": ESKF.imu,
 }
-"""What each estimator does with a sample: where its machine code is kept, so is all of it."""
+"""Each estimator's step for a sample: if its machine code is cached, so is all of it."""
 BEHIND: Final = 10
-"""How nice the process is that compiles while telemetry flows."""
+"""Niceness of the process that compiles while telemetry runs."""
 
 
 def make_ready(estimator: str) -> None:
-    """Have the machine code of an estimator in this process, and see to that of all others.
+    """Load or compile an estimator in this process, and compile the others in the background.
 
-    It is kept beside the source, so only the first start after an upgrade compiles: the estimator
-    that is chosen, before anything else, and then the others in a process of their own, behind the
-    telemetry, since a ground station may choose one in flight, when the compiler would cost the
-    horizon seconds; to read one from the disk takes some hundredths of one.
+    The machine code is cached beside the source, so only the first start after an upgrade
+    compiles: the chosen estimator first, and then the others in a separate process while telemetry
+    runs, since a ground station may choose one in flight, when compiling would interrupt the
+    attitude for seconds; reading one from disk takes some hundredths of a second.
 
     Parameters
     ----------
     estimator : str
-        The one that the settings name.
+        Name of the one in the settings.
     """
     missing = [name for name, step in STEPS.items() if not is_kept(step)]
     if estimator in missing:
         log.info("compiling the estimator %s, this once; later starts take a second", estimator)
         begin = time.monotonic()
         with _clock() as show:
-            # Apart, for a compiler's memory is not given back; this process reads what it kept.
+            # In a separate process, because the compiler's memory is never freed; this one reads
+            # its cache.
             run_copies(_compile, [estimator], show)
         log.info("compiled in %.0f s", time.monotonic() - begin)
         missing.remove(estimator)
@@ -63,12 +64,12 @@ def make_ready(estimator: str) -> None:
 
 @contextmanager
 def _clock() -> Iterator[Callable[[], None]]:
-    """Show on a terminal that it is worked at, and for how long."""
-    # Not above: most starts compile nothing.
+    """Show on a terminal that work is in progress, and for how long."""
+    # Imported here: most starts compile nothing.
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = console_of(stderr=True)
-    # No thread of its own: the process that compiles is forked from this one.
+    # Without a thread: the process that compiles is forked from this one.
     with Progress(
         SpinnerColumn(), TextColumn("compiling the estimator, this once"), TimeElapsedColumn(),
         console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
@@ -78,7 +79,7 @@ def _clock() -> Iterator[Callable[[], None]]:
 
 
 def _compile(name: str) -> None:
-    # It is the parent that tells of an interrupt.
+    # The parent reports an interrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _rehearse(name)
 
@@ -97,7 +98,7 @@ def _rehearse(name: str) -> None:
 
 
 def _at_rest() -> Iterator[ImuRaw | BaroRaw | GpsFix]:
-    """Yield a fifth of a second of a node that lies still: each kind of record there is."""
+    """Yield a fifth of a second of a node at rest, with every kind of record."""
     node = NodeId(1, 1)
     for time_us in range(REHEARSAL_US, 3 * REHEARSAL_US, SAMPLE_US):
         yield ImuRaw(

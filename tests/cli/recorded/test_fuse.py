@@ -135,7 +135,7 @@ def test_a_latency_that_a_log_does_not_tell_is_estimated(tmp_path: Path) -> None
     result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out)])
     assert result.exit_code == 0, result.output
     words = " ".join(result.output.split())
-    told = re.search(r"its manoeuvres tell (0\.\d+) s", words)
+    told = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
     assert told is not None, words
     assert float(told[1]) == pytest.approx(0.16, abs=0.02)
     assert f'"gps_latency_s":{told[1][:4]}' in out.read_text().replace(" ", "")
@@ -146,6 +146,6 @@ def test_a_latency_that_no_manoeuvre_tells_is_assumed(log: Path) -> None:
     log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
     arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
     words = " ".join(CliRunner().invoke(app, arguments).output.split())
-    assert "0.15 s is assumed, for no manoeuvre tells it" in words
+    assert "0.15 s is assumed, since no manoeuvre shows it" in words
     told = CliRunner().invoke(app, [*arguments, "--gps-latency", "0.2"])
-    assert "tells no GPS latency" not in told.output
+    assert "gives no GPS latency" not in told.output
