@@ -54,7 +54,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
-PURE = FOUNDATION | STAGES | JOINED | {"replay", "status"}
+PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"replay", "status"}
 PURE_FOLDERS = {"panel/state", "season/statistics"}
 """Pure parts of rooms that are not."""
 

@@ -1,7 +1,10 @@
+"""Machine code: the same results as Python, kept for what it was made of, and loaded alone."""
+
 import importlib
 import importlib.util
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,7 +12,182 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.compiled import is_kept, record_at
+from gateway.compiled import address_of, array_at, compiled, compiled_with, digest_of
+from gateway.compiled.compiler import compile_dispatcher
+from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.complementary.complementary_kernels import KERNELS
+
+FLOAT = np.dtype(np.float64)
+FACTOR = 3.0
+
+
+@compiled
+def scaled(x: float) -> float:
+    return FACTOR * x
+
+
+def scale(values: int, count: int, offset: float) -> None:
+    numbers = array_at(values, (count,), FLOAT)
+    for k in range(count):
+        numbers[k] = scaled(numbers[k]) + offset
+
+
+def allocate(count: int) -> None:
+    np.zeros(count)[0] = 1.0
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def use(entry: Callable[[int, int, float], None]) -> list[float]:
+    numbers = np.array([1.0, 2.5])
+    entry(address_of(numbers), 2, 0.25)
+    return numbers.tolist()
+
+
+@pytest.mark.io
+def test_an_entry_point_does_what_its_function_does_and_is_kept(folder: Path) -> None:
+    assert use(scale) == [3.25, 7.75]
+    first = EntryPoint(scale)
+    assert not first.is_kept
+    assert use(first) == [3.25, 7.75]
+    assert first.is_kept
+    assert use(EntryPoint(scale)) == [3.25, 7.75]
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.io
+@pytest.mark.parametrize(
+    "damage", [lambda data: b"", lambda data: data[:-1], lambda data: data[:-50] + bytes(50)]
+)
+def test_damaged_code_is_made_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
+    use(EntryPoint(scale))
+    [file] = folder.iterdir()
+    sound = file.read_bytes()
+    file.write_bytes(damage(sound))
+    assert not EntryPoint(scale).is_kept
+    assert use(EntryPoint(scale)) == [3.25, 7.75]
+    assert EntryPoint(scale).is_kept
+
+
+@pytest.mark.io
+def test_code_of_an_earlier_source_goes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use(EntryPoint(scale))
+    monkeypatch.setitem(globals(), "FACTOR", 5.0)
+    assert not EntryPoint(scale).is_kept
+    # The compiler of this process has bound the constant already.
+    monkeypatch.setitem(globals(), "scaled", compiled(lambda x: 5.0 * x))
+    assert use(EntryPoint(scale)) == [5.25, 12.75]
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.io
+def test_where_nothing_can_be_kept_it_works_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    entry = EntryPoint(scale)
+    assert use(entry) == [3.25, 7.75]
+    assert not entry.is_kept
+
+
+@pytest.mark.io
+def test_an_entry_point_may_not_allocate(folder: Path) -> None:
+    with pytest.raises(TypeError, match="allocate"):
+        EntryPoint(allocate)(3)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.io
+def test_what_is_kept_is_loaded_without_numba() -> None:
+    for entry in KERNELS.live:
+        entry.prepare()
+    tell = (
+        "import sys; from gateway.estimation.select import EstimationSettings, make_estimator;"
+        "make_estimator(EstimationSettings(estimator='complementary'));"
+        "print('numba' in sys.modules)"
+    )
+    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
+    assert other.stdout == "False\n"
+
+
+@pytest.mark.io
+def test_every_process_takes_the_code_for_made_of_the_same() -> None:
+    tell = (
+        "from gateway.estimation.complementary.complementary_kernels import KERNELS;"
+        "from gateway.compiled import digest_of; print(digest_of(KERNELS.imus.__wrapped__))"
+    )
+    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
+    entry: Any = KERNELS.imus
+    assert other.stdout.strip() == digest_of(entry.__wrapped__)
+
+
+CALLED = """
+from gateway.compiled import compiled
+
+FACTOR = {factor}
+{comment}
+@compiled
+def inner():
+    return {inner}
+"""
+CALLING = """
+import called
+from gateway.compiled import compiled
+from called import inner
+
+@compiled
+def outer():
+    return called.FACTOR * middle()
+
+@compiled
+def middle():
+    return inner()
+"""
+
+
+@pytest.mark.io
+@pytest.mark.parametrize(
+    ("factor", "inner", "comment", "same"),
+    [
+        (2, "100", "", False),
+        (1, "3 + 4 * five()", "", False),
+        (1, "100", "\n\n# The next function.", True),
+    ],
+)
+def test_what_it_calls_has_changed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    factor: int,
+    inner: str,
+    comment: str,
+    same: bool,
+) -> None:
+    """Machine code holds the constants and functions of other files, too."""
+    monkeypatch.syspath_prepend(tmp_path)
+    # Python itself takes a file of the same size and second for unchanged.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "calling.py").write_text(CALLING)
+    digests = []
+    for parts in ((1, "100", ""), (factor, inner, comment)):
+        text = CALLED.format(factor=parts[0], inner=parts[1], comment=parts[2])
+        (tmp_path / "called.py").write_text(text)
+        for name in ("called", "calling"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        digests.append(digest_of(importlib.import_module("calling").outer))
+    assert (digests[0] == digests[1]) == same
+
+
+def test_the_copies_of_a_template_are_made_of_their_own() -> None:
+    one, two = (compiled_with(scaled, {"FACTOR": f}, f"by_{f}") for f in (1.0, 2.0))
+    assert [one(7.0), two(7.0), scaled(7.0)] == [7.0, 14.0, 21.0]
+    assert len({digest_of(f) for f in (one, two, scaled)}) == 3
+
 
 SOURCE = """
 from gateway.compiled import compiled
@@ -29,15 +207,19 @@ def process(path: Path) -> Any:
     assert spec.loader
     module: ModuleType = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.read
+    return compile_dispatcher(module.read)
 
 
 @pytest.mark.io
-def test_two_processes_compile_for_different_types_at_once(tmp_path: Path) -> None:
+def test_two_processes_compile_for_different_types_at_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both read the index before either has written; the first to name its file is the last to
     write it.
     """
-    path = tmp_path / "raced.py"
+    # Numba has read the environment before.
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(folder))
+    path = folder / "raced.py"
     path.write_text(SOURCE)
     NEAR["x"], FAR["x"] = 1.0, 2.0
     first, second = process(path), process(path)
@@ -51,112 +233,8 @@ def test_two_processes_compile_for_different_types_at_once(tmp_path: Path) -> No
 
     files._save_data = late
     assert first(NEAR) == 1.0
-    assert list(tmp_path.rglob("*.nbc"))
+    assert list(folder.rglob("*.nbc"))
     after = process(path)
     assert after(FAR) == 2.0
     assert after(NEAR) == 1.0
     assert after.stats.cache_hits[after.signatures[0]] == 1
-
-
-@pytest.mark.io
-def test_every_process_takes_the_code_for_made_of_the_same() -> None:
-    tell = (
-        "from gateway.compiled import record_at as at; print(at._cache._cache_file._source_stamp)"
-    )
-    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
-    here: Any = record_at
-    assert other.stdout.strip() == here._cache._cache_file._source_stamp
-
-
-@pytest.mark.io
-def test_code_is_kept_until_the_source_changes(tmp_path: Path) -> None:
-    path = tmp_path / "raced.py"
-    path.write_text(SOURCE)
-    assert not is_kept(process(path))
-    process(path)(NEAR)
-    assert is_kept(process(path))
-    path.write_text(SOURCE + "    # Another source.\n")
-    assert not is_kept(process(path))
-    assert is_kept(len), "what is not compiled is never to be waited for"
-
-
-CALLED = """
-from gateway.compiled import compiled
-
-FACTOR = {factor}
-
-@compiled
-def inner():
-    return {inner}
-"""
-CALLING = """
-from gateway.compiled import compiled
-from called import FACTOR, inner
-
-@compiled
-def outer():
-    return FACTOR * middle()
-
-@compiled
-def middle():
-    return inner()
-"""
-
-
-@pytest.mark.io
-@pytest.mark.parametrize(
-    ("factor", "inner", "result"), [(2, "100", 200), (1, "3 + 4 * 5", 23), (1, "100", 100)]
-)
-def test_what_it_calls_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: int, inner: str, result: int
-) -> None:
-    """The machine code holds the constants and functions of other files, too."""
-    monkeypatch.syspath_prepend(tmp_path)
-    # Python itself takes a file of the same size and second for unchanged.
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    (tmp_path / "calling.py").write_text(CALLING)
-    for parts, expected in (((1, "100"), 100), ((factor, inner), result)):
-        (tmp_path / "called.py").write_text(CALLED.format(factor=parts[0], inner=parts[1]))
-        for name in ("called", "calling"):
-            monkeypatch.delitem(sys.modules, name, raising=False)
-        importlib.invalidate_caches()
-        calling = importlib.import_module("calling")
-        assert calling.outer() == expected
-    assert bool(calling.outer.stats.cache_hits) == (result == 100)
-
-
-TEMPLATE = """
-from gateway.compiled import compiled, compiled_with
-
-def answer():
-    return 0
-
-def outer():
-    return 10 + answer()
-
-@compiled
-def one():
-    return 1
-
-@compiled
-def two():
-    return {two}
-
-COPIES = [compiled_with(outer, {{"answer": f}}, f.__name__) for f in (one, two)]
-"""
-
-
-@pytest.mark.io
-def test_the_copies_of_a_template_keep_code_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In another process, too; and none runs on when what stands in it has changed."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    for two, hits in ((2, [0, 0]), (2, [1, 1]), (34, [0, 0])):
-        (tmp_path / "template.py").write_text(TEMPLATE.format(two=two))
-        monkeypatch.delitem(sys.modules, "template", raising=False)
-        importlib.invalidate_caches()
-        copies = importlib.import_module("template").COPIES
-        assert [copy() for copy in copies] == [11, 10 + two]
-        assert [sum(copy.stats.cache_hits.values()) for copy in copies] == hits

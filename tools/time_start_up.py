@@ -1,31 +1,125 @@
-"""Time how soon ground stations are through their start-up with a running `mavgate demo`.
+"""Time how soon the gateway starts, and how soon ground stations are through theirs with it.
 
     python tools/time_start_up.py
+    python tools/time_start_up.py --gateway
 
-Starts the demo on free ports and prints seconds of wall clock: the scripted QGroundControl over UDP
-and TCP, as MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last
-parameter. The baseline, in the same run, is the round trip of one PING.
+Prints the CPU of `mavgate --help` and `status`, the best of five; then of `mavgate run` on a
+simulated receiver the seconds, the CPU and the memory from its call to its first datagram and to
+its first attitude, with compiled estimators and with none. The baselines are a Python that does
+nothing, `mavlogdump.py --help`, and MAVProxy up to its first line on a gateway that runs.
+
+Then it starts the demo and prints seconds of wall clock: the scripted QGroundControl over UDP and
+TCP, as MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last
+parameter. The baseline is the round trip of one PING.
 """
 
+import argparse
+import os
 import re
+import resource
+import select
 import socket
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+import tty
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from tests.end_to_end.processes import START_LIMIT_S, Gateway
+from gateway.simulator.receiver import simulate
+from gateway.simulator.simulator_settings import SimulatorSettings
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
 from tests.end_to_end.station import Station
 from tests.end_to_end.test_demo import MavProxy
 from tests.end_to_end.test_ground_stations import CONFIG
 from tests.vehicle.test_start_up import qgroundcontrol
 
 REPEATS = 5
+START_UNIX_US = 1_781_187_930_000_000
+
+
+def cpu_of(*arguments: str) -> float:
+    """Measure the processor seconds of a program of Python; the best of some runs."""
+    found = []
+    for _ in range(REPEATS):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *arguments], capture_output=True, check=False)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(found)
+
+
+def process_figures(pid: int) -> str:
+    """Tell the processor time and the memory of a process and of those that it waited for."""
+    text = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    own, waited = (sum(map(int, text[k : k + 2])) / os.sysconf("SC_CLK_TCK") for k in (11, 13))
+    status = Path(f"/proc/{pid}/status").read_text()
+    resident_mb = int(re.findall(r"VmRSS:\s+(\d+)", status)[0]) / 1024
+    return f"CPU {own:.2f} s (and {waited:.2f} s of compilers), {resident_mb:.0f} MB"
+
+
+def feed(master: int, frames: Iterator, began_s: float) -> None:
+    """Write the receiver's frames at their own time; what nobody has read yet is not waited for."""
+    for frame in frames:
+        while (early_s := began_s + frame.time_s - time.monotonic()) > 0.0:
+            yield early_s
+        if select.select([], [master], [], 0.0)[1]:
+            os.write(master, frame.data)
+
+
+def time_run(folder: Path, cache: Path | None) -> None:
+    """Print how soon a gateway on a receiver that is there already sends, and what that took."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    frames = simulate(SimulatorSettings(gps_first_fix_s=0.5), START_UNIX_US).frames()
+    before = os.environ.get("NUMBA_CACHE_DIR")
+    if cache is not None:
+        os.environ["NUMBA_CACHE_DIR"] = str(cache)
+    began_s = time.monotonic()
+    gateway = Gateway(folder, "run", "--port", os.ttyname(slave), config=CONFIG)
+    client = Client(gateway.port)
+    wanted = ["HEARTBEAT", "ATTITUDE"]
+    try:
+        for early_s in feed(master, frames, began_s):
+            if not select.select([client.sock], [], [], early_s)[0]:
+                continue
+            names = {message.get_type() for message in client.receive()}
+            while wanted and (wanted[0] in names or not wanted[0]):
+                print(
+                    f"mavgate run, {'warm' if cache is None else 'cold'}, to {wanted.pop(0)}: "
+                    f"{time.monotonic() - began_s:.2f} s, {process_figures(gateway.process.pid)}"
+                )
+            if not wanted:
+                break
+    finally:
+        gateway.stop()
+        client.sock.close()
+        os.close(master)
+        os.close(slave)
+        os.environ.pop("NUMBA_CACHE_DIR", None)
+        if before is not None:
+            os.environ["NUMBA_CACHE_DIR"] = before
+
+
+def time_gateway(folder: Path) -> None:
+    """Print what small commands and starts take, beside programs that do less."""
+    mavgate, dump = ("-m", "gateway.cli"), str(Path(sys.executable).with_name("mavlogdump.py"))
+    print(f"python -c pass: CPU {cpu_of('-c', 'pass'):.2f} s")
+    print(f"mavlogdump.py --help: CPU {cpu_of(dump, '--help'):.2f} s")
+    print(f"mavgate --help: CPU {cpu_of(*mavgate, '--help'):.2f} s")
+    gateway = Gateway(folder, "demo", config=CONFIG)
+    try:
+        connect(socket.SOCK_STREAM, gateway.listen_port, 2).close()
+        print(f"mavgate status: CPU {cpu_of(*mavgate, 'status'):.2f} s")
+    finally:
+        gateway.stop()
+    time_run(folder, None)
+    time_run(folder, folder / "empty")
 
 
 def connect(kind: int, port: int, version: int) -> Station:
@@ -90,7 +184,14 @@ def time_mavproxy(port: int, folder: Path) -> None:
 
 def main() -> None:
     """Start the demo, measure, stop it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--gateway", action="store_true", help="its own start alone")
+    alone = parser.parse_args().gateway
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_RUNTIME_DIR"] = folder
+        time_gateway(Path(folder))
+        if alone:
+            return
         gateway = Gateway(Path(folder), "demo", config=CONFIG)
         try:
             time_stations(gateway.listen_port)

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from gateway.compiled import address_of
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -50,20 +51,26 @@ class SampleLog:
 
 @dataclass(frozen=True, slots=True)
 class Kernels(Generic[State, Gains]):
-    """The compiled functions of one estimator."""
+    """The compiled functions of one estimator; arrays and records by their addresses."""
 
     declaration: type[State]
-    start: Callable[[State, Gains], None]
-    imu: Callable[[int, int, int, FloatArray, FloatArray], None]
-    """`(state, gains, time_us, imu_row, output_row)`; records by their addresses."""
-    baro: Callable[[int, int, float], None]
+    begin: EntryPoint[[int, int]]
+    """`(state, gains)`."""
+    imus: EntryPoint[[int, int, int, int, int, int]]
+    """`(state, gains, count, times_us, imu_rows, output_rows)`."""
+    baro: EntryPoint[[int, int, float]]
     """`(state, gains, alt_m)`."""
-    gps: Callable[[int, int, int, FloatArray], None]
+    gps: EntryPoint[[int, int, int, int]]
     """`(state, gains, arrival_us, gps_row)`."""
+    run: EntryPoint[...]
+    """`(state, gains, count and arrays of each kind in a SampleLog, two counters, output_rows)`."""
     earlier: Callable[..., None]
-    """`(state, gains, time_us, taken, *arrays of the barometer and the GPS)`."""
-    run: Callable[..., None]
-    """`(state, gains, *arrays of a SampleLog, output)`."""
+    """`(state, gains, time_us, taken, *arrays of the barometer and the GPS)`, of compiled code."""
+
+    @property
+    def live(self) -> tuple[EntryPoint[...], ...]:
+        """What a gateway needs, the largest first."""
+        return (self.imus, self.gps, self.baro, self.begin)
 
 
 class KernelEstimator(Generic[State, Gains]):
@@ -87,13 +94,16 @@ class KernelEstimator(Generic[State, Gains]):
         self._gains_at = address_of(gains)
         self._reference = reference
         self._earth = EarthField(reference)
-        self._row = np.empty(IMU_COLUMNS)
+        self._time_us = np.zeros(1, np.int64)
+        self._row, self._fix = np.zeros(IMU_COLUMNS), np.zeros(GPS_COLUMNS)
         self._output = np.empty(NAV_COLUMNS)
-        # A first call on a scrap state compiles, or loads, what a sample would wait for.
+        self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
+        self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
+        # A first call on a scrap state loads, or compiles, what a sample would wait for.
         self._begin()
-        kernels.imu(self._at, self._gains_at, 0, np.zeros(IMU_COLUMNS), self._output)
+        kernels.imus(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
         kernels.baro(self._at, self._gains_at, 0.0)
-        kernels.gps(self._at, self._gains_at, 0, np.zeros(GPS_COLUMNS))
+        kernels.gps(self._at, self._gains_at, 0, self._fix_at)
         self._begin()
 
     def reset(self) -> None:
@@ -103,7 +113,7 @@ class KernelEstimator(Generic[State, Gains]):
 
     def _begin(self) -> None:
         self._use(new_record(self._kernels.declaration))
-        self._kernels.start(self._state, self._gains)
+        self._kernels.begin(self._at, self._gains_at)
 
     def _use(self, record: State) -> None:
         self._state, self._at = record, address_of(record)
@@ -147,26 +157,22 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._row[:] = imu_row(sample)
-        self._kernels.imu(self._at, self._gains_at, sample.time_us, self._row, self._output)
+        self._time_us[0], self._row[:] = sample.time_us, imu_row(sample)
+        self._kernels.imus(
+            self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at
+        )
         return nav_state(sample.time_us, self._output)
 
     def update_imus(self, samples: Sequence[ImuSample]) -> list[NavState]:
         """Advance by IMU samples between which nothing else came, as `update_imu` by each."""
         if len(samples) == 1:
             return [self.update_imu(samples[0])]
+        count = len(samples)
         rows = np.array([imu_row(sample) for sample in samples]).reshape(-1, IMU_COLUMNS)
-        times_us = [sample.time_us for sample in samples]
-        nothing, no_times = np.empty(0), np.empty(0, np.int64)
-        log = SampleLog(
-            imu_time_us=np.array(times_us, np.int64),
-            imu=rows,
-            baro_time_us=no_times,
-            baro_alt_m=nothing,
-            gps_time_us=no_times,
-            gps=nothing.reshape(0, GPS_COLUMNS),
-        )
-        return [nav_state(t, row) for t, row in zip(times_us, self.run(log), strict=True)]
+        time_us = np.array([sample.time_us for sample in samples], np.int64)
+        out = np.empty((count, NAV_COLUMNS))
+        self._kernels.imus(self._at, self._gains_at, count, *map(address_of, (time_us, rows, out)))
+        return [nav_state(s.time_us, row) for s, row in zip(samples, out, strict=True)]
 
     def update_baro(self, sample: BaroSample) -> None:
         """Take in one barometer sample.
@@ -186,8 +192,8 @@ class KernelEstimator(Generic[State, Gains]):
         fix : GpsFix
             Fused as of the time it was valid.
         """
-        row = gps_row(fix, self._reference, self._earth)
-        self._kernels.gps(self._at, self._gains_at, fix.time_us, np.array(row))
+        self._fix[:] = gps_row(fix, self._reference, self._earth)
+        self._kernels.gps(self._at, self._gains_at, fix.time_us, self._fix_at)
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""
@@ -207,15 +213,17 @@ class KernelEstimator(Generic[State, Gains]):
             One row per IMU sample.
         """
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
-        self._kernels.run(
-            self._state,
-            self._gains,
-            log.imu_time_us,
-            log.imu,
-            log.baro_time_us,
-            log.baro_alt_m,
-            log.gps_time_us,
-            log.gps,
-            out,
-        )
+        times = (log.imu_time_us, log.baro_time_us, log.gps_time_us)
+        rows = (log.imu, log.baro_alt_m, log.gps)
+        kinds = [
+            (np.ascontiguousarray(time_us, np.int64), np.ascontiguousarray(row, np.float64))
+            for time_us, row in zip(times, rows, strict=True)
+        ]
+        arguments = [
+            argument
+            for time_us, row in kinds
+            for argument in (len(time_us), address_of(time_us), address_of(row))
+        ]
+        taken = np.zeros(2, np.int64)
+        self._kernels.run(self._at, self._gains_at, *arguments, address_of(taken), address_of(out))
         return out

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.records import Vec3
 
 FloatArray = NDArray[np.float64]
@@ -124,7 +125,7 @@ def step(c: Coefficients, z: Delays, x: Vec3) -> tuple[Vec3, Delays]:
     return ((y0, y1, y2), delays)
 
 
-@compiled
+@dispatched
 def run(c: Coefficients, z: Delays, x: FloatArray) -> tuple[FloatArray, Delays]:
     """Pass an array of shape (n, 3) through the filter."""
     y = np.empty_like(x)

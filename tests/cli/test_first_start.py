@@ -9,7 +9,8 @@ from rich.console import Console
 
 from gateway.cli.app import app
 from gateway.cli.support import warm_up
-from gateway.cli.support.warm_up import STEPS, make_ready
+from gateway.cli.support.warm_up import ENTRY_POINTS, make_ready
+from gateway.compiled.entry_point import EntryPoint
 
 pytestmark = pytest.mark.io
 
@@ -21,14 +22,20 @@ class Compiler:
         self.kept = kept
         self.asked: list[tuple[str, str]] = []
 
-    def is_kept(self, step: object) -> bool:
-        return next(name for name, known in STEPS.items() if known is step) in self.kept
+    def is_kept(self, name: str) -> bool:
+        return name in self.kept
 
-    def apart(self, _work: object, names: Iterable[str], while_waiting: Callable[[], None]) -> None:
+    def apart(
+        self,
+        _work: object,
+        shares: Iterable[Iterable[EntryPoint[...]]],
+        while_waiting: Callable[[], None],
+    ) -> None:
         while_waiting()
-        for name in names:
-            self.asked.append(("apart", name))
-            self.kept.add(name)
+        entry_points = [entry_point for share in shares for entry_point in share]
+        [name] = [n for n, known in ENTRY_POINTS.items() if set(known) == set(entry_points)]
+        self.asked.append(("apart", name))
+        self.kept.add(name)
 
     def behind(self, _work: object, names: Iterable[str]) -> None:
         self.asked += [("behind", name) for name in names]
@@ -56,7 +63,7 @@ def test_the_first_start_waits_for_the_chosen_estimator_alone(
     console = Console(file=shown, force_terminal=is_terminal, width=100)
     monkeypatch.setattr(warm_up, "console_of", lambda **_: console)
     make_ready("eskf")
-    others = [("behind", name) for name in STEPS if name != "eskf"]
+    others = [("behind", name) for name in ENTRY_POINTS if name != "eskf"]
     assert compiler.asked == [("apart", "eskf"), ("here", "eskf"), *others]
     assert ("compiling the estimator" in shown.getvalue()) == is_terminal
 
@@ -68,7 +75,7 @@ def test_others_that_are_missing_are_not_waited_for(compiler: Compiler) -> None:
 
 
 def test_a_later_start_shows_nothing(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
-    compiler.kept.update(STEPS)
+    compiler.kept.update(ENTRY_POINTS)
     monkeypatch.setattr(warm_up, "console_of", lambda **_: pytest.fail("a clock"))
     make_ready("paper")
     assert compiler.asked == [("here", "paper")]

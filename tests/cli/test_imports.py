@@ -14,6 +14,7 @@ HEAVY = {"asyncio", "numba", "numpy", "pymavlink", "scipy"}
 RUN_MAY_NOT = {
     "gateway.fleet.fleet_server",
     "gateway.panel.panel_server",
+    "numba",
     "prometheus_client",
     "rich.live",
     "rich.progress",

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.cli.support.errors import how_to_add
-from gateway.cli.support.warm_up import STEPS
-from gateway.compiled import is_kept
+from gateway.cli.support.warm_up import ENTRY_POINTS, is_kept
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
 from gateway.edges.disk.part_files import free_bytes_near
 from gateway.edges.operator.control_finder import live_sockets
@@ -124,7 +123,7 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
 
 def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether compiled estimators are cached, and can be."""
-    if all(is_kept(step) for step in STEPS.values()):
+    if all(map(is_kept, ENTRY_POINTS)):
         yield Diagnosis(Grade.GOOD, "estimators", "compiled")
         return
     text = "the next start compiles the estimators: telemetry waits for the chosen one alone"

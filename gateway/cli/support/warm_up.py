@@ -11,10 +11,10 @@ from typing import Final
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy, run_copies
 from gateway.cli.support.terminal import console_of
-from gateway.compiled import is_kept
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
-from gateway.estimation.paper import paper_kernels
+from gateway.estimation.paper.paper_entry import step_live
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
@@ -23,14 +23,19 @@ log = logging.getLogger(__name__)
 
 REHEARSAL_US: Final = 100_000
 SAMPLE_US: Final = 10_000
-STEPS: Final[dict[str, Callable[..., object]]] = {
-    "paper": paper_kernels.step_live,
-    "complementary": COMPLEMENTARY.imu,
-    "eskf": ESKF.imu,
+ENTRY_POINTS: Final[dict[str, tuple[EntryPoint[...], ...]]] = {
+    "paper": (step_live,),
+    "complementary": COMPLEMENTARY.live,
+    "eskf": ESKF.live,
 }
-"""Each estimator's step for a sample: if its machine code is cached, so is all of it."""
+"""The machine code that each estimator needs, the largest first."""
 BEHIND: Final = 10
 """Niceness of the process that compiles while telemetry runs."""
+
+
+def is_kept(estimator: str) -> bool:
+    """Return whether the machine code of an estimator is on disk."""
+    return all(entry_point.is_kept for entry_point in ENTRY_POINTS[estimator])
 
 
 def make_ready(estimator: str) -> None:
@@ -39,21 +44,23 @@ def make_ready(estimator: str) -> None:
     The machine code is cached beside the source, so only the first start after an upgrade
     compiles: the chosen estimator first, and then the others in a separate process while telemetry
     runs, since a ground station may choose one in flight, when compiling would interrupt the
-    attitude for seconds; reading one from disk takes some hundredths of a second.
+    attitude for seconds; loading one from disk takes some hundredths of a second. This process
+    never imports the compiler, which needs more memory than everything else together.
 
     Parameters
     ----------
     estimator : str
         Name of the one in the settings.
     """
-    missing = [name for name, step in STEPS.items() if not is_kept(step)]
+    missing = [name for name in ENTRY_POINTS if not is_kept(name)]
     if estimator in missing:
         log.info("compiling the estimator %s, this once; later starts take a second", estimator)
         begin = time.monotonic()
         with _clock() as show:
-            # In a separate process, because the compiler's memory is never freed; this one reads
-            # its cache.
-            run_copies(_compile, [estimator], show)
+            # In separate processes, because the compiler's memory is never freed; this one reads
+            # the cache. The largest entry point takes as long as all others together.
+            largest, *others = ENTRY_POINTS[estimator]
+            run_copies(_compile, [[largest], others], show)
         log.info("compiled in %.0f s", time.monotonic() - begin)
         missing.remove(estimator)
     _rehearse(estimator)
@@ -78,16 +85,17 @@ def _clock() -> Iterator[Callable[[], None]]:
         yield progress.refresh
 
 
-def _compile(name: str) -> None:
+def _compile(entry_points: Iterable[EntryPoint[...]]) -> None:
     # The parent reports an interrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    _rehearse(name)
+    for entry_point in entry_points:
+        entry_point.prepare()
 
 
 def _compile_behind(names: Iterable[str]) -> None:
     os.nice(BEHIND)
     for name in names:
-        _compile(name)
+        _compile(ENTRY_POINTS[name])
 
 
 def _rehearse(name: str) -> None:

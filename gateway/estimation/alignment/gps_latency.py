@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.estimation.columns import ACCEL, GPS_USABLE, GPS_VEL, GYRO
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray
@@ -58,7 +58,7 @@ class GpsLatency:
     std_s: float
 
 
-@compiled
+@dispatched
 def sum_force(time_us: IntArray, imu: FloatArray, total: FloatArray) -> None:
     """Integrate the specific force in the gyroscope's frame, m/s; `total` has shape (n, 3)."""
     q, x, y, z = (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0

@@ -1,23 +1,31 @@
 """How samples reach a filter, live and over a log: written once, compiled for each.
 
-Numba keeps the machine code of a function by its file and name, and binds what it calls when it is
-compiled. So the loop is a template: a copy is compiled for each filter, in which the filter's own
-functions stand for those that are empty here.
+Machine code holds all that it calls. So the loop is a template: a copy is compiled for each filter,
+in which the filter's own functions stand for those that are empty here.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 
-from gateway.compiled import compiled_with, record_at
+from gateway.compiled import array_at, compiled_with, record_at
+from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.columns import GPS_COLUMNS, IMU_COLUMNS, NAV_COLUMNS
 from gateway.estimation.kernel import Kernels
 from gateway.estimation.kernel_record import FloatArray, IntArray, layout
 
 S = TypeVar("S")
 P = TypeVar("P")
+Arguments = ParamSpec("Arguments")
 
 STATE_LAYOUT = GAINS_LAYOUT = np.dtype(np.void)
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
+
+
+def start(s: Any, p: Any) -> None:
+    """Stand for the filter's own."""
 
 
 def take_imu(s: Any, p: Any, time_us: int, row: FloatArray) -> None:
@@ -36,21 +44,33 @@ def write_output(s: Any, row: FloatArray) -> None:
     """Stand for the filter's own."""
 
 
-def imu_step(state: int, gains: int, time_us: int, row: FloatArray, output: FloatArray) -> None:
-    """Take one IMU sample live, and write the output row; records by their addresses."""
-    s = record_at(state, STATE_LAYOUT)
-    take_imu(s, record_at(gains, GAINS_LAYOUT), time_us, row)
-    write_output(s, output)
+def begin(state: int, gains: int) -> None:
+    """Make a state of zeros one that nothing has been seen in."""
+    start(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT))
+
+
+def imu_steps(
+    state: int, gains: int, count: int, times_us: int, samples: int, outputs: int
+) -> None:
+    """Take IMU samples, and write a row after each."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    time_us = array_at(times_us, (count,), INT)
+    rows = array_at(samples, (count, IMU_COLUMNS), FLOAT)
+    out = array_at(outputs, (count, NAV_COLUMNS), FLOAT)
+    for i in range(count):
+        take_imu(s, p, time_us[i], rows[i])
+        write_output(s, out[i])
 
 
 def baro_step(state: int, gains: int, alt_m: float) -> None:
-    """Take one barometer sample live."""
+    """Take one barometer sample."""
     take_baro(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT), alt_m)
 
 
-def gps_step(state: int, gains: int, arrival_us: int, row: FloatArray) -> None:
-    """Take one fix live."""
-    take_gps(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT), arrival_us, row)
+def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
+    """Take one fix."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    take_gps(s, p, arrival_us, array_at(fix, (GPS_COLUMNS,), FLOAT))
 
 
 def take_earlier(
@@ -73,19 +93,31 @@ def take_earlier(
 
 
 def run(
-    s: object,
-    p: object,
-    imu_time_us: IntArray,
-    imu: FloatArray,
-    baro_time_us: IntArray,
-    baro_alt_m: FloatArray,
-    gps_time_us: IntArray,
-    gps: FloatArray,
-    out: FloatArray,
+    state: int,
+    gains: int,
+    imu_count: int,
+    imu_times_us: int,
+    imu_rows: int,
+    baro_count: int,
+    baro_times_us: int,
+    baro_alts_m: int,
+    gps_count: int,
+    gps_times_us: int,
+    gps_rows: int,
+    counters: int,
+    outputs: int,
 ) -> None:
     """Advance over a log: at each IMU sample, what came before it first."""
-    taken = np.zeros(2, np.int64)
-    for i in range(imu_time_us.shape[0]):
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
+    imu = array_at(imu_rows, (imu_count, IMU_COLUMNS), FLOAT)
+    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
+    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
+    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    gps = array_at(gps_rows, (gps_count, GPS_COLUMNS), FLOAT)
+    taken = array_at(counters, (2,), INT)
+    out = array_at(outputs, (imu_count, NAV_COLUMNS), FLOAT)
+    for i in range(imu_count):
         now_us = imu_time_us[i]
         take_earlier(s, p, now_us, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
         take_imu(s, p, now_us, imu[i])
@@ -118,6 +150,7 @@ def kernels_of(
     names: dict[str, object] = {
         "STATE_LAYOUT": layout(declaration),
         "GAINS_LAYOUT": layout(gains),
+        "start": start,
         "take_imu": take_imu,
         "take_baro": take_baro,
         "take_gps": take_gps,
@@ -125,12 +158,16 @@ def kernels_of(
     }
     mark = declaration.__name__
     earlier = compiled_with(take_earlier, names, mark)
+
+    def entry(template: Callable[Arguments, None]) -> EntryPoint[Arguments]:
+        return EntryPoint(compiled_with(template, names | {"take_earlier": earlier}, mark))
+
     return Kernels(
         declaration=declaration,
-        start=start,
-        imu=compiled_with(imu_step, names, mark),
-        baro=compiled_with(baro_step, names, mark),
-        gps=compiled_with(gps_step, names, mark),
+        begin=entry(begin),
+        imus=entry(imu_steps),
+        baro=entry(baro_step),
+        gps=entry(gps_step),
+        run=entry(run),
         earlier=earlier,
-        run=compiled_with(run, names | {"take_earlier": earlier}, mark),
     )

@@ -51,6 +51,7 @@ from gateway.estimation.kernel_record import (
     unpack_record,
 )
 from gateway.estimation.paper import paper_kernels as kernels
+from gateway.estimation.paper.paper_entry import MOTION_COLUMNS, step_live
 from gateway.estimation.paper.paper_kernels import is_finite
 from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
 from gateway.estimation.rest import RestGains, RestSettings, rest_gains
@@ -159,6 +160,7 @@ class PaperEstimator:
         self._earth = EarthField(reference)
         self._s = PaperState()
         self._memory = new_record(kernels.Memory)
+        self._motion = np.zeros(MOTION_COLUMNS)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -237,7 +239,7 @@ class PaperEstimator:
             return
         s = self._s
         place, vel = self._read(fix)
-        s.fix_place, s.fix_vel_n_mps = kernels.carry_forward(
+        place, vel = kernels.carry_forward(
             self._memory,
             place,
             vel,
@@ -245,6 +247,9 @@ class PaperEstimator:
             _known(s.time_us),
             self._reference.gps_latency_s,
         )
+        # They come from numpy's numbers, which a snapshot does not take.
+        s.fix_place = (float(place[0]), float(place[1]), float(place[2]))
+        s.fix_vel_n_mps = (float(vel[0]), float(vel[1]), float(vel[2]))
         if not math.isfinite(s.place[0]):
             s.place, s.vel_n_mps = s.fix_place, s.fix_vel_n_mps
         self._blend_fix()
@@ -312,21 +317,20 @@ class PaperEstimator:
         return place, vel
 
     def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
-        s, now_us = self._s, _known(self._s.time_us)
-        s.rate_b_radps, s.q_nb, s.place, s.vel_n_mps = kernels.step_live(
+        s, now_us, motion = self._s, _known(self._s.time_us), self._motion
+        motion[:] = (*s.q_nb, *gyro, *s.place, *s.vel_n_mps, *accel, *s.fix_vel_n_mps)
+        step_live(
             address_of(self._memory),
             address_of(self._rest),
             self._settings.alpha_gyro,
-            s.q_nb,
-            accel,
-            gyro,
-            s.place,
-            s.vel_n_mps,
-            s.fix_vel_n_mps,
+            address_of(motion),
             now_us - _known(s.fix_time_us),
             now_us,
             dt_s,
         )
+        m = motion.tolist()
+        s.q_nb, s.rate_b_radps = (m[0], m[1], m[2], m[3]), (m[4], m[5], m[6])
+        s.place, s.vel_n_mps = (m[7], m[8], m[9]), (m[10], m[11], m[12])
         if self._settings.blend == "every_sample":
             self._blend_fix()
 

@@ -9,10 +9,11 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from gateway.compiled import compiled, record_at
+from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.estimation import flagbits
 from gateway.estimation.history import SLOTS, recall, remember
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, layout, write_vec
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, write_vec
 from gateway.estimation.rest import RestGains, RestState, watch_rest
 from gateway.geometry.geodesy import offset_deg
 from gateway.geometry.quaternion import (
@@ -68,10 +69,6 @@ class Memory(RestState):
     ring_count: int
     past: Annotated[FloatArray, (6,)]
     """Scratch: the integrals as they were."""
-
-
-MEMORY_LAYOUT: Final = layout(Memory)
-REST_LAYOUT: Final = layout(RestGains)
 
 
 @compiled
@@ -206,26 +203,6 @@ def step(
 
 
 @compiled
-def step_live(
-    memory: int,
-    gains: int,
-    alpha_gyro: float,
-    q_nb: Quat,
-    accel: Vec3,
-    gyro: Vec3,
-    place: Place,
-    vel: Vec3,
-    fix_vel: Vec3,
-    fix_age_us: int,
-    now_us: int,
-    dt_s: float,
-) -> tuple[Vec3, Quat, Place, Vec3]:
-    """Do one `step` with memory and gains by their addresses."""
-    s, p = record_at(memory, MEMORY_LAYOUT), record_at(gains, REST_LAYOUT)
-    return step(s, p, alpha_gyro, q_nb, accel, gyro, place, vel, fix_vel, fix_age_us, now_us, dt_s)
-
-
-@compiled
 def carry_forward(
     s: Memory, place: Place, vel: Vec3, arrival_us: int, now_us: int, latency_s: float
 ) -> tuple[Place, Vec3]:
@@ -309,7 +286,7 @@ def flags_of(
     return flags
 
 
-@compiled
+@dispatched
 def run(
     gains: tuple[float, float, float, float, float],
     rest: RestGains,

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import apply_transition, propagate
 from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, KERNELS, move, take_imu
@@ -93,7 +94,7 @@ def move_copy(s: EskfState, p: EskfGains, time_us: int, row: FloatArray, F: Floa
         foresee(s, p, F)
 
 
-@compiled
+@dispatched
 def run_forward(
     states: FloatArray,
     p: EskfGains,

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.wire.mavlink_messages import CRC_EXTRA
 
 ByteArray = NDArray[np.uint8]
@@ -130,7 +131,7 @@ def _judge(
     return size if checksum == _WAIT and (successor == _YES or in_step) else 0
 
 
-@compiled
+@dispatched
 def scan(
     data: ByteArray,
     final: bool,

@@ -12,7 +12,7 @@ from gateway.analysis.flight_arrays import FloatArray, IntArray
 from gateway.analysis.metrics import euler_rad, rms, worst, wrap_pi
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
-from gateway.compiled import compiled
+from gateway.compiled.entry_point import dispatched
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 from gateway.units import US_PER_S
 
@@ -146,7 +146,7 @@ def integrate_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray
     return _integrate(dt_s, np.nan_to_num(gyro_b_radps), np.array(q_nb, np.float64))
 
 
-@compiled
+@dispatched
 def _integrate(dt_s: FloatArray, gyro: FloatArray, begin: FloatArray) -> FloatArray:
     out = np.empty((len(dt_s), 4))
     q = (begin[0], begin[1], begin[2], begin[3])

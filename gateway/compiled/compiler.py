@@ -1,0 +1,121 @@
+"""The only place that uses numba: strict-IEEE machine code of functions marked by `compiled`.
+
+Imported only when there is something to compile: numba takes 60 MB and a quarter of a second.
+"""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from inspect import signature
+from types import FunctionType
+from typing import Any, Final
+
+import llvmlite.binding as llvm
+import numba
+from numba import carray, types  # type: ignore[attr-defined]
+from numba.core.caching import IndexDataCacheFile
+from numba.extending import intrinsic, overload, typeof_impl
+
+from gateway.compiled import array_at, digest_of, is_compiled
+from gateway.compiled.machine_code import MachineCode, target_machine
+
+STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
+"""Offline fusion of a log must give exactly what it gave live."""
+TYPES: Final[dict[Any, Any]] = {int: types.int64, float: types.float64}
+
+
+def compile_entry(function: Callable[..., None]) -> MachineCode:
+    """Compile an entry point.
+
+    Parameters
+    ----------
+    function : callable
+        Marked by `compiled`; takes `int` and `float`, and returns nothing. It must not allocate
+        or raise, because that needs numba's runtime, which is not there when the code is loaded.
+
+    Returns
+    -------
+    MachineCode
+        With a C function of the same parameters: `int64_t` and `double`.
+
+    Raises
+    ------
+    TypeError
+        If it allocates.
+    """
+    arguments = [TYPES[p.annotation] for p in signature(function).parameters.values()]
+    entry = numba.cfunc(types.void(*arguments), **STRICT)(function)
+    module = llvm.parse_assembly(entry.inspect_llvm())
+    helpers = [f.name for f in module.functions if f.is_declaration]
+    helpers = [name for name in helpers if name.startswith(("NRT_", "Py", "numba_"))]
+    if any("alloc" in name.lower() for name in helpers):
+        raise TypeError(f"{function.__qualname__} allocates, which an entry point may not")
+    return MachineCode(entry.native_name, helpers, target_machine().emit_object(module))
+
+
+def compile_dispatcher(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function for any argument types; numba caches the code for each set of types.
+
+    Parameters
+    ----------
+    function : callable
+        Marked by `compiled`.
+
+    Returns
+    -------
+    callable
+        Compiles the function, or loads its cached code, when it is called.
+    """
+    dispatcher: Any = numba.njit(cache=True, **STRICT)(function)
+    files = dispatcher._cache._cache_file  # noqa: SLF001
+    files.__class__ = _FileBySignature
+    # Numba itself compares only the function's own file, not those of the functions it calls.
+    files._source_stamp = digest_of(function)  # noqa: SLF001
+    return dispatcher  # type: ignore[no-any-return]
+
+
+class _FileBySignature(IndexDataCacheFile):
+    """Names a file of machine code by the types that it was compiled for.
+
+    Numba numbers the files of a function. Two processes that compile it for different types at the
+    same time may take the same number, and ever after one would run the other's code.
+    """
+
+    def save(self: Any, key: object, data: object) -> None:
+        """Keep the machine code of one signature."""
+        digest = hashlib.sha256(repr(key).encode()).digest()
+        name = self._data_name(int.from_bytes(digest[:8]))
+        self._save_index({**self._load_index(), key: name})
+        self._save_data(name, data)
+
+
+@cache
+def _called(function: FunctionType) -> Any:
+    """Return the form of a function that compiled code can call."""
+    njit: Any = numba.njit
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **STRICT)(function)
+
+
+@typeof_impl.register(FunctionType)
+def _type_of_function(function: FunctionType, _: object) -> Any:
+    return types.Dispatcher(_called(function)) if is_compiled(function) else None
+
+
+def _make_pointer(_: Any, _address: Any) -> Any:
+    """Convert an integer to the pointer of that value."""
+
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), generate
+
+
+_pointer_to: Any = intrinsic(_make_pointer)
+
+
+@overload(array_at)
+def _array_at(address: Any, shape: Any, kind: Any) -> Any:  # noqa: ARG001
+    def see(address: Any, shape: Any, kind: Any) -> Any:
+        return carray(_pointer_to(address), shape, kind)
+
+    return see

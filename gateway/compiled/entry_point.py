@@ -1,0 +1,97 @@
+"""Functions that Python calls as machine code: directly by ctypes, or through numba."""
+
+import ctypes
+import os
+from collections.abc import Callable
+from functools import update_wrapper
+from inspect import signature
+from typing import Any, Final, Generic, ParamSpec, TypeVar
+
+from gateway.compiled import compiled, digest_of
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+INTERPRETED: Final = os.environ.get("NUMBA_DISABLE_JIT", "0") != "0"
+"""Run everything as Python, for a debugger."""
+C_TYPES: Final[dict[Any, Any]] = {int: ctypes.c_int64, float: ctypes.c_double}
+
+
+class EntryPoint(Generic[Parameters]):
+    """A function that is called as machine code, loaded from the cache or compiled at first call.
+
+    Parameters
+    ----------
+    function : callable
+        Takes `int` (addresses of arrays too) and `float`, and returns nothing; see
+        `compiler.compile_entry`.
+    """
+
+    def __init__(self, function: Callable[Parameters, None]) -> None:
+        self._function = compiled(function)
+        self._name = f"{function.__module__}.{function.__qualname__}"
+        self._loaded: Callable[..., None] | None = function if INTERPRETED else None
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        """Call it."""
+        if self._loaded is None:
+            self._loaded = self._load()
+        self._loaded(*args, **kwargs)
+
+    def prepare(self) -> None:
+        """Load or compile it before it is called."""
+        self._loaded = self._loaded or self._load()
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether its machine code is cached, or not needed."""
+        if INTERPRETED:
+            return True
+        # Imported late, here and below, because LLVM takes 40 MB.
+        from gateway.compiled.machine_code import kept_code
+
+        return kept_code(self._name, digest_of(self._function)) is not None
+
+    def _load(self) -> Callable[..., None]:
+        from gateway.compiled.machine_code import keep_code, kept_code, load_code
+
+        name, digest = self._name, digest_of(self._function)
+        code = kept_code(name, digest)
+        if code is None:
+            from gateway.compiled.compiler import compile_entry
+
+            code = compile_entry(self._function)
+            keep_code(name, digest, code)
+        parameters = signature(self._function).parameters.values()
+        prototype = ctypes.PYFUNCTYPE(None, *(C_TYPES[p.annotation] for p in parameters))
+        return prototype(load_code(code))
+
+
+class _Dispatched(Generic[Parameters, Result]):
+    """A function that numba compiles at its first call."""
+
+    def __init__(self, function: Callable[Parameters, Result]) -> None:
+        self._function = compiled(function)
+        self._dispatcher: Callable[..., Result] | None = function if INTERPRETED else None
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if self._dispatcher is None:
+            from gateway.compiled.compiler import compile_dispatcher
+
+            self._dispatcher = compile_dispatcher(self._function)
+        return self._dispatcher(*args, **kwargs)
+
+
+def dispatched(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a function when Python calls it, for loops over whole recordings.
+
+    Only Python can call the result; compiled code calls functions marked by `compiled`.
+
+    Parameters
+    ----------
+    function : callable
+        In numba's nopython subset; takes arrays and records as they are.
+    """
+    return _Dispatched(function)
