@@ -1,10 +1,15 @@
-"""Three fields that all fly an aircraft 1, seen, set and sent on a mission through one fleet."""
+"""Three fields that all fly an aircraft 1, seen, set and sent on a mission through one fleet.
+
+The civil clocks of two of them are wrong by years; nothing of it may matter.
+"""
 
 import asyncio
 import json
+import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +21,21 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 
 from gateway.cli.support.warm_up import make_ready
 from gateway.estimation.select import EstimationSettings
-from tests.end_to_end.processes import START_LIMIT_S, Gateway, MavProxy, free_udp_ports
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, free_udp_ports
 from tests.end_to_end.test_ground_stations import WAYPOINTS
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 SITES = ("field-1", "field-2", "field-3")
+YEAR_S = 31_556_952
+OFF_S = {"field-2": 20 * YEAR_S, "field-3": -20 * YEAR_S}
+WRONG_CLOCK = Path(__file__).with_name("wrong_clock.c")
 SITE = """
 [hub]
 endpoints = ["zenoh:{place}?site={site}"]
+
+[recording]
+folder = "{folder}"
 
 [simulator]
 gps_first_fix_s = 0.5
@@ -33,48 +44,71 @@ gps_first_fix_s = 0.5
 
 @dataclass
 class Fleet:
-    """Where its ground stations are."""
+    """Where its ground stations are, and its sites."""
 
-    mavsdk_port: int
-    mavproxy_port: int
+    ports: list[int]
+    sites: dict[str, Gateway]
+
+    def ask(self, *words: str) -> str:
+        """Ask by the command line."""
+        words = (sys.executable, "-m", "gateway.cli", "fleet", *words)
+        return subprocess.run(words, capture_output=True, check=True, text=True).stdout
 
     def ids(self) -> dict[str, int]:
-        """Ask by the command line which id each site's aircraft has here."""
-        words = [sys.executable, "-m", "gateway.cli", "fleet", "status", "--json"]
-        done = subprocess.run(words, capture_output=True, check=True, text=True)
+        """Return which id each site's aircraft has here."""
         return {
             site["name"]: vehicle["id"]
-            for site in json.loads(done.stdout)["sites"]
+            for site in json.loads(self.ask("status", "--json"))["sites"]
             for vehicle in site["vehicles"]
             if vehicle["system_id"] == 1
         }
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
+@pytest.fixture(scope="module")
+def wrong_clock(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
+    """Something to preload that moves the civil clock of a process."""
+    if not (compiler := shutil.which("cc")):
+        return None
+    library = tmp_path_factory.mktemp("clock") / "wrong_clock.so"
+    words = [compiler, "-shared", "-fPIC", "-o", str(library), str(WRONG_CLOCK), "-ldl"]
+    subprocess.run(words, check=True)
+    return library
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) -> Iterator[Fleet]:
+    folder = tmp_path_factory.mktemp("fleet")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     # Once for all: three sites that compile at the same time would take minutes.
     make_ready(EstimationSettings().estimator)
-    running: list[Gateway] = []
-    ports = free_udp_ports(2)
+    running: dict[str, Gateway] = {}
+    ports = free_udp_ports(3)
     words = [sys.executable, "-m", "gateway.cli", "fleet", "--listen", place, "--site", "field-*"]
     for port in ports:
         words += ["--endpoint", f"udp:127.0.0.1:{port}"]
-    with (tmp_path / "fleet.log").open("w") as log:
+    with (folder / "fleet.log").open("w") as log:
         process = subprocess.Popen(words, stdout=log, stderr=log)
     try:
         for site in SITES:
-            folder = tmp_path / site
-            folder.mkdir()
-            text = SITE.replace("{place}", place).replace("{site}", site)
-            running.append(Gateway(folder, "demo", config=text))
-        yield Fleet(*ports)
+            running[site] = start_site(folder / site, place, site, wrong_clock)
+        yield Fleet(ports, running)
     finally:
-        for each in (process, *(gateway.process for gateway in running)):
+        for each in (process, *(gateway.process for gateway in running.values())):
             each.kill()
             each.wait(10)
+
+
+def start_site(folder: Path, place: str, site: str, wrong_clock: Path | None) -> Gateway:
+    """Start a site, its civil clock moved if it can be."""
+    folder.mkdir()
+    text = SITE.replace("{place}", place).replace("{site}", site).replace("{folder}", str(folder))
+    with pytest.MonkeyPatch.context() as environment:
+        if wrong_clock is not None and site in OFF_S:
+            environment.setenv("LD_PRELOAD", str(wrong_clock))
+            environment.setenv("CLOCK_OFF_S", str(OFF_S[site]))
+        return Gateway(folder, "demo", "--record", config=text)
 
 
 async def seen(mavsdk: Mavsdk) -> dict[int, System]:
@@ -89,11 +123,11 @@ async def seen(mavsdk: Mavsdk) -> dict[int, System]:
 
 async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "way.txt").write_text(WAYPOINTS)
-    mavproxy = MavProxy(fleet.mavproxy_port, tmp_path)
+    mavproxy = MavProxy(fleet.ports[1], tmp_path)
     try:
         configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
         async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{fleet.mavsdk_port}")
+            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{fleet.ports[0]}")
             systems = await seen(mavsdk)
             ids = await asyncio.to_thread(fleet.ids)
             assert set(ids) == set(SITES)
@@ -119,3 +153,33 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
     finally:
         mavproxy.process.kill()
         mavproxy.process.communicate(timeout=10)
+
+
+def test_clocks_that_are_wrong_by_years(
+    fleet: Fleet, wrong_clock: Path | None, tmp_path: Path
+) -> None:
+    """Fused, recorded, fetched, and ended in time."""
+    if wrong_clock is None:
+        pytest.skip("no C compiler")
+    client, now_s = Client(fleet.ports[2]), time.time()
+    told_s: dict[int, float] = {}
+    fused: set[int] = set()
+    while not len(told_s) == len(fused) == len(SITES):
+        for message in client.receive():
+            if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec:
+                told_s[message.get_srcSystem()] = message.time_unix_usec / 1e6
+            elif message.get_type() == "GLOBAL_POSITION_INT" and message.lat:
+                fused.add(message.get_srcSystem())
+    client.sock.close()
+    for site, system_id in fleet.ids().items():
+        assert abs(told_s[system_id] - now_s - OFF_S.get(site, 0)) < YEAR_S / 365
+    assert set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES)
+    for site in OFF_S:
+        fleet.ask("recordings", "get", site, "last", "--to", str(tmp_path / site))
+    assert [gateway.stop() for gateway in fleet.sites.values()] == [0, 0, 0]
+    for site, off_s in OFF_S.items():
+        (log,) = (tmp_path / site).glob("*.tlog")
+        data = log.read_bytes()
+        first_s = int.from_bytes(data[:8], "big") / 1e6
+        assert abs(first_s - now_s - off_s) < YEAR_S / 365
+        assert len(data) > 10_000

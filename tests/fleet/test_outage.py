@@ -1,0 +1,46 @@
+"""A fleet whose router dies and comes back, as its ground station sees it."""
+
+import msgspec
+import pytest
+
+from gateway.fleet.fleet_settings import FleetSettings
+from tests.edges.hub.test_fleet_link import Router, router
+from tests.fleet.conftest import World
+
+__all__ = ["router"]
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def settings(settings: FleetSettings, router: Router) -> FleetSettings:
+    """Both ends at one router."""
+    return msgspec.structs.replace(settings, listen=router.place, router=router.place)
+
+
+async def test_the_router_dies_and_comes_back(world: World, router: Router) -> None:
+    site = world.open_site("field-a", beside="udp-listen:127.0.0.1:0")
+    local = world.rig.station(site.listening_ports()[0])
+    local.say(local.sender.heartbeat())
+    await world.until(lambda: bool(world.systems()))
+    router.kill()
+    await world.until(
+        lambda: not world.fleet.status()["is_linked"] and site.clients()[0].state == "connecting"
+    )
+    before = len(world.got)
+    for _ in range(50):
+        world.station.say(world.station.sender.command(1, 1))
+    await world.until(lambda: site.clients()[0].dropped > 100)
+    texts = [m.text for m in world.got[before:] if m.get_type() == "STATUSTEXT"]
+    assert {m.get_type() for m in world.got[before:]} <= {"STATUSTEXT"}, "nothing of the vehicle"
+    assert len(texts) <= 1
+    assert (site.clients()[0].queued, world.fleet.status()["clients"][0].queued) == (0, 0)
+    router.start()
+    del world.got[:]
+    await world.until(lambda: bool(world.systems()))
+    assert not world.commands("field-a"), "what is old is not delivered as new"
+    world.station.say(world.station.sender.command(1, 1))
+    await world.until(lambda: bool(world.commands("field-a")))
+    assert len(world.commands("field-a")) == 1
+    assert [each["id"] for each in world.fleet.status()["sites"][0]["vehicles"]] == [1]
+    assert site.clients()[1].dropped == 0, "a local client has noticed nothing"
