@@ -114,7 +114,22 @@ def test_turns_without_gps_are_not_taken_for_level(flight: Flight) -> None:
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
     out = run_eskf(alone)
     assert attitude_scores(alone, out[:, :4])["heading"] < 3.0
-    assert share(two_sigma(alone, out)["heading"]) > 0.9
+    within = two_sigma(alone, out)
+    assert share(within["tilt"]) > 0.85
+    assert share(within["heading"]) > 0.9
+
+
+def test_a_take_off_run_without_gps_is_neither_tilt_nor_rest(flight: Flight) -> None:
+    """It pulls as steadily as gravity, with the gyroscope as quiet as at rest."""
+    log, down = flight.log, flight.truth["down"]
+    run = (np.linalg.norm(flight.truth["vel"], axis=1) > 8.0) & (down > down[0] - 20.0)
+    first = int(np.argmax(run))
+    use = np.zeros(len(run), bool)
+    use[first : first + 300] = True
+    alone = replace(flight.with_gps(np.zeros(len(log.gps), bool)), counts=use)
+    out = run_eskf(alone)
+    assert attitude_scores(alone, out[:, :4])["inclination"] < 2.5
+    assert not (out[use, NAV_FLAGS].astype(int) & int(NavFlags.AT_REST)).any()
 
 
 def test_real_turns_without_gps_are_told_as_unsure(data_dir: Path) -> None:

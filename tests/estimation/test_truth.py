@@ -133,6 +133,14 @@ def test_real_fixed_wing_flight(data_dir: Path, name: str, run) -> None:
 
 
 @pytest.mark.slow
+def test_real_car_in_outages(data_dir: Path) -> None:
+    """It drives as quietly as it stands: what is taken for rest would stop it."""
+    flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
+    assert outage_score(flight, run_eskf, 10.0) < 2.1
+    assert outage_score(flight, run_eskf, 30.0) < 10.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [run_complementary, run_eskf], ids=["complementary", "eskf"])
 def test_real_gps_glitches_do_no_harm(data_dir: Path, run) -> None:
     """The fixes of this log wander off by a hundred metres, then come back."""

@@ -10,10 +10,12 @@ from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import VEL, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.measure import (
     UNAIDED_CORRELATION_S,
+    lag_integrals,
+    take_back,
     update_by_baro,
     update_by_compass,
     update_by_rest,
@@ -29,6 +31,7 @@ from gateway.estimation.eskf.start import (
     start,
     start_heading_by_compass,
 )
+from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.filtering.sample_clock import step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -41,9 +44,7 @@ from gateway.estimation.kernel_record import (
     write_quat,
     write_vec,
 )
-from gateway.estimation.local_position import (
-    BARO_STALE_S,
-)
+from gateway.estimation.local_position import BARO_STALE_S, past_state
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_similarity, take_field
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
@@ -68,9 +69,20 @@ ROUGH_LIMIT: Final = 1e4
 HAND_MPS2: Final = 0.5
 TURN_S: Final = 4.0
 """What pulls more than a hand does for long is flown; its velocity turns in about this time."""
-HAND_MPS: Final = 2.8
-"""A hand is not faster for long; what is faster is flown, and for a while after."""
-FLOWN_S: Final = 20.0
+WAY_S: Final = 2.0
+HAND_M: Final = 2.0
+"""A hand does not go so far in this time; what does is flown."""
+FLOWN_S: Final = 30.0
+"""The speed that a flight has shown is to be expected for about this time."""
+LEG_S: Final = 10.0
+"""A flight that hardly turns is on the same leg for about this time."""
+ASSUMED_S: Final = 5.0
+"""Corrections that are older are not taken back."""
+PUSHED_SQ: Final = 9.0
+PUSH_MPS2: Final = 0.3
+"""A steady level force beyond this, and beyond three standard deviations of tilt, is no rest."""
+PUSHED_MPS: Final = 40.0
+"""No steady force pushes to more than this without a turn or a gust."""
 UNAIDED_PULL_MPS2: Final = 0.5
 """A lasting acceleration of this much halves the belief in standing still."""
 ZERO: Final = (0.0, 0.0, 0.0)
@@ -105,7 +117,7 @@ def take_imu(
     if sound:
         moving = is_moving(s, p)
         rested = s.at_rest == 1
-        watch_rest(s, p, gyro, accel, moving, dt)
+        watch_rest(s, p, gyro, accel, is_pushed(s, dt) or moving, dt)
         raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
@@ -164,10 +176,27 @@ def substitute_force(s: EskfState) -> Vec3:
 
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
-    """Return whether the GPS says that the aircraft moves."""
+    """Return whether the GPS says that the aircraft moves, or without any the way that it went."""
+    if s.aided == 0 and s.flies == 1 and s.pushed_mps < PUSHED_MPS:
+        return True
     vel = s.vel_n if s.aided == 1 else s.fix_vel
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     return bool(fresh and math.hypot(vel[0], vel[1]) > p.rest_speed_mps)
+
+
+@compiled
+def is_pushed(s: EskfState, dt: float) -> bool:
+    """Return whether a steady force is not gravity alone: braking is as smooth as rest.
+
+    What would have pushed to a speed that nothing here flies is a tilt that is wrong.
+    """
+    f = rotate(as_quat(s.q_nb), as_vec(s.accel_lp))
+    tilt_var = s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1]
+    unsure = STANDARD_GRAVITY_MPS2**2 * tilt_var + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
+    level_sq = f[0] * f[0] + f[1] * f[1]
+    pushed = s.lost == 0 and level_sq > PUSHED_SQ * unsure + PUSH_MPS2 * PUSH_MPS2
+    s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
+    return bool(pushed and s.pushed_mps < PUSHED_MPS)
 
 
 @compiled
@@ -233,28 +262,58 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
     s.pseudo_s = s.time_s
     if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
         end_dead_reckoning(s, p)
+    if s.aided == 0:
+        propagate(s, p)
+        watch_way(s, dt)
     if s.at_rest == 1:
         update_by_rest(s, p)
     elif s.aided == 0 and s.lost == 0:
-        pull = s.pull_mps2 / UNAIDED_PULL_MPS2
-        flown = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
-        variance = p.unaided_var * (1.0 + pull * pull) + flown * flown
-        propagate(s, p)
-        variance = max(variance, TURN_S * unaided_speed_sq(s, dt))
-        update_by_velocity(s, p, variance * UNAIDED_CORRELATION_S / dt)
+        update_by_velocity(s, p, unaided_density(s, p) / dt)
 
 
 @compiled
-def unaided_speed_sq(s: EskfState, dt: float) -> float:
-    """Return the squared speed that has lately shown itself beyond what the covariance explains.
+def unaided_density(s: EskfState, p: EskfGains) -> float:
+    """Return how little is known of a velocity that no GPS tells.
 
-    A standing or hovering aircraft has none. The acceleration of a flight, taken for tilt, would
-    have to come with a turn that the gyroscope did not see: the speed of about zero that stands in
-    for a sensor is refuted by so much.
+    Returns
+    -------
+    float
+        The variance of the speed of about zero that stands in for a sensor, times how long the
+        true velocity stays the same, m2/s. A hand's is small and short. What flies is as fast as
+        it has shown, by turns or by its way, and the harder it turns, the sooner it is another.
     """
-    shown = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2 - s.P[VEL, VEL] - s.P[VEL + 1, VEL + 1])
-    s.unaided_sq = max(s.unaided_sq * math.exp(-dt / FLOWN_S), shown - HAND_MPS * HAND_MPS)
-    return s.unaided_sq
+    pull = s.pull_mps2 / UNAIDED_PULL_MPS2
+    hand = p.unaided_var * (1.0 + pull * pull) * UNAIDED_CORRELATION_S
+    turned = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
+    leg_s = min(0.5 * math.sqrt(s.unaided_sq) / max(s.turning_mps2, 0.1), LEG_S)
+    return max(hand, turned * turned * TURN_S, s.unaided_sq * leg_s)
+
+
+@compiled
+def watch_way(s: EskfState, dt: float) -> None:
+    """Notice by the way of the last seconds what no hand carries so far: it flies.
+
+    A take-off run is as smooth as rest, and its pull looks like tilt; only its way tells. The
+    speed of about zero is refuted by it, so what that has corrected meanwhile is taken back.
+    """
+    lag = s.time_s - look_back(s, s.time_s - WAY_S)
+    _, vel = past_state(s, s.then, lag)
+    _, pushed = lag_integrals(s, s.then, lag)
+    north = (vel[0] - s.assumed[3]) * lag + pushed[0]
+    east = (vel[1] - s.assumed[4]) * lag + pushed[1]
+    unsure = s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
+    flew = s.flies
+    s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * unsure else 0
+    s.unaided_sq *= math.exp(-dt / FLOWN_S)
+    for k in range(6):
+        s.assumed[k] *= math.exp(-dt / ASSUMED_S)
+    if s.at_rest == 1:
+        s.unaided_sq, s.flies = 0.0, 0
+    elif s.flies == 1:
+        shown = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2 - unsure)
+        s.unaided_sq = max(s.unaided_sq, shown)
+        if flew == 0:
+            take_back(s)
 
 
 @compiled

@@ -67,6 +67,12 @@ class EskfState(FilterState):
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
     unaided_sq: float
     """Mean square of the speed that has shown itself where no GPS tells it, per axis, m2/s2."""
+    assumed: Annotated[FloatArray, (6,)]
+    """What the speed of about zero has lately corrected: attitude in rad, velocity in m/s."""
+    pushed_mps: float
+    """Speed to which a steady force would have pushed by now, were it no tilt."""
+    flies: int
+    """1 while the way without GPS is that of a flight."""
     hold_s: float
     """How long position is dead-reckoned."""
     baro_down_m: float

@@ -273,6 +273,19 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
         # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
         consider(s, ACCEL_BIAS, 3)
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
+    for k in range(6):
+        s.assumed[k] += s.dx[TILT + k]
+    inject(s)
+
+
+@compiled
+def take_back(s: EskfState) -> None:
+    """Undo what the speed of about zero has lately corrected, and be unsure by as much."""
+    s.restarts += 1
+    for k in range(6):
+        s.dx[TILT + k] = -s.assumed[k]
+        s.P[TILT + k, TILT + k] += s.assumed[k] * s.assumed[k]
+        s.assumed[k] = 0.0
     inject(s)
 
 
