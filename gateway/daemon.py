@@ -113,6 +113,7 @@ class Daemon:
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self._metrics_text)
+        self._write_metrics: Callable[[Snapshot], str] | None = None
         self._notifier = ServiceNotifier()
         self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
@@ -140,7 +141,7 @@ class Daemon:
             set_realtime_priority(self._settings.hub.realtime_priority)
         self._hub.start()
         self._recorder.start()
-        self._metrics.listen(self._settings.hub.metrics_port)
+        self._serve_metrics()
         self._serial.start()
         if self._receiver is not None:
             self._receiver.start()
@@ -181,7 +182,7 @@ class Daemon:
         self._settings = now
         self._hub.apply(settings.hub)
         self._perform(self._pipeline.sign_by(passphrase, own, self.now_us()))
-        self._metrics.listen(settings.hub.metrics_port)
+        self._serve_metrics()
         self._notifier.ready()
         later = "; others need a new start" if settings != now else ""
         status = f"settings of the hub and of signing applied{later}"
@@ -224,11 +225,19 @@ class Daemon:
             recorder=self._recorder.status(),
         )
 
-    def _metrics_text(self) -> str:
-        # Imported here: most gateways serve no metrics, and need not wait for the library.
-        from gateway.edges.operator.metric_families import prometheus_text
+    def _serve_metrics(self) -> None:
+        port = self._settings.hub.metrics_port
+        if port and self._write_metrics is None:
+            # Imported here: most gateways serve no metrics. Not at the first request either:
+            # loading the library then would stop the telemetry for 0.3 s.
+            from gateway.edges.operator.metric_families import prometheus_text
 
-        return prometheus_text(self.snapshot())
+            self._write_metrics = prometheus_text
+        self._metrics.listen(port)
+
+    def _metrics_text(self) -> str:
+        assert self._write_metrics is not None
+        return self._write_metrics(self.snapshot())
 
     def announce(self, text: str) -> None:
         """Announce an event that is not a problem to the ground stations."""

@@ -94,16 +94,18 @@ class Pipeline:
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Process one raw record, from the link or from a recording."""
+        vehicle_id = record.node.vehicle_id
         if isinstance(record, GpsFix) and record.utc_us is not None:
-            vehicle_id = record.node.vehicle_id
             at_zero_us = self._gps_time.hear(vehicle_id, record.utc_us, record.time_us)
             if at_zero_us is not None:
                 self._signing_clock.hear_gps(at_zero_us)
-        is_new = record.node.vehicle_id not in self.aircraft
-        self._heard_us[record.node.vehicle_id] = now_us
-        aircraft = self._aircraft_of(record.node.vehicle_id)
+        self._heard_us[vehicle_id] = now_us
+        aircraft = self.aircraft.get(vehicle_id)
+        if aircraft is not None:
+            return aircraft.take(record, now_us)
+        aircraft = self._aircraft_of(vehicle_id)
         # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
-        first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us) if is_new else []
+        first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us)
         return first + aircraft.take(record, now_us)
 
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:

@@ -26,6 +26,8 @@ FilterState = tuple[Delays, Vec3]
 """Delays and last output."""
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
+"""A wire: what it is designed for keeps no delays and needs no arithmetic."""
+NO_DELAYS: Final[Delays] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SLOWEST_HIGHPASS_HZ: Final = 1e-6
 """A time constant of 44 hours: a slower one makes no difference in any flight, while rounding
 would put its pole on the unit circle, where its gain at 0 Hz is undefined."""
@@ -184,6 +186,9 @@ class VectorFilter:
         tuple of 3 floats
             The filtered sample.
         """
+        if self._coefficients is PASS_THROUGH:
+            self.state = (NO_DELAYS, x)
+            return x
         y, delays = step(self._coefficients, self._delays(x), x)
         self.state = (delays, y)
         return y
@@ -203,7 +208,10 @@ class VectorFilter:
         """
         if not len(x):
             return x.copy()
-        y, delays = run(self._coefficients, self._delays(x[0]), np.ascontiguousarray(x))
+        if self._coefficients is PASS_THROUGH:
+            y, delays = x.copy(), NO_DELAYS
+        else:
+            y, delays = run(self._coefficients, self._delays(x[0]), np.ascontiguousarray(x))
         self.state = (delays, (float(y[-1, 0]), float(y[-1, 1]), float(y[-1, 2])))
         return y
 

@@ -196,8 +196,9 @@ class Vehicle:
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
-        found = self._replies(self.telemetry.on_state(state, sample))
-        found += self._replies(self._announcements.on_flags(state.flags, now_us))
+        told = self.telemetry.on_state(state, sample)
+        told += self._announcements.on_flags(state.flags, now_us)
+        found = self._replies(told)
         found += self._intervals.on_state(state.time_us)
         if self._calibrator.busy:
             found += self._calibrator.on_sample(sample)

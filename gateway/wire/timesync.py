@@ -58,7 +58,7 @@ class ClockTracker:
         self._buckets: list[_Point] = []
         self._line = _Point(0, 0)
         self._skew = 0.0
-        self._suspect: _Point | None = None
+        self._suspect_us: int | None = None
 
     @property
     def skew_ppm(self) -> float:
@@ -81,22 +81,23 @@ class ClockTracker:
             The stamp on the local clock, in µs; never later than the arrival.
         """
         remote_us = self._unwrap(remote_u32, arrival_us)
-        point = _Point(remote_us, arrival_us - remote_us)
-        if self._is_doubtful(point, arrival_us):
+        local_us = self._to_local(remote_us) if self._buckets else arrival_us
+        if self._is_doubtful(arrival_us - remote_us, local_us - arrival_us):
             return arrival_us
         if self._last_remote_us is None or remote_us > self._last_remote_us:
             self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
-        self._add(point)
-        return min(self._to_local(remote_us), arrival_us)
+        if self._add(remote_us, arrival_us - remote_us):
+            local_us = self._to_local(remote_us)
+        return min(local_us, arrival_us)
 
-    def _is_doubtful(self, point: _Point, arrival_us: int) -> bool:
+    def _is_doubtful(self, delta_us: int, ahead_us: int) -> bool:
         """Return whether a packet is far too early, and no other says so too."""
-        before, self._suspect = self._suspect, None
-        if not self._buckets or self._to_local(point.remote_us) - arrival_us <= AHEAD_US:
+        before_us, self._suspect_us = self._suspect_us, None
+        if ahead_us <= AHEAD_US:
             return False
-        if before is not None and abs(before.delta_us - point.delta_us) <= AHEAD_US:
+        if before_us is not None and abs(before_us - delta_us) <= AHEAD_US:
             return False
-        self._suspect = point
+        self._suspect_us = delta_us
         return True
 
     def _unwrap(self, remote_u32: int, arrival_us: int) -> int:
@@ -110,18 +111,20 @@ class ClockTracker:
             self.restarts += 1
         return remote_u32
 
-    def _add(self, point: _Point) -> None:
+    def _add(self, remote_us: int, delta_us: int) -> bool:
+        """Take in a point if it is the soonest of its bucket; tell whether the line is new."""
         buckets = self._buckets
         if buckets:
             soonest = buckets[-1]
-            bucket, newest = point.remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
-            if bucket < newest or (bucket == newest and point.delta_us >= soonest.delta_us):
-                return
+            bucket, newest = remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
+            if bucket < newest or (bucket == newest and delta_us >= soonest.delta_us):
+                return False
             if bucket == newest:
                 buckets.pop()
-        buckets.append(point)
+        buckets.append(_Point(remote_us, delta_us))
         del buckets[:-MAX_BUCKETS]
         self._fit()
+        return True
 
     def _fit(self) -> None:
         first, last = self._buckets[0], self._buckets[-1]

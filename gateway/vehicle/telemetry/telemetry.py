@@ -140,7 +140,7 @@ class Telemetry:
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
         due = [m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us)]
-        return self._build_all(due, state.time_us)
+        return self._build_all(due, state.time_us) if due else []
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
         """Take in a barometer sample, and return its message if due."""

@@ -6,6 +6,7 @@ loses vowels behind its first word. The name depends on the section's keys alone
 the same when settings elsewhere come and go.
 """
 
+from functools import cache
 from typing import Final
 
 MAX_NAME: Final = 16
@@ -63,6 +64,7 @@ def without_unit(key: str) -> str:
     return head if head and tail in UNITS else key
 
 
+@cache
 def parameter_name(section: str, key: str, axis: str = "") -> str:
     """Name the parameter of one setting.
 
