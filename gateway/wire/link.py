@@ -24,13 +24,17 @@ from gateway.records import (
 from gateway.units import M_PER_CM, M_PER_MM, US_PER_S
 from gateway.wire import payloads
 from gateway.wire.framing import Fault, FrameDecoder
-from gateway.wire.timesync import ClockTracker
+from gateway.wire.timesync import WRAP_US, ClockTracker
 
 UINT16_MAX: Final = 65_535
 
 SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
 """Payloads further back than any retry queue belong to another run of the node."""
+SLOWED: Final = 64
+"""A sixty-fourth: streams stay locked to samples that come so much closer."""
+MOST_AHEAD_US: Final = 50_000
+"""Of where the clock's estimate puts a sample: more is no small correction."""
 RATE_SPAN_US: Final = US_PER_S
 MAX_ARRIVALS: Final = 2048
 """Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
@@ -98,6 +102,8 @@ class _Node:
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     pipe: int = 0
     last_time_us: int = 0
+    last_stamp_us: int | None = None
+    """On its own clock; None before the first payload after a start of it."""
     quality: payloads.GpsQualityPayload | None = None
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
 
@@ -224,14 +230,29 @@ def _hear_node(
     time_us = node.clock.observe(header.node_time_us, heard_us)
     if node.clock.restarts != restarts:
         node.sequence.forget()
+        node.last_stamp_us = None
     # A late payload is counted but not used: every stage behind relies on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
         return None
     node.pipe = frame.pipe
     node.arrivals_us.append(arrival_us)
-    # A better estimate of the clock may move time back by a hair; a sample may not.
-    node.last_time_us = max(time_us, node.last_time_us + 1)
+    node.last_time_us = _never_back(node, header.node_time_us, time_us)
+    node.last_stamp_us = header.node_time_us
     return _to_record(header, frame.payload, node)
+
+
+def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
+    """Return the time of a sample where a better estimate of the clock may have set it back.
+
+    It then comes a little sooner after the last one than the node says, until the times agree:
+    samples all at once would be no motion for an estimator, and too many for a stream.
+    """
+    if node.last_stamp_us is not None:
+        elapsed_us = (stamp_us - node.last_stamp_us) % WRAP_US
+        slowed_us = node.last_time_us + elapsed_us - elapsed_us // SLOWED
+        if time_us < slowed_us <= time_us + MOST_AHEAD_US:
+            return slowed_us
+    return max(time_us, node.last_time_us + 1)
 
 
 def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) -> RawRecord | None:

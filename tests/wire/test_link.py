@@ -176,6 +176,34 @@ def test_node_restart_costs_nothing_but_its_clock() -> None:
     assert (node.lost, node.restarts) == (0, 1)
 
 
+@pytest.mark.parametrize("rate_hz", [50, 200, 1000])
+@pytest.mark.parametrize("queue_us", [300, 5_000, 40_000])
+def test_samples_come_a_little_closer_after_a_queue(rate_hz: int, queue_us: int) -> None:
+    """The first samples wait in a queue that clears at once: theirs is a time too late."""
+    link, line, period_us = Link(), Line(), 1_000_000 // rate_hz
+    times_us, arrivals_us = [], []
+    for number in range(64 * (queue_us // period_us + 2) + 20):
+        node_us = 1_000_000 + number * period_us
+        arrival_us = max(node_us, 1_000_000 + queue_us) + 1000
+        times_us += [r.time_us for r in link.feed(line.frame(node_us, IMU), arrival_us)]
+        arrivals_us.append(arrival_us)
+    assert len(times_us) == len(arrivals_us)
+    gaps_us = np.diff(times_us)
+    assert gaps_us.min() >= period_us * 63 // 64
+    assert gaps_us.max() <= period_us
+    assert times_us[-1] == arrivals_us[-1]
+
+
+def test_samples_of_a_long_queue_still_come_in_order() -> None:
+    link, line = Link(), Line()
+    stamps_us = range(1_000_000, 2_000_000, 5000)
+    found = [record for us in stamps_us for record in link.feed(line.frame(us, IMU), 2_000_000)]
+    times_us = np.array([record.time_us for record in found])
+    assert len(times_us) == len(stamps_us)
+    assert np.diff(times_us).min() >= 1
+    assert times_us.max() <= 2_000_000 + 51_000
+
+
 def test_receiver_restart_is_no_serial_loss() -> None:
     line, link = Line(), Link()
     for i in range(10):
