@@ -269,7 +269,8 @@ class Hub:
         if wait_s:
             loop.call_later(wait_s, self._flush, wait_s)
         else:
-            loop.call_soon(self._flush, wait_s)
+            # Not before the sockets were looked at once more: a wake-up may read one datagram only.
+            loop.call_soon(loop.call_soon, self._flush, wait_s)
 
     def _flush(self, wait_s: float) -> None:
         for flush in self._gathering.pop(wait_s, ()):

@@ -22,6 +22,9 @@ NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 65535
 READ_BUDGET: Final = 64
 """Datagrams read at one wake-up, so that one flooding peer cannot starve the others."""
+ALONE_US: Final = 300
+"""A datagram that arrives so long after the last wake-up is most likely the only one. A second
+read, which would raise BlockingIOError, is left out; if more is there, the loop wakes again."""
 RESOLVE_AGAIN_US: Final = 60 * US_PER_S
 """Names of home networks change their address at most some times a day."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
@@ -37,6 +40,7 @@ class DatagramClient(Client):
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
     _is_gathering = False
+    _woken_us = 0
 
     def __post_init__(self) -> None:
         """Start without a socket."""
@@ -198,7 +202,9 @@ class DatagramClient(Client):
 
     def _on_readable(self, sock: socket.socket) -> None:
         now_us = self.context.now_us()
-        for _ in range(READ_BUDGET):
+        budget = READ_BUDGET if now_us - self._woken_us <= ALONE_US else 1
+        self._woken_us = now_us
+        for _ in range(budget):
             try:
                 data = sock.recv(MAX_DATAGRAM)
             except BlockingIOError:

@@ -141,7 +141,8 @@ async def test_nothing_runs_round_a_ring(rig: Any) -> None:
         await rig.quiet()
     passed = [first.counters().forwarded, second.counters().forwarded]
     assert passed < [3 * 55, 3 * 110]
-    assert first.counters().looped > 50
+    # Those of the first round may pass before both cables have been heard.
+    assert first.counters().looped > 40
     await rig.quiet()
     assert [first.counters().forwarded, second.counters().forwarded] == passed
 

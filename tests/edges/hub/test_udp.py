@@ -284,6 +284,48 @@ async def test_an_answer_and_a_wish_concern_one_client(rig: Any) -> None:
     assert second.is_silent()
 
 
+class Waiting:
+    """A socket with datagrams in it, which counts how often it is read."""
+
+    def __init__(self, *datagrams: bytes) -> None:
+        self.datagrams = list(datagrams)
+        self.reads = 0
+
+    def recv(self, _size: int) -> bytes:
+        self.reads += 1
+        if not self.datagrams:
+            raise BlockingIOError
+        return self.datagrams.pop(0)
+
+
+async def test_datagrams_one_by_one_cost_one_read_each_and_a_burst_is_read_at_once(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}")
+    await rig.until_open(hub)
+    (client,) = hub._clients.values()
+    clock = [1_000_000]
+    monkeypatch.setattr(hub, "now_us", lambda: clock[0])
+
+    def wake_up(waiting: Waiting) -> Waiting:
+        with monkeypatch.context() as patch:
+            patch.setattr(client, "_socket", waiting)
+            client._on_readable(waiting)
+        return waiting
+
+    for _ in range(3):
+        clock[0] += 1000
+        alone = wake_up(Waiting(station.sender.heartbeat()))
+        assert (alone.reads, alone.datagrams) == (1, [])
+    burst = Waiting(*(station.sender.heartbeat() for _ in range(10)))
+    clock[0] += 1000
+    assert wake_up(burst).reads == 1
+    clock[0] += 50
+    assert (wake_up(burst).reads, burst.datagrams) == (11, [])
+    assert client.counters.received == 13
+
+
 async def test_packed_frames_share_a_datagram(rig: Any) -> None:
     station = rig.station()
     hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=30")
