@@ -1,10 +1,15 @@
 """Measure the way from the serial byte to the datagram: latency and CPU share.
 
-A frame with one IMU sample is written to a pseudo-terminal and the ATTITUDE_QUATERNION that it
-becomes is awaited on a UDP port, at several frame rates. The baseline, measured in the same run, is
-a program that reads the same line and sends a datagram of the same size for every delimiter,
-without decoding, fusing or encoding anything. The greatest latency at the highest rate is the
-longest pause, the machine's own included: the baseline tells those.
+    python tools/bench_latency.py
+
+Several aircraft send all that their nodes say: IMU samples, the barometer's, fixes with their
+quality, the nodes' and the receiver's own reports. A frame with an IMU sample is written to a
+pseudo-terminal and the ATTITUDE_QUATERNION that it becomes is awaited on a UDP port, at several
+rates. Programs take turns in short rounds, so that other load on the machine meets them alike: the
+median round counts. The baseline is a program that reads the same line and sends a datagram of the
+same size for every frame, without decoding, fusing or encoding anything; `--forwarder` names
+another such, written in whatever language. The greatest latency at the highest rate is the longest
+pause, the machine's own included: the baseline tells those.
 """
 
 import argparse
@@ -14,7 +19,9 @@ import json
 import math
 import os
 import select
+import shlex
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -22,8 +29,9 @@ import time
 import tty
 from collections import deque
 from collections.abc import Iterator
-from operator import itemgetter
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
@@ -32,16 +40,18 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from gateway.records import ImuFlags, NodeId
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
-RATES_HZ = (60, 200, 1000)
-QUATERNION_SIZE = 44
-"""A MAVLink 2 ATTITUDE_QUATERNION frame."""
+RATES_HZ = (100, 1000)
+VEHICLES = 3
+BARO_HZ, FIX_HZ, REPORT_HZ = 25, 5, 1
+"""Of each aircraft, beside its IMU samples; the receiver's report comes with its own."""
 WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
+GATEWAY = "mavgate"
 
 BASELINE = """
 import os, socket, sys
@@ -58,24 +68,88 @@ attitude_quaternion_hz = 1000
 """
 
 
-def frames(rate_hz: int) -> Iterator[bytes]:
-    """Make an endless row of IMU frames of a level node that turns slowly."""
-    for seq in itertools.count():
-        gyro = round(300 * math.sin(seq / 500))
-        payload = payloads.ImuPayload(
-            accel=(20, -15, 4096),
-            gyro=(3, -2, gyro),
-            mag=(200, 30, -380),
-            temperature=-3900,
-            flags=ImuFlags.MAG_NEW if seq % 3 == 0 else ImuFlags(0),
-            accel_range=2,
-            gyro_range=2,
-            mag_gain=1,
-        )
-        node_us = round(seq * 1e6 / rate_hz) % 2**32
-        header = payloads.Header(NodeId(1, 0), seq % 65536, node_us)
+class Moment(NamedTuple):
+    """What is on the line at once."""
+
+    system: int
+    """Whose IMU sample it is."""
+    sample: bytes
+    others: list[bytes]
+
+
+class Nodes:
+    """Aircraft that lie level and turn slowly, and their receiver."""
+
+    def __init__(self) -> None:
+        self._sequences: dict[NodeId, Iterator[int]] = {}
+        self._frames = itertools.count()
+
+    def moments(self, rate_hz: int, vehicles: int) -> Iterator[Moment]:
+        """Make an endless row, with so many IMU samples a second of all aircraft together."""
+        for number in itertools.count():
+            system, tick = 1 + number % vehicles, number // vehicles
+            node_us = round(number * 1e6 / rate_hz)
+            sample = self._radio(NodeId(system, 0), node_us, imu_payload(number))
+            others = list(self._others(system, tick, rate_hz / vehicles, node_us))
+            yield Moment(system, sample, others)
+
+    def _others(self, system: int, tick: int, rate_hz: float, node_us: int) -> Iterator[bytes]:
+        def is_due(each_hz: int) -> bool:
+            return int(tick * each_hz / rate_hz) != int((tick - 1) * each_hz / rate_hz)
+
+        imu, gps = NodeId(system, 0), NodeId(system, 1)
+        if is_due(BARO_HZ):
+            yield self._radio(imu, node_us, payloads.BaroPayload(10_000_000, 215))
+        if is_due(FIX_HZ):
+            itow_ms = node_us // 1000
+            yield self._radio(gps, node_us, quality_payload(itow_ms))
+            yield self._radio(gps, node_us, fix_payload(itow_ms))
+        if is_due(REPORT_HZ):
+            report = payloads.NodeStatusPayload((1, 0), 1, 7, 0, 0, 0, 3, 900, 200, 3700)
+            yield self._radio(imu, node_us, report)
+            pipes = (PipeCounters(1000, 3, 0),) * payloads.PIPES
+            status = payloads.ReceiverStatusFrame(
+                next(self._frames) % 256, node_us % 2**32, 76, 4, 0, 1, pipes
+            )
+            yield encode_frame(payloads.encode_receiver_status(status))
+
+    def _radio(self, node: NodeId, node_us: int, payload: payloads.Payload) -> bytes:
+        sequence = next(self._sequences.setdefault(node, itertools.count()))
+        header = payloads.Header(node, sequence % 65536, node_us % 2**32)
         packet = payloads.encode_payload(header, payload)
-        yield encode_frame(payloads.encode_radio(seq % 256, 0, node_us, packet))
+        frame_seq, pipe = next(self._frames) % 256, node.node_id
+        return encode_frame(payloads.encode_radio(frame_seq, pipe, node_us % 2**32, packet))
+
+
+def imu_payload(number: int) -> payloads.ImuPayload:
+    """Make the counts of a level node that turns slowly."""
+    return payloads.ImuPayload(
+        accel=(20, -15, 4096),
+        gyro=(3, -2, round(300 * math.sin(number / 500))),
+        mag=(200, 30, -380),
+        temperature=-3900,
+        flags=ImuFlags.MAG_NEW if number % 3 == 0 else ImuFlags(0),
+        accel_range=2,
+        gyro_range=2,
+        mag_gain=1,
+    )
+
+
+def fix_payload(itow_ms: int) -> payloads.GpsFixPayload:
+    """Make a fix that stands still."""
+    place = (-77_656_000, 1_103_728_000, 110_000)
+    return payloads.GpsFixPayload(itow_ms, *place, (0, 0, 0), GpsFixType.FIX_3D, True, 12)
+
+
+def quality_payload(itow_ms: int) -> payloads.GpsQualityPayload:
+    """Make what belongs to it."""
+    utc = datetime(2026, 1, 1, tzinfo=UTC)
+    return payloads.GpsQualityPayload(itow_ms, 150, 220, 30, 900, 140, 2500, utc)
+
+
+def frames(rate_hz: int) -> Iterator[bytes]:
+    """Make an endless row of the IMU frames of one aircraft."""
+    return (moment.sample for moment in Nodes().moments(rate_hz, 1))
 
 
 def cpu_seconds(pid: int) -> float:
@@ -84,153 +158,185 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
 
 
-def is_answer(datagram: bytes) -> bool:
-    """Return whether a datagram is what one IMU frame becomes."""
-    if len(datagram) == QUATERNION_SIZE and datagram[0] == 0:
+class Line:
+    """A pseudo-terminal with a program at its other end, and what the program answers by UDP."""
+
+    def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
+        self._is_gateway = name == GATEWAY
+        self._moments = moments
+        self._waiting: dict[int, deque[float | None]] = {}
+        """When what is not answered yet was sent; None for what does not count."""
+        self._latencies_us: list[float] = []
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", 0))
+        self._sock.setblocking(False)
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        places = {"line": os.ttyname(self._slave), "port": self._sock.getsockname()[1]}
+        self.process = subprocess.Popen(
+            [word.format(**places) for word in command],
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+
+    def close(self) -> None:
+        """End the program."""
+        self.process.terminate()
+        self.process.wait(10)
+        self._sock.close()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def await_answer(self, rate_hz: int) -> None:
+        """Feed the line until the program answers, then let it run dry."""
+        deadline = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < deadline and self.process.poll() is None:
+            self._send()
+            if select.select([self._sock], [], [], 1 / rate_hz)[0] and self._receive():
+                while select.select([self._sock], [], [], 0.3)[0]:
+                    self._sock.recv(2048)
+                self._waiting.clear()
+                return
+        raise SystemExit(f"no answer from {self.process.args}")
+
+    def exchange(self, rate_hz: int, seconds: float) -> list[float]:
+        """Send at a rate and match each IMU frame with its answer, in order.
+
+        Returns
+        -------
+        list of float
+            Latencies in µs.
+        """
+        self._latencies_us = []
+        begin = time.perf_counter()
+        count, total = 0, round(seconds * rate_hz)
+        while count < total or (self._unanswered() and time.perf_counter() < begin + seconds + 1):
+            now = time.perf_counter()
+            due = begin + count / rate_hz
+            if now >= due and count < total:
+                self._send()
+                count += 1
+                continue
+            # Sleeping to the end would wake too late at 1000 frames/s: the last part is polled.
+            if select.select([self._sock], [], [], max(0.0, due - now - 2e-4))[0]:
+                self._receive()
+        if missing := self._unanswered():
+            raise SystemExit(f"{missing} frames of {total} were not answered")
+        return self._latencies_us
+
+    def _unanswered(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def _send(self) -> None:
+        moment = next(self._moments)
+        queue = self._waiting.setdefault(moment.system if self._is_gateway else 0, deque())
+        queue.append(time.perf_counter())
+        os.write(self._master, moment.sample)
+        for frame in moment.others:
+            if not self._is_gateway:
+                queue.append(None)
+            os.write(self._master, frame)
+
+    def _receive(self) -> bool:
+        """Take one datagram; tell whether it answers something."""
+        arrival, datagram, system = time.perf_counter(), self._sock.recv(2048), 0
+        if self._is_gateway:
+            message_id = int.from_bytes(datagram[7:10], "little")
+            if message_id != mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+                return False
+            system = datagram[5]
+        if (queue := self._waiting.get(system)) and (sent := queue.popleft()) is not None:
+            self._latencies_us.append((arrival - sent) * 1e6)
         return True
-    message_id = int.from_bytes(datagram[7:10], "little")
-    return datagram[0] == 0xFD and message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 
 
-def exchange(
-    master: int, sock: socket.socket, source: Iterator[bytes], rate_hz: int, seconds: float
-) -> list[float]:
-    """Send frames at a rate and match each with its answer, in order.
-
-    Returns
-    -------
-    list of float
-        Latencies in µs.
-    """
-    latencies: list[float] = []
-    waiting: deque[float] = deque()
-    begin = time.perf_counter()
-    count, total = 0, round(seconds * rate_hz)
-    while count < total or (waiting and time.perf_counter() < begin + seconds + 1.0):
-        now = time.perf_counter()
-        due = begin + count / rate_hz
-        if now >= due and count < total:
-            frame = next(source)
-            waiting.append(time.perf_counter())
-            os.write(master, frame)
-            count += 1
-            continue
-        # Sleeping to the end would wake too late at 1000 frames/s: the last part is polled.
-        ready, _, _ = select.select([sock], [], [], max(0.0, due - now - 2e-4))
-        if ready:
-            arrival = time.perf_counter()
-            if is_answer(sock.recv(2048)) and waiting:
-                latencies.append((arrival - waiting.popleft()) * 1e6)
-    if waiting:
-        raise SystemExit(f"{len(waiting)} of {total} frames were not answered")
-    return latencies
-
-
-def measure(command: list[str], master: int, port: int, rate_hz: int, seconds: float) -> dict:
-    """Run a program on the line and measure it."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(("127.0.0.1", port))
-        sock.setblocking(False)
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-        try:
-            source = frames(rate_hz)
-            await_answer(process, master, sock, source, rate_hz)
-            exchange(master, sock, source, rate_hz, WARM_UP_S)
-            cpu, wall = cpu_seconds(process.pid), time.perf_counter()
-            latencies = exchange(master, sock, source, rate_hz, seconds)
-            share = (cpu_seconds(process.pid) - cpu) / (time.perf_counter() - wall)
-        finally:
-            process.terminate()
-            process.wait(10)
-    p50, p99 = np.percentile(latencies, [50, 99])
+def measure(
+    name: str, command: list[str], rate_hz: int, options: argparse.Namespace
+) -> dict[str, float]:
+    """Run a program on a line of its own and measure it."""
+    line = Line(name, command, Nodes().moments(rate_hz, options.vehicles))
+    try:
+        line.await_answer(rate_hz)
+        line.exchange(rate_hz, WARM_UP_S)
+        cpu, wall = cpu_seconds(line.process.pid), time.perf_counter()
+        latencies_us = line.exchange(rate_hz, options.seconds)
+        share = (cpu_seconds(line.process.pid) - cpu) / (time.perf_counter() - wall)
+    finally:
+        line.close()
+    p50, p99 = np.percentile(latencies_us, [50, 99])
     return {
-        "samples": len(latencies),
         "p50_us": float(p50),
         "p99_us": float(p99),
-        "max_us": max(latencies),
+        "max_us": max(latencies_us),
         "cpu_percent": 100 * share,
     }
 
 
-def await_answer(
-    process: subprocess.Popen,
-    master: int,
-    sock: socket.socket,
-    source: Iterator[bytes],
-    rate_hz: int,
-) -> None:
-    """Feed the line until the program answers, then let it run dry."""
-    deadline = time.monotonic() + START_LIMIT_S
-    while time.monotonic() < deadline and process.poll() is None:
-        os.write(master, next(source))
-        if select.select([sock], [], [], 1 / rate_hz)[0] and is_answer(sock.recv(2048)):
-            while select.select([sock], [], [], 0.3)[0]:
-                sock.recv(2048)
-            return
-    raise SystemExit(f"no answer from {process.args}")
+def programs(folder: Path, forwarders: list[str]) -> dict[str, list[str]]:
+    """Give the command lines, with places for the line and the port, of all that is measured."""
+    (folder / "bench.toml").write_text(CONFIG)
+    gateway = f"-m gateway.cli run --plain --config {folder}/bench.toml --port {{line}}"
+    endpoint = "udp:127.0.0.1:{port}"
+    return {
+        "plain forwarder": [sys.executable, "-c", BASELINE, "{line}", "{port}"],
+        GATEWAY: [sys.executable, *gateway.split(), "--endpoint", endpoint],
+        **{command.split()[0]: shlex.split(command) for command in forwarders},
+    }
+
+
+def summed_up(rounds: list[dict[str, float]]) -> dict[str, float]:
+    """Take the median round of each figure, and the longest pause of all."""
+    return {
+        key: (max if key == "max_us" else statistics.median)([one[key] for one in rounds])
+        for key in rounds[0]
+    }
 
 
 def main() -> None:
     """Run every rate and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=20.0, help="per rate and program")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each single run")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--vehicles", type=int, default=VEHICLES)
+    parser.add_argument(
+        "--forwarder", action="append", default=[], metavar="COMMAND",
+        help="compare another that sends one datagram a frame: a command with {line} and {port}",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     options = parser.parse_args()
-    results = []
+    found: dict[tuple[int, str], list[dict[str, float]]] = {}
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        (folder / "bench.toml").write_text(CONFIG)
-        runs = [(name, rate) for rate in RATES_HZ for name in ("plain forwarder", "mavgate")]
-        for name, rate in track(runs, "measuring"):
-            master, slave = os.openpty()
-            tty.setraw(slave)
-            port = free_port()
-            endpoint = f"udp:127.0.0.1:{port}"
-            line = os.ttyname(slave)
-            gateway = f"-m gateway.cli run --plain --config {folder}/bench.toml --port {line}"
-            command = {
-                "mavgate": [sys.executable, *gateway.split(), "--endpoint", endpoint],
-                "plain forwarder": [sys.executable, "-c", BASELINE, line, str(port)],
-            }[name]
-            figures = measure(command, master, port, rate, options.seconds)
-            results.append({"program": name, "rate_hz": rate, **figures})
-            os.close(master)
-            os.close(slave)
-    show(results)
+        commands = programs(folder, options.forwarder)
+        runs = list(itertools.product(range(options.rounds), RATES_HZ, commands))
+        for _, rate_hz, name in track(runs, "measuring"):
+            figures = measure(name, commands[name], rate_hz, options)
+            found.setdefault((rate_hz, name), []).append(figures)
+    results = {key: summed_up(rounds) for key, rounds in found.items()}
+    show(results, options)
     if options.json:
-        options.json.write_text(json.dumps(results, indent=1) + "\n")
+        rows = [{"rate_hz": rate, "program": name, **r} for (rate, name), r in results.items()]
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 
-def free_port() -> int:
-    """Find a UDP port that nobody uses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
-
-
-def show(results: list[dict]) -> None:
-    """Print the figures as a table."""
-    table = Table(title="serial byte in to datagram out", box=box.SIMPLE_HEAD)
-    for column in ("frames/s", "program", "samples", "p50 µs", "p99 µs", "max µs", "CPU %"):
+def show(results: dict[tuple[int, str], dict[str, float]], options: argparse.Namespace) -> None:
+    """Print the figures as a table, and the longest pauses."""
+    title = f"serial byte in to datagram out, {options.vehicles} aircraft"
+    table = Table(title=title, box=box.SIMPLE_HEAD)
+    for column in ("IMU/s", "program", "p50 µs", "p99 µs", "max µs", "CPU %"):
         table.add_column(column, justify="left" if column == "program" else "right")
-    for row in results:
-        table.add_row(
-            str(row["rate_hz"]),
-            row["program"],
-            str(row["samples"]),
-            *(f"{row[key]:.0f}" for key in ("p50_us", "p99_us", "max_us")),
-            f"{row['cpu_percent']:.1f}",
-        )
+    for (rate_hz, name), row in results.items():
+        latencies = (f"{row[key]:.0f}" for key in ("p50_us", "p99_us", "max_us"))
+        table.add_row(str(rate_hz), name, *latencies, f"{row['cpu_percent']:.1f}")
     console = Console()
     console.print(table)
-    for program in dict.fromkeys(row["program"] for row in results):
-        # Where frames come fastest, a pause of the program meets one just as it begins.
-        worst = max((r for r in results if r["program"] == program), key=itemgetter("rate_hz"))
-        console.print(
-            f"longest pause of the {program}: {worst['max_us'] / 1e3:.1f} ms in "
-            f"{worst['samples'] / worst['rate_hz']:.0f} s at {worst['rate_hz']} frames/s"
-        )
+    # Where frames come fastest, a pause of the program meets one just as it begins.
+    fastest, lasted_s = max(RATES_HZ), options.rounds * options.seconds
+    for (rate_hz, name), row in results.items():
+        if rate_hz == fastest:
+            console.print(
+                f"longest pause of {name}: {row['max_us'] / 1e3:.1f} ms in {lasted_s:.0f} s"
+            )
 
 
 if __name__ == "__main__":
