@@ -1,0 +1,130 @@
+"""Find what stops the gateway's loop: a demo for some minutes, ground stations coming and going.
+
+    python tools/bench_pauses.py --minutes 60
+
+It flies simulated aircraft, records all in files that are soon full, serves metrics, and is visited
+by stations by UDP, TCP and WebSocket that ask for all there is. Printed are the longest turns of
+its loop by the program's own doing, apart from what the machine takes; the baseline, beside it the
+whole time, is a loop that only wakes up.
+"""
+
+import argparse
+import asyncio
+import gc
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+from msgspec.structs import replace
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from gateway.cli.live.demo import calibrated_aircraft
+from gateway.cli.support.warm_up import make_ready
+from gateway.config import GatewaySettings
+from gateway.daemon import Daemon
+from gateway.edges.clock import unix_time_us
+from gateway.simulator.receiver import simulate
+from tools.turns import TurnWatch, idle_turns
+
+GOAL_MS = 2.0
+ROTATE_MB = 1.0
+"""The smallest there is: some files a minute."""
+
+
+def free_ports(count: int) -> list[int]:
+    """Find ports that nobody uses, by TCP nor by UDP."""
+    socks = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [sock.getsockname()[1] for sock in socks]
+    for sock in socks:
+        sock.close()
+    return ports
+
+
+def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySettings:
+    """Have everything on that may hold the loop up."""
+    settings = GatewaySettings()
+    udp, tcp, web, metrics = ports
+    endpoints = (f"udp-listen:127.0.0.1:{udp}", f"tcp-listen:127.0.0.1:{tcp}")
+    hub = replace(
+        settings.hub,
+        endpoints=(*endpoints, f"ws-listen:127.0.0.1:{web}", "udp:localhost:9"),
+        metrics_port=metrics,
+        idle_timeout_s=5.0,
+    )
+    recording = replace(
+        settings.recording, mode="always", folder=str(folder / "recordings"), rotate_mb=ROTATE_MB
+    )
+    return replace(
+        settings,
+        hub=hub,
+        recording=recording,
+        aircraft_folder=str(folder),
+        simulator=replace(settings.simulator, vehicles=vehicles),
+    )
+
+
+async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> None:
+    """Run the daemon as `mavgate demo` does."""
+    line = simulate(settings.simulator, unix_time_us()).frames()
+    daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
+    gc.collect()
+    gc.freeze()
+    watch.install()
+    daemon.start()
+    watch.restart()
+    try:
+        await asyncio.sleep(seconds)
+        watch.stop()
+    finally:
+        daemon.close()
+
+
+def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
+    """Fly, with stations beside it."""
+    ports = free_ports(4)
+    settings = settings_in(folder, options.vehicles, ports)
+    make_ready(settings.estimation.estimator)
+    watch = TurnWatch()
+    visitors = subprocess.Popen(
+        [sys.executable, Path(__file__).with_name("visitors.py"), *map(str, ports)],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
+            runner.run(fly(settings, watch, 60.0 * options.minutes))
+        if visitors.poll() is not None:
+            raise SystemExit("the stations have died")
+    finally:
+        visitors.terminate()
+        visitors.wait()
+    return watch
+
+
+def main() -> None:
+    """Run, and print what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--vehicles", type=int, default=2)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(1) as pool:
+        # Its own control socket: a gateway that runs on this machine keeps its.
+        os.environ["XDG_RUNTIME_DIR"] = name
+        baseline = pool.submit(idle_turns, 60.0 * options.minutes)
+        begin_s = time.monotonic()
+        watch = run(options, Path(name))
+        longest_us = max(turn.own_us for turn in watch.worst)
+        print(f"{(time.monotonic() - begin_s) / 60:.1f} min, {options.vehicles} aircraft")
+        print(f"longest pause by the program: {longest_us / 1e3:.2f} ms (goal {GOAL_MS:.0f} ms)")
+        print(watch.report())
+        own_us, wall_us = baseline.result()
+        print(f"baseline, a loop that only wakes up: {own_us / 1e3:.2f} of {wall_us / 1e3:.2f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""How long the turns of an event loop take, and how much of that is the program's own doing.
+
+A turn is what a loop does between two waits: for so long nothing that comes is looked at. Of the
+program's own doing is what the thread computes and what it waits for, be it a disk, a lock or
+another thread. The rest, in which the thread was ready and the machine let others run, is told by
+the kernel. `idle_turns` is a program that does next to nothing, for comparison.
+"""
+
+import asyncio
+import contextlib
+import gc
+import heapq
+import os
+import selectors
+import time
+from typing import Any, NamedTuple
+
+WORST = 5
+"""Turns that are kept."""
+IDLE_TURN_S = 0.005
+
+
+class Turn(NamedTuple):
+    """One turn of the loop."""
+
+    own_us: float
+    wall_us: float
+    at_s: float
+    """Since the watch began."""
+    longest: str
+    """The callback that took longest."""
+
+
+class TurnWatch(selectors.EpollSelector):
+    """The selector of an event loop, which sees the beginning and the end of every turn."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.worst: list[Turn] = []
+        """The longest by the program's own doing; a heap."""
+        self.longest_wall_us = 0.0
+        self.longest_collection_us = [0.0, 0.0, 0.0]
+        """Of the garbage collector, by generation."""
+        self._run = asyncio.Handle._run  # noqa: SLF001
+        self._schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+        self._waited_ns = 0
+        self._longest: tuple[int, object] = (0, None)
+        self._collecting_ns = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin, and forget what was seen."""
+        self._is_on = True
+        self.worst.clear()
+        self.longest_wall_us = 0.0
+        self.longest_collection_us[:] = 0.0, 0.0, 0.0
+        self._began_ns = time.perf_counter_ns()
+        self._begin_ns: int | None = None
+
+    def stop(self) -> None:
+        """See no more."""
+        self._is_on = False
+
+    def install(self) -> None:
+        """See single callbacks and collections too."""
+        watch = self
+
+        def run(handle: asyncio.Handle) -> None:
+            begin_ns = time.perf_counter_ns()
+            watch._run(handle)
+            took_ns = time.perf_counter_ns() - begin_ns
+            if took_ns > watch._longest[0]:
+                watch._longest = took_ns, getattr(handle, "_callback", None)
+
+        asyncio.Handle._run = run  # type: ignore[method-assign]  # noqa: SLF001
+        gc.callbacks.append(self._on_collection)
+
+    def select(self, timeout: float | None = None) -> list[Any]:
+        """Wait; what lies between two calls is a turn."""
+        if self._begin_ns is not None and self._is_on:
+            self._end_turn(self._begin_ns)
+        found = super().select(timeout)
+        self._longest = (0, None)
+        self._waited_ns = self._ready_ns()
+        self._begin_ns = time.perf_counter_ns()
+        return found
+
+    def _end_turn(self, begin_ns: int) -> None:
+        now_ns = time.perf_counter_ns()
+        wall_us = (now_ns - begin_ns) / 1e3
+        own_us = wall_us - (self._ready_ns() - self._waited_ns) / 1e3
+        self.longest_wall_us = max(self.longest_wall_us, wall_us)
+        if len(self.worst) < WORST or own_us > self.worst[0].own_us:
+            turn = Turn(own_us, wall_us, (now_ns - self._began_ns) / 1e9, _name(self._longest[1]))
+            (heapq.heappush if len(self.worst) < WORST else heapq.heapreplace)(self.worst, turn)
+
+    def _ready_ns(self) -> int:
+        """Return how long the thread has waited for a processor."""
+        return int(os.pread(self._schedule, 64, 0).split()[1])
+
+    def _on_collection(self, phase: str, info: dict[str, int]) -> None:
+        now_ns = time.thread_time_ns()
+        if phase == "start":
+            self._collecting_ns = now_ns
+            return
+        longest, generation = self.longest_collection_us, info["generation"]
+        longest[generation] = max(longest[generation], (now_ns - self._collecting_ns) / 1e3)
+
+    def report(self) -> str:
+        """Say in some lines what was seen."""
+        lines = [
+            f"  longest turn, the machine's doing included: {self.longest_wall_us / 1e3:.2f} ms"
+        ]
+        lines += [
+            f"  own {turn.own_us / 1e3:6.2f} ms of {turn.wall_us / 1e3:6.2f} ms at "
+            f"{turn.at_s:7.1f} s, mostly {turn.longest}"
+            for turn in sorted(self.worst, reverse=True)
+        ]
+        collected = ", ".join(f"{us / 1e3:.2f}" for us in self.longest_collection_us)
+        return "\n".join([*lines, f"  longest collections by generation: {collected} ms"])
+
+
+def _name(callback: object) -> str:
+    owner = getattr(callback, "__self__", None)
+    if isinstance(owner, asyncio.Task):
+        return getattr(owner.get_coro(), "__qualname__", repr(owner))
+    return getattr(callback, "__qualname__", type(callback).__name__)
+
+
+async def _idle() -> None:
+    while True:
+        await asyncio.sleep(IDLE_TURN_S)
+
+
+def idle_turns(seconds: float) -> tuple[float, float]:
+    """Return the longest turns of a loop that only wakes up, in µs: by its own doing, and all."""
+    watch = TurnWatch()
+    with (
+        contextlib.suppress(TimeoutError),
+        asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner,
+    ):
+        runner.run(asyncio.wait_for(_idle(), seconds))
+    return max(turn.own_us for turn in watch.worst), watch.longest_wall_us

@@ -1,0 +1,118 @@
+"""Ground stations that come and go: by UDP, TCP and WebSocket, each asking for all there is.
+
+    python tools/visitors.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
+
+For `soak.py`: they ask a gateway for parameters, missions, messages, rates and files, stay for
+some seconds and leave, until the process is ended. Its metrics are scraped meanwhile.
+"""
+
+import asyncio
+import contextlib
+import random
+import struct
+import sys
+import urllib.request
+
+from bench_hub import HANDSHAKE
+from fault_traffic import heartbeat, packed, request_message
+from pymavlink.dialects.v20 import common as mavlink
+
+AT_ONCE = 6
+"""Stations that are there at a time."""
+LONGEST_STAY_S = 8.0
+SCRAPE_S = 5.0
+OPEN_FILE_RO, BURST_READ_FILE = 4, 15
+METADATA = b"/general.json"
+
+
+def ftp(opcode: int, data: bytes) -> bytes:
+    """Encode a request for a file of the vehicle."""
+    head = struct.pack("<HBBBBBBI", 1, 0, opcode, len(data), 0, 0, 0, 0)
+    payload = (head + data).ljust(251, b"\0")
+    return packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, list(payload)))
+
+
+def questions() -> list[bytes]:
+    """Encode what a ground station asks at its start."""
+    rate = (mavlink.MAVLINK_MSG_ID_ATTITUDE, 20_000, 0, 0, 0, 0, 0)
+    return [
+        heartbeat(200),
+        packed(mavlink.MAVLink_param_request_list_message(1, 1)),
+        packed(mavlink.MAVLink_mission_request_list_message(1, 1, 0)),
+        request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, to_all=False),
+        packed(mavlink.MAVLink_command_long_message(1, 1, 511, 0, *rate)),
+        ftp(OPEN_FILE_RO, METADATA),
+        ftp(BURST_READ_FILE, b""),
+    ]
+
+
+class Datagrams(asyncio.DatagramProtocol):
+    """A client that listens to nothing."""
+
+
+async def visit_udp(port: int, stay_s: float) -> None:
+    """Come by UDP."""
+    loop = asyncio.get_running_loop()
+    transport, _ = await loop.create_datagram_endpoint(Datagrams, remote_addr=("127.0.0.1", port))
+    for question in questions():
+        transport.sendto(question)
+    for _ in range(round(stay_s)):
+        await asyncio.sleep(1.0)
+        transport.sendto(heartbeat(200))
+    transport.close()
+
+
+async def visit_stream(port: int, stay_s: float, *, web: bool) -> None:
+    """Come by TCP, or by WebSocket."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    if web:
+        writer.write(HANDSHAKE)
+        await reader.readuntil(b"\r\n\r\n")
+    for question in questions():
+        writer.write(_masked(question) if web else question)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(stay_s):
+            while await reader.read(65536):
+                pass
+    writer.close()
+
+
+def _masked(data: bytes) -> bytes:
+    """Put a frame into a WebSocket message of a client, under a mask that changes nothing."""
+    size = bytes([0x80 | len(data)]) if len(data) < 126 else b"\xfe" + len(data).to_bytes(2)
+    return b"\x82" + size + bytes(4) + data
+
+
+async def come_and_go(udp: int, tcp: int, web: int) -> None:
+    """Be one station after the other."""
+    while True:
+        stay_s = random.uniform(0.5, LONGEST_STAY_S)
+        try:
+            match random.randrange(3):
+                case 0:
+                    await visit_udp(udp, stay_s)
+                case 1:
+                    await visit_stream(tcp, stay_s, web=False)
+                case _:
+                    await visit_stream(web, stay_s, web=True)
+        except OSError:
+            await asyncio.sleep(0.5)
+
+
+async def scrape(port: int) -> None:
+    """Read the gateway's metrics now and then."""
+    url = f"http://127.0.0.1:{port}/metrics"
+    while True:
+        await asyncio.sleep(SCRAPE_S)
+        await asyncio.to_thread(lambda: urllib.request.urlopen(url, timeout=5).read())
+
+
+async def main() -> None:
+    """Let all come and go."""
+    udp, tcp, web, metrics = map(int, sys.argv[1:])
+    stations = [come_and_go(udp, tcp, web) for _ in range(AT_ONCE)]
+    await asyncio.gather(scrape(metrics), *stations)
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
