@@ -4,18 +4,23 @@ Pure: time is an argument, and effects are returned as a list of actions.
 """
 
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from typing import Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from gateway import __version__
+from gateway.estimation.columns import NAV_COLUMNS, imu_rows, nav_row, nav_state
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import (
     BaroRaw,
+    BaroSample,
     ClientInterval,
     FusedSample,
     FusionState,
@@ -30,6 +35,7 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.imu_log import ImuLog
 from gateway.sensing.recalibration import (
     remove_accel_error,
     remove_gyro_error,
@@ -168,43 +174,42 @@ class Aircraft:
             case NodeStatus():
                 return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
 
-    def fuse(self, records: Sequence[ImuRaw | ImuCalibrated]) -> list[FusedSample]:
-        """Run IMU samples through sensing and estimation only, without the vehicle.
+    @property
+    def chain(self) -> SensorChain:
+        """The sensing stage."""
+        return self._chain
+
+    def fuse(
+        self, log: ImuLog, heard: Sequence[tuple[int, BaroRaw | GpsFix]]
+    ) -> NDArray[np.float64]:
+        """Let a recording's samples run through estimation alone: the vehicle hears nothing.
 
         Parameters
         ----------
-        records : sequence of ImuRaw or ImuCalibrated
-            Without a barometer sample or fix in between.
+        log : ImuLog
+            From the sensing stage.
+        heard : sequence of tuple
+            Heights and fixes in their order, each with the number of the sample before which it
+            came.
 
         Returns
         -------
-        list of FusedSample
-            As `take` returns for each.
+        ndarray, shape (n, NAV_COLUMNS)
+            The states that `take` records; see `gateway.estimation.columns`.
         """
-        samples = [
-            self._chain.imu(record) if isinstance(record, ImuRaw) else self._filter(record)
-            for record in records
+        told = [
+            (k, self._chain.baro(record) if isinstance(record, BaroRaw) else record)
+            for k, record in heard
         ]
         if isinstance(self._estimator, KernelEstimator):
-            states = self._estimator.update_imus(samples)
+            imu = imu_rows(log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.flags)
+            states = self._estimator.run_as_heard(log.time_us, imu, told)
         else:
-            states = [self._estimator.update_imu(sample) for sample in samples]
-        return [
-            FusedSample(
-                self.vehicle_id,
-                record if isinstance(record, ImuRaw) else None,
-                sample,
-                state if self._correct is None else self._correct(state),
-            )
-            for record, sample, state in zip(records, samples, states, strict=True)
-        ]
-
-    def hear(self, record: BaroRaw | GpsFix) -> None:
-        """Pass a barometer sample or fix to the estimation only."""
-        if isinstance(record, BaroRaw):
-            self._estimator.update_baro(self._chain.baro(record))
-        else:
-            self._estimator.update_gps(record)
+            states = fuse_singly(self._estimator, log.samples(), told)
+        if self._correct is not None:
+            known = map(nav_state, log.time_us.tolist(), states)
+            states = np.array([nav_row(self._correct(state)) for state in known])
+        return states.reshape(-1, NAV_COLUMNS)
 
     def _filter(self, imu: ImuCalibrated) -> ImuSample:
         return self._chain.imu_si(
@@ -333,6 +338,38 @@ def make_fusion(
         chain.restore(state.sensing)
         estimator.restore(state.estimation)
     return chain, estimator
+
+
+def fuse_singly(
+    estimator: Estimator,
+    samples: Sequence[ImuSample],
+    heard: Iterable[tuple[int, BaroSample | GpsFix]],
+) -> NDArray[np.float64]:
+    """Run any estimator over samples and what came between them, one by one.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    samples : sequence of ImuSample
+    heard : iterable of tuple
+        See `Aircraft.fuse`.
+
+    Returns
+    -------
+    ndarray, shape (n, NAV_COLUMNS)
+    """
+    waiting = deque(heard)
+    rows = []
+    for number, sample in enumerate([*samples, None]):
+        while waiting and waiting[0][0] <= number:
+            record = waiting.popleft()[1]
+            if isinstance(record, BaroSample):
+                estimator.update_baro(record)
+            else:
+                estimator.update_gps(record)
+        if sample is not None:
+            rows.append(nav_row(estimator.update_imu(sample)))
+    return np.array(rows, np.float64).reshape(-1, NAV_COLUMNS)
 
 
 def _fits(settings: AircraftSettings) -> str:

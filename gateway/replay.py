@@ -4,10 +4,20 @@ from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import msgspec
+import numpy as np
 
 from gateway import __version__
 from gateway.aircraft import Action, AircraftSettings
-from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.cells import FLAGS, FloatArray, has_group
+from gateway.flightlog.table.row import (
+    BARO,
+    GPS,
+    RAW,
+    SI,
+    TableRow,
+    baro_of_cells,
+    fix_of_cells,
+)
 from gateway.flightlog.table.table import REMARK, TableHeader, TableMark
 from gateway.pipeline import Pipeline
 from gateway.records import (
@@ -20,6 +30,8 @@ from gateway.records import (
     NavState,
     NodeStatus,
 )
+from gateway.sensing.chain import SensorChain
+from gateway.sensing.imu_log import ImuLog, IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.telemetry.events import INFO, StatusText
 
@@ -110,6 +122,57 @@ def records_of(row: TableRow) -> list[BaroRaw | GpsFix | ImuRaw | ImuCalibrated]
     """List a row's records in the order in which they were processed; counts before SI values."""
     records = (row.baro, row.gps, row.raw or row.imu)
     return [record for record in records if record is not None]
+
+
+def imu_log_of(cells: FloatArray, chain: SensorChain) -> ImuLog:
+    """Let the IMU samples of a table's rows run through the sensing stage; counts before SI values.
+
+    Parameters
+    ----------
+    cells : ndarray, shape (n, len(COLUMNS))
+        Rows that each have a sample; see `gateway.flightlog.table.cells`.
+    chain : SensorChain
+        Of their aircraft.
+    """
+    time_us = cells[:, 0].astype(np.int64)
+    return chain.imu_si_log(time_us, *calibrated_of(cells, chain))
+
+
+def calibrated_of(
+    cells: FloatArray, chain: SensorChain
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Calibrate the IMU samples of a table's rows; see `imu_log_of`.
+
+    Returns
+    -------
+    accel, gyro, mag : ndarray, shape (n, 3)
+    temperature_degc : ndarray, shape (n,)
+    flags : ndarray of int, shape (n,)
+    """
+    flags = cells[:, FLAGS].astype(np.int64)
+    si = cells[:, SI].copy()
+    has_counts = has_group(cells, RAW)
+    if has_counts.any():
+        accel, gyro, mag, temperature_degc = chain.calibrated(
+            cells[has_counts, RAW], flags[has_counts]
+        )
+        si[has_counts] = np.column_stack([accel, gyro, mag, temperature_degc])
+    return si[:, 0:3], si[:, 3:6], si[:, 6:9], si[:, 9], flags
+
+
+def heard_of(cells: FloatArray, vehicle_id: int) -> list[tuple[int, BaroRaw | GpsFix]]:
+    """List the heights and fixes of a table's rows, each with how many IMU samples came before."""
+    has_sample = has_group(cells, RAW) | has_group(cells, SI)
+    before: IntArray = np.cumsum(has_sample) - has_sample
+    found: list[tuple[int, int, BaroRaw | GpsFix]] = []
+    for order, group, make in ((0, BARO, baro_of_cells), (1, GPS, fix_of_cells)):
+        rows = np.flatnonzero(has_group(cells, group))
+        for row, values in zip(rows.tolist(), cells[rows, group].tolist(), strict=True):
+            record = make(values, vehicle_id)
+            if record is not None:
+                found.append((row, order, record))
+    found.sort(key=lambda heard: heard[:2])
+    return [(int(before[row]), record) for row, _, record in found]
 
 
 def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:

@@ -309,18 +309,17 @@ def flight_of_samples(
         baro_time_us=np.array([b.time_us for b in baros], np.int64),
         baro_alt_m=np.array([b.alt_pressure_m for b in baros], np.float64),
         fixes=tuple(fixes),
-        scored=_settled(samples, fixes, fusion.estimation.reference),
+        scored=settled(
+            np.array([s.time_us for s in samples], np.int64), fixes, fusion.estimation.reference
+        ),
     )
 
 
-def _settled(
-    samples: list[ImuSample], fixes: list[GpsFix], reference: ReferenceSettings
-) -> BoolArray:
+def settled(time_us: IntArray, fixes: Iterable[GpsFix], reference: ReferenceSettings) -> BoolArray:
     """Score from the time on at which any estimator can have settled."""
     first_us = next((fix.time_us for fix in fixes if is_usable(fix, reference)), None)
-    start_us = samples[0].time_us if first_us is None else first_us
-    times_us = np.array([s.time_us for s in samples])
-    return np.asarray(times_us >= start_us + SETTLING_US)
+    start_us = int(time_us[0]) if first_us is None else first_us
+    return np.asarray(time_us >= start_us + SETTLING_US)
 
 
 def track_of_states(states: list[NavState]) -> FlightTrack:

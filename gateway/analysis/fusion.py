@@ -15,13 +15,7 @@ from gateway.analysis.flight_arrays import (
     track_of_states,
 )
 from gateway.estimation.columns import (
-    ACCEL,
-    CLIP_FLAGS,
-    CLIPPED,
     GPS_COLUMNS,
-    GYRO,
-    IMU_COLUMNS,
-    MAG,
     NAV_ALT,
     NAV_COLUMNS,
     NAV_FLAGS,
@@ -29,6 +23,7 @@ from gateway.estimation.columns import (
     NAV_QUAT,
     NAV_VEL,
     GpsRow,
+    imu_rows,
     nav_row,
 )
 from gateway.estimation.interface import Estimator
@@ -36,16 +31,17 @@ from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.paper.paper import PaperEstimator
 from gateway.estimation.select import make_estimator
 from gateway.estimation.smoothing.smoother import smooth
-from gateway.records import NAN, BaroSample, GpsFix, ImuFlags, ImuSample, NavState
+from gateway.records import NAN, BaroSample, GpsFix, NavState
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.imu_log import ImuLog
 
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
     """A flight's samples behind the gateway's filters."""
 
-    samples: tuple[ImuSample, ...]
+    log: ImuLog
     table: FloatArray
     """The same, shape (N, 9), as `gateway.estimation.paper.paper_kernels` takes it: specific force
     and rate behind their filters, NaN where the unfiltered sample is not sound; magnetic field."""
@@ -53,31 +49,19 @@ class Sensed:
 
 def sense(flight: Flight, settings: SensingSettings) -> Sensed:
     """Filter a flight's samples as the gateway does live."""
-    chain = SensorChain(settings, NodeCalibration())
-    has_mag: list[bool] = np.asarray(np.isfinite(flight.mag_b_ut).all(axis=1)).tolist()
-    columns = zip(
-        flight.time_us.tolist(),
-        map(tuple, flight.accel_b_mps2.tolist()),
-        map(tuple, flight.gyro_b_radps.tolist()),
-        map(tuple, flight.mag_b_ut.tolist()),
-        has_mag,
-        flight.flags.tolist(),
-        strict=True,
+    unknown = np.full(len(flight.time_us), np.nan)
+    log = SensorChain(settings, NodeCalibration()).imu_si_log(
+        flight.time_us,
+        flight.accel_b_mps2,
+        flight.gyro_b_radps,
+        flight.mag_b_ut,
+        unknown,
+        flight.flags,
     )
-    samples = tuple(
-        chain.imu_si(time_us, accel, gyro, mag if new else None, NAN, ImuFlags(flags))
-        for time_us, accel, gyro, mag, new, flags in columns
-    )
-    table = np.column_stack(
-        [
-            np.array([s.accel_lowpass_b_mps2 for s in samples]),
-            np.array([s.gyro_highpass_b_radps for s in samples]),
-            flight.mag_b_ut,
-        ]
-    )
+    table = np.column_stack([log.accel_lowpass_b_mps2, log.gyro_highpass_b_radps, log.mag_b_ut])
     unsound = ~(np.isfinite(flight.accel_b_mps2) & np.isfinite(flight.gyro_b_radps)).all(axis=1)
     table[unsound, :6] = np.nan
-    return Sensed(samples, table)
+    return Sensed(log, table)
 
 
 def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> FlightTrack:
@@ -149,11 +133,8 @@ def fuse_smoothed(flight: Flight, settings: FusionSettings) -> FlightTrack:
 
 def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog:
     """Lay a flight out for the compiled estimators."""
-    imu = np.zeros((len(flight.time_us), IMU_COLUMNS))
-    imu[:, ACCEL : ACCEL + 3] = flight.accel_b_mps2
-    imu[:, GYRO : GYRO + 3] = flight.gyro_b_radps
-    imu[:, MAG : MAG + 3] = flight.mag_b_ut
-    imu[:, CLIPPED] = (flight.flags & int(CLIP_FLAGS)) != 0
+    vectors = (flight.accel_b_mps2, flight.gyro_b_radps, flight.mag_b_ut)
+    imu = imu_rows(*vectors, flight.flags)
     rows = np.array([fix_row(fix) for fix in flight.fixes], np.float64)
     return SampleLog(
         imu_time_us=flight.time_us,
@@ -200,7 +181,7 @@ def _states_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> l
     waiting = iter(others)
     record = next(waiting, None)
     states = []
-    for sample in sensed.samples:
+    for sample in sensed.log.samples():
         while record is not None and record.time_us <= sample.time_us:
             if isinstance(record, GpsFix):
                 estimator.update_gps(record)

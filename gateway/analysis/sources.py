@@ -1,7 +1,7 @@
 """Where flights come from: the simulator and recordings."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import msgspec
@@ -15,14 +15,17 @@ from gateway.analysis.flight_arrays import (
     IntArray,
     Reference,
     flight_of_records,
-    track_of_states,
+    settled,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.table.row import TableRow
-from gateway.records import ImuCalibrated, NavState, RawRecord
-from gateway.replay import records_of
-from gateway.sensing.calibration import NodeCalibration
+from gateway.flightlog.table.cells import NODE_TIME, has_group
+from gateway.flightlog.table.row import BARO, GPS, NAV, RAW, SI, fix_of_cells
+from gateway.flightlog.table.table import TableBlock
+from gateway.records import GpsFix, RawRecord
+from gateway.replay import calibrated_of
+from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
+from gateway.sensing.chain import SensingSettings, SensorChain, pressure_altitude_m
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.sensors import SensorErrors
@@ -38,6 +41,7 @@ SIMULATED_STORY: Final = (
 )
 TRUTH_STORY: Final = "the simulation's exact truth"
 NEAR_US: Final = 50_000
+NO_COUNTS: Final = -1
 
 
 def simulated_flight(
@@ -108,8 +112,8 @@ def with_latency(fusion: FusionSettings, latency_s: float) -> FusionSettings:
     return msgspec.structs.replace(fusion, estimation=estimation)
 
 
-def flight_of_rows(
-    rows: Iterable[TableRow],
+def flight_of_blocks(
+    blocks: Iterable[TableBlock],
     calibration: NodeCalibration,
     fusion: FusionSettings,
     *,
@@ -120,7 +124,7 @@ def flight_of_rows(
 
     Parameters
     ----------
-    rows : iterable of TableRow
+    blocks : iterable of TableBlock
         In the order of time.
     calibration : NodeCalibration
         Of the IMU node, for rows that hold counts.
@@ -139,27 +143,105 @@ def flight_of_rows(
     ValueError
         If there are fewer than two IMU samples.
     """
-    states: list[NavState] = []
-
-    def records() -> Iterator[RawRecord | ImuCalibrated]:
-        for row in rows:
-            if row.state is not None:
-                states.append(row.state)
-            yield from records_of(row)
-
-    flight = flight_of_records(records(), calibration, name=name, story=story, fusion=fusion)
-    if not states:
+    pieces = [_arrays_of(block.cells, calibration) for block in blocks if len(block)]
+    if sum(len(piece.time_us) for piece in pieces) < 2:
+        raise ValueError(f"{name}: {sum(len(p.time_us) for p in pieces)} IMU samples are no flight")
+    columns = {
+        column: np.concatenate([getattr(piece, column) for piece in pieces])
+        for column in _Arrays.__slots__
+        if column != "fixes"
+    }
+    fixes = [fix for piece in pieces for fix in piece.fixes]
+    time_us = columns["time_us"]
+    node_time_us, bare_mag = columns["node_time_us"], columns["mag_uncalibrated_b_ut"]
+    has_counts = bool((node_time_us != NO_COUNTS).all())
+    flight = Flight(
+        name=name,
+        story=story,
+        fusion=fusion,
+        time_us=time_us,
+        accel_b_mps2=columns["accel_b_mps2"],
+        gyro_b_radps=columns["gyro_b_radps"],
+        mag_b_ut=columns["mag_b_ut"],
+        flags=columns["flags"],
+        baro_time_us=columns["baro_time_us"],
+        baro_alt_m=columns["baro_alt_m"],
+        fixes=tuple(fixes),
+        scored=settled(time_us, fixes, fusion.estimation.reference),
+        node_time_us=node_time_us if has_counts else None,
+        mag_uncalibrated_b_ut=bare_mag if has_counts else None,
+    )
+    states = columns["states"]
+    if not len(states):
         return flight
-    return replace(flight, recorded=at_times(track_of_states(states), flight.time_us))
+    return replace(flight, recorded=at_times(_track_of_cells(states), time_us))
 
 
-def judged_by(flight: Flight, rows: Iterable[TableRow], name: str) -> Flight:
+@dataclass(frozen=True, slots=True)
+class _Arrays:
+    """What a flight takes of a block."""
+
+    time_us: IntArray
+    accel_b_mps2: FloatArray
+    gyro_b_radps: FloatArray
+    mag_b_ut: FloatArray
+    flags: IntArray
+    node_time_us: IntArray
+    """`NO_COUNTS` for a sample without counts."""
+    mag_uncalibrated_b_ut: FloatArray
+    baro_time_us: IntArray
+    baro_alt_m: FloatArray
+    fixes: list[GpsFix]
+    states: FloatArray
+    """Cells of `NAV_COLUMNS`."""
+
+
+def _arrays_of(cells: FloatArray, calibration: NodeCalibration) -> _Arrays:
+    has_counts = has_group(cells, RAW)
+    samples = cells[has_counts | has_group(cells, SI)]
+    chain = SensorChain(SensingSettings(), calibration)
+    accel, gyro, mag, _, flags = calibrated_of(samples, chain)
+    turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
+    counts = samples[:, RAW]
+    bare_mag = turned.apply_all(new_field_ut(np.nan_to_num(counts), flags))
+    baros = cells[has_group(cells, BARO)][:, BARO]
+    fixes = [fix_of_cells(row, 1) for row in cells[has_group(cells, GPS)][:, GPS].tolist()]
+    node_time_us = np.where(np.isnan(counts[:, 0]), NO_COUNTS, samples[:, NODE_TIME])
+    return _Arrays(
+        time_us=samples[:, 0].astype(np.int64),
+        accel_b_mps2=accel,
+        gyro_b_radps=gyro,
+        mag_b_ut=mag,
+        flags=flags,
+        node_time_us=node_time_us.astype(np.int64),
+        mag_uncalibrated_b_ut=bare_mag,
+        baro_time_us=baros[:, 0].astype(np.int64),
+        baro_alt_m=np.array([*map(pressure_altitude_m, baros[:, 3].tolist())], np.float64),
+        fixes=[fix for fix in fixes if fix is not None],
+        states=cells[has_group(cells, NAV)][:, NAV],
+    )
+
+
+def _track_of_cells(states: FloatArray) -> FlightTrack:
+    """Take a track out of cells of `NAV_COLUMNS`, only what the states vouch for."""
+    track = FlightTrack(
+        time_us=states[:, 0].astype(np.int64),
+        q_nb=states[:, 1:5],
+        lat_deg=states[:, 8],
+        lon_deg=states[:, 9],
+        alt_amsl_m=states[:, 10],
+        vel_n_mps=states[:, 11:14],
+    )
+    return track.where_valid(states[:, 23].astype(np.int64))
+
+
+def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
     """Take the states of a recording as a flight's reference.
 
     Parameters
     ----------
     flight : Flight
-    rows : iterable of TableRow
+    blocks : iterable of TableBlock
         On the clock of the flight, in the order of time.
     name : str
         What the reference is called.
@@ -173,10 +255,10 @@ def judged_by(flight: Flight, rows: Iterable[TableRow], name: str) -> Flight:
     ValueError
         If the recording holds no state.
     """
-    states = [row.state for row in rows if row.state is not None]
-    if not states:
+    states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
+    if not sum(map(len, states)):
         raise ValueError(f"{name}: holds no states to judge by")
-    track = at_times(track_of_states(states), flight.time_us)
+    track = at_times(_track_of_cells(np.concatenate(states)), flight.time_us)
     return replace(
         flight, reference=Reference(track, is_exact=False, story=f"the states in {name}")
     )

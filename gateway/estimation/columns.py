@@ -7,8 +7,10 @@ import math
 from functools import cache
 from typing import Final
 
+import numpy as np
+
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray
+from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.records import (
     NAN,
@@ -73,6 +75,27 @@ def imu_row(sample: ImuSample) -> ImuRow:
     clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
     mag = sample.mag_b_ut or UNKNOWN_VEC3
     return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped)
+
+
+def imu_rows(
+    accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, mag_b_ut: FloatArray, flags: IntArray
+) -> FloatArray:
+    """Lay out many IMU samples.
+
+    Parameters
+    ----------
+    accel_b_mps2, gyro_b_radps, mag_b_ut : ndarray, shape (n, 3)
+        Unfiltered; the field NaN unless new.
+    flags : ndarray of int, shape (n,)
+        `ImuFlags`.
+
+    Returns
+    -------
+    ndarray, shape (n, IMU_COLUMNS)
+        What `imu_row` gives for each.
+    """
+    clipped = (flags & int(CLIP_FLAGS)) != 0
+    return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, clipped.astype(np.float64)])
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Generic, TypeVar
 
 import msgspec
@@ -29,6 +30,9 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
+
+Heard = tuple[int, BaroSample | GpsFix]
+"""A height or a fix, and the number of the IMU sample before which it arrived."""
 
 State = TypeVar("State")
 Gains = TypeVar("Gains")
@@ -63,7 +67,8 @@ class Kernels(Generic[State, Gains]):
     gps: EntryPoint[[int, int, int, int]]
     """`(state, gains, arrival_us, gps_row)`."""
     run: EntryPoint[...]
-    """`(state, gains, count and arrays of each kind in a SampleLog, two counters, output_rows)`."""
+    """`(state, gains, count, imu_time_us, imu, count, baro_before, baro_alt_m, count, gps_before,
+    gps_time_us, gps, output_rows)`; before which sample each height and each fix is taken."""
     earlier: Callable[..., None]
     """`(state, gains, time_us, taken, *arrays of the barometer and the GPS)`, of compiled code."""
 
@@ -163,17 +168,6 @@ class KernelEstimator(Generic[State, Gains]):
         )
         return nav_state(sample.time_us, self._output)
 
-    def update_imus(self, samples: Sequence[ImuSample]) -> list[NavState]:
-        """Advance by IMU samples between which nothing else came, as `update_imu` by each."""
-        if len(samples) == 1:
-            return [self.update_imu(samples[0])]
-        count = len(samples)
-        rows = np.array([imu_row(sample) for sample in samples]).reshape(-1, IMU_COLUMNS)
-        time_us = np.array([sample.time_us for sample in samples], np.int64)
-        out = np.empty((count, NAV_COLUMNS))
-        self._kernels.imus(self._at, self._gains_at, count, *map(address_of, (time_us, rows, out)))
-        return [nav_state(s.time_us, row) for s, row in zip(samples, out, strict=True)]
-
     def update_baro(self, sample: BaroSample) -> None:
         """Take in one barometer sample.
 
@@ -212,18 +206,84 @@ class KernelEstimator(Generic[State, Gains]):
         ndarray, shape (n, NAV_COLUMNS)
             One row per IMU sample.
         """
+        return self._run(
+            log,
+            _taken_before(log.imu_time_us, log.baro_time_us),
+            _taken_before(log.imu_time_us, log.gps_time_us),
+        )
+
+    def _run(self, log: SampleLog, baro_before: IntArray, gps_before: IntArray) -> FloatArray:
+        """Run the compiled loop; see `Kernels.run`."""
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
-        times = (log.imu_time_us, log.baro_time_us, log.gps_time_us)
-        rows = (log.imu, log.baro_alt_m, log.gps)
-        kinds = [
-            (np.ascontiguousarray(time_us, np.int64), np.ascontiguousarray(row, np.float64))
-            for time_us, row in zip(times, rows, strict=True)
-        ]
-        arguments = [
-            argument
-            for time_us, row in kinds
-            for argument in (len(time_us), address_of(time_us), address_of(row))
-        ]
-        taken = np.zeros(2, np.int64)
-        self._kernels.run(self._at, self._gains_at, *arguments, address_of(taken), address_of(out))
+        kinds = (
+            (log.imu_time_us, log.imu),
+            (baro_before, log.baro_alt_m),
+            (gps_before, log.gps_time_us, log.gps),
+        )
+        # Their addresses hold only while the arrays are kept.
+        arrays = [[*map(np.ascontiguousarray, kind)] for kind in kinds]
+        arguments = [number for kind in arrays for number in (len(kind[0]), *map(address_of, kind))]
+        self._kernels.run(self._at, self._gains_at, *arguments, address_of(out))
         return out
+
+    def run_as_heard(
+        self, time_us: IntArray, imu: FloatArray, heard: Sequence[Heard]
+    ) -> FloatArray:
+        """Advance over samples and what arrived between them, in the order of arrival.
+
+        Parameters
+        ----------
+        time_us : ndarray, shape (n,)
+            Of the IMU samples.
+        imu : ndarray, shape (n, IMU_COLUMNS)
+        heard : sequence of tuple
+            Heights and fixes in their order, each with the number of the sample before which it
+            arrived: up to n.
+
+        Returns
+        -------
+        ndarray, shape (n, NAV_COLUMNS)
+            One row per IMU sample.
+        """
+        # The compiled loop takes heights first: it is interrupted where one came after a fix.
+        cuts = {k for (k, a), (m, b) in pairwise(heard) if k == m and _is_fix(a) > _is_fix(b)}
+        pieces = []
+        begin = 0
+        for end in [*sorted(cuts - {len(time_us)}), len(time_us)]:
+            within = [(k - begin, r) for k, r in heard if begin <= k < end and k not in cuts]
+            pieces.append(self._run_piece(time_us[begin:end], imu[begin:end], within))
+            for k, record in heard:
+                if k == end:
+                    self._take(record)
+            begin = end
+        return np.concatenate(pieces)
+
+    def _run_piece(self, time_us: IntArray, imu: FloatArray, heard: Sequence[Heard]) -> FloatArray:
+        heights = [(k, r.alt_pressure_m) for k, r in heard if isinstance(r, BaroSample)]
+        fixes = [(k, r.time_us, self.fix_row(r)) for k, r in heard if isinstance(r, GpsFix)]
+        log = SampleLog(
+            imu_time_us=time_us,
+            imu=imu,
+            baro_time_us=np.empty(0, np.int64),
+            baro_alt_m=np.array([alt_m for _, alt_m in heights], np.float64),
+            gps_time_us=np.array([arrival_us for _, arrival_us, _ in fixes], np.int64),
+            gps=np.array([row for *_, row in fixes], np.float64).reshape(-1, GPS_COLUMNS),
+        )
+        baro_before = np.array([k for k, _ in heights], np.int64)
+        return self._run(log, baro_before, np.array([k for k, *_ in fixes], np.int64))
+
+    def _take(self, record: BaroSample | GpsFix) -> None:
+        if isinstance(record, BaroSample):
+            self.update_baro(record)
+        else:
+            self.update_gps(record)
+
+
+def _is_fix(record: BaroSample | GpsFix) -> bool:
+    return isinstance(record, GpsFix)
+
+
+def _taken_before(imu_time_us: IntArray, time_us: IntArray) -> IntArray:
+    """Return before which IMU sample each of a queue is taken: the first that is not earlier."""
+    reached = np.searchsorted(np.maximum.accumulate(imu_time_us), time_us)
+    return np.maximum.accumulate(reached)

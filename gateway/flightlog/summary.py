@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, TableMark
+from gateway.flightlog.table.cells import FIX_LAT, FIX_LON, FIX_OK, FloatArray, has_group
+from gateway.flightlog.table.row import BARO, GPS, MAG, NAV, RAW, SI
+from gateway.flightlog.table.table import TableBlock, TableFault, TableHeader, TableMark
 from gateway.flightlog.tlog.tlog import Batch, TlogIndex
 from gateway.geometry.geodesy import displacement_m
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -206,18 +207,17 @@ class TableSummary:
         self._way = GroundWay()
         self._gaps = _Gaps()
 
-    def add(self, events: list[TableEvent], header: TableHeader | None) -> None:
-        """Take in the next events of the file."""
+    def add(self, block: TableBlock, header: TableHeader | None) -> None:
+        """Take in the next block of the file."""
         self._header = header
-        for event in events:
-            match event:
-                case TableRow():
-                    self._add_row(event)
-                case TableMark():
-                    self._marks.append(event)
-                case TableFault():
-                    self._counts["damage"] += 1
-                    self._damaged_bytes += event.size
+        for _, comment in block.comments:
+            if isinstance(comment, TableMark):
+                self._marks.append(comment)
+            elif isinstance(comment, TableFault):
+                self._counts["damage"] += 1
+                self._damaged_bytes += comment.size
+        if len(block):
+            self._add_rows(block.cells)
 
     def result(self, size: int) -> FileInfo:
         """Return the summary of a file of that size."""
@@ -248,21 +248,22 @@ class TableSummary:
             marks=tuple(self._marks),
         )
 
-    def _add_row(self, row: TableRow) -> None:
-        counts, imu = self._counts, row.imu
-        counts["row"] += 1
-        counts["imu"] += imu is not None or row.raw is not None
-        counts["mag"] += imu is not None and imu.mag_b_ut is not None
-        counts["baro"] += row.baro is not None
-        counts["gps"] += row.gps is not None
-        counts["state"] += row.state is not None
+    def _add_rows(self, cells: FloatArray) -> None:
+        counts = self._counts
+        has_imu, has_mag = has_group(cells, SI), has_group(cells, MAG)
+        counts["row"] += len(cells)
+        counts["imu"] += int((has_imu | has_group(cells, RAW)).sum())
+        counts["mag"] += int((has_imu & has_mag).sum())
+        for name, group in (("baro", BARO), ("gps", GPS), ("state", NAV)):
+            counts[name] += int(has_group(cells, group).sum())
+        times_us = cells[:, 0].astype(np.int64)
         if self._first_us is None:
-            self._first_us = row.time_us
-        self._last_us = max(row.time_us, self._last_us or 0)
-        self._gaps.add(row.time_us)
-        if row.gps is not None and row.gps.fix_ok:
-            fix = row.gps
-            self._way.add(fix.time_us, fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
+            self._first_us = int(times_us[0])
+        self._last_us = max(int(times_us.max()), self._last_us or 0)
+        self._gaps.add_all(times_us)
+        fixed = cells[:, FIX_OK] == 1.0
+        for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
+            self._way.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
 
 
 def payload_of(frame: bytes, size: int) -> bytes:

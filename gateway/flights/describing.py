@@ -8,17 +8,17 @@ from gateway.edges.disk.recording_streams import (
     kind_of,
     other_format,
     read_batches,
-    read_events,
+    read_blocks,
 )
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary
 from gateway.flightlog.table.table import TableReader
+from gateway.flights.joined import shifted
 from gateway.flights.reading import (
     NO_RECORDING,
     FlightError,
     ReadOptions,
     is_table,
     open_rows,
-    shifted,
 )
 
 
@@ -57,12 +57,12 @@ def describe(file: Path, options: ReadOptions) -> FileInfo:
         foreign = open_rows(file, options)
         own = is_table(file)
         zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
-        for row in foreign.rows:
-            table.add([*shifted(row, zero_us)], foreign.header)
+        for block in foreign.blocks:
+            table.add(shifted(block, zero_us), foreign.header)
         name = other_format(file) if kind is FileKind.OTHER else kind.value
         header = foreign.header if own else None
         remarks = tuple(foreign.remarks)
         return replace(table.result(size), kind=name, header=header, remarks=remarks)
-    for event in read_events(file, reader, advance):
-        table.add([event], reader.header)
+    for block in read_blocks(file, reader, advance):
+        table.add(block, reader.header)
     return table.result(size)

@@ -12,7 +12,8 @@ from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.edges.disk.tracker_csv import read_flight
 from gateway.flightlog.table.row import TableRow
-from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, joined_rows, open_rows
+from gateway.flights.joined import joined_tables
+from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, open_rows
 from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain, pressure_altitude_m
 from gateway.simulator.recorded import RecordedFlight
@@ -55,7 +56,7 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     """
     if options.columns is None and kind_of(files[0]) is FileKind.FOREIGN:
         return read_flight(files[0])
-    table = joined_rows([open_rows(file, options) for file in files])
+    table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_of(table, options)
     columns = np.array(_cells(table.plain_rows, aircraft), float).reshape(-1, len(COLUMNS))
     for remark in table.remarks:

@@ -1,15 +1,19 @@
 """Fused states as the lines of a table without other columns."""
 
-import math
 from collections.abc import Iterator
 from typing import Final
 
+import numpy as np
+
 from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.flightlog.table.row import NAV_COLUMNS
+from gateway.flightlog.table.cells import write_lines
+from gateway.flightlog.table.row import NAV_COLUMNS, WHOLE_COLUMNS
 from gateway.flightlog.table.table import FORMAT_LINE, TableHeader, encode_header
 
 LINES: Final = 2000
 """Lines that are written at once."""
+WRITTEN: Final = ("time_us", *NAV_COLUMNS)
+IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
 
 
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
@@ -24,13 +28,7 @@ def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> I
     states : ndarray, shape (N, NAV_COLUMNS)
         See `gateway.estimation.columns`.
     """
-    yield f"{FORMAT_LINE}\n{encode_header(header)}time_us,{','.join(NAV_COLUMNS)}\n".encode()
-    for begin in range(0, len(time_us), LINES):
-        chunk = slice(begin, begin + LINES)
-        yield "".join(map(_line, time_us[chunk].tolist(), states[chunk].tolist())).encode()
-
-
-def _line(time_us: int, values: list[float]) -> str:
-    *figures, flags = values
-    cells = ["" if math.isnan(value) else repr(value) for value in figures]
-    return f"{time_us},{time_us},{','.join(cells)},{int(flags)}\n"
+    yield f"{FORMAT_LINE}\n{encode_header(header)}{','.join(WRITTEN)}\n".encode()
+    table = np.column_stack([time_us, time_us, states])
+    for begin in range(0, len(table), LINES):
+        yield write_lines(table[begin : begin + LINES], IS_WHOLE)

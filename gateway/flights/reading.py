@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.resources import files
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -21,33 +21,25 @@ from gateway.edges.disk.recording_streams import (
     kind_of,
     other_format,
     read_batches,
+    read_blocks,
     read_chunks,
-    read_events,
 )
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
-from gateway.flightlog.table.row import RowBuilder, TableRow
+from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import (
     HEAD_LINES,
     MAX_LINE,
-    TableEvent,
+    TableBlock,
     TableFault,
     TableHeader,
     TableMark,
     TableReader,
+    block_of,
 )
-from gateway.flightlog.tlog.stamps import JUMP_US
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.pipeline import PipelineSettings
-from gateway.records import (
-    BaroRaw,
-    FusionState,
-    GpsFix,
-    ImuCalibrated,
-    ImuRaw,
-    NavState,
-    NodeStatus,
-)
+from gateway.records import FusionState, NodeStatus
 from gateway.replay import header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
 
@@ -56,9 +48,6 @@ TRACKER_LOG: Final = files("gateway.flights") / "tracker-log.toml"
 
 Position = Literal["causal", "interpolated"]
 SettingsChoice = Literal["recorded", "current"]
-
-
-Moved = TypeVar("Moved", BaroRaw, GpsFix, ImuRaw, ImuCalibrated, NavState)
 
 
 Line = TableRow | TableHeader | TableMark | FusionState | NodeStatus
@@ -92,17 +81,26 @@ class RecordedTable:
     """Rows with their head."""
 
     header: TableHeader
-    rows: Iterator[Line]
-    """A header among them means that settings were changed in flight, a state is the fusion's at
-    that row, a mark an operator's remark."""
+    blocks: Iterator[TableBlock]
+    """A header among the rows tells of settings that were changed in flight, a state of what the
+    fusion remembered there, a mark of what somebody remarked."""
     remarks: list[str] = field(default_factory=list)
     """Remarks about the file for the user; complete once the rows are read."""
+
+    @property
+    def rows(self) -> Iterator[Line]:
+        """The same one by one, but for faults."""
+        events = (e for block in self.blocks for e in block.events(self.header.vehicle_id))
+        return (event for event in events if isinstance(event, Line))
 
     @property
     def plain_rows(self) -> Iterator[TableRow]:
         """The rows only."""
         return (row for row in self.rows if isinstance(row, TableRow))
 
+
+ROWS: Final = 1000
+"""Of another program's file that are laid out as columns at once."""
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 
@@ -218,70 +216,6 @@ def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterato
     return heapq.merge(*streams, key=lambda record: record.time_us)
 
 
-def joined_rows(tables: list[RecordedTable]) -> RecordedTable:
-    """Join tables of one aircraft on the clock of the first.
-
-    Parts of one recording share a clock; other recordings are put in their place by civil time.
-
-    Raises
-    ------
-    FlightError
-        If they are of several aircraft.
-    """
-    vehicles = sorted({table.header.vehicle_id for table in tables})
-    if len(vehicles) > 1:
-        listed = " and ".join(map(str, vehicles))
-        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
-    first = tables[0].header
-    remarks: list[str] = []
-
-    def rows() -> Iterator[Line]:
-        known = first
-        for table in tables:
-            header = table.header
-            if (header.settings, header.calibration) != (known.settings, known.calibration):
-                yield header
-            for row in table.rows:
-                known = row if isinstance(row, TableHeader) else known
-                yield from shifted(row, _shift_us(header, first))
-            remarks.extend(table.remarks)
-
-    return RecordedTable(first, rows(), remarks)
-
-
-def _shift_us(header: TableHeader, first: TableHeader) -> int:
-    """Return the offset between two clocks; the parts of a recording share one."""
-    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
-        return 0
-    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
-    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
-
-
-def shifted(row: Line, shift_us: int) -> Iterator[Line]:
-    """Shift a row and all its records in time; a state has its own times and is left out."""
-    if not shift_us or isinstance(row, TableHeader):
-        yield row
-    elif isinstance(row, TableMark):
-        yield TableMark(row.time_us + shift_us, row.text)
-    elif isinstance(row, NodeStatus):
-        yield msgspec.structs.replace(row, time_us=row.time_us + shift_us)
-    elif isinstance(row, TableRow):
-        yield TableRow(
-            row.time_us + shift_us,
-            _moved(row.baro, shift_us),
-            _moved(row.gps, shift_us),
-            _moved(row.raw, shift_us),
-            _moved(row.imu, shift_us),
-            _moved(row.state, shift_us),
-        )
-
-
-def _moved(record: Moved | None, shift_us: int) -> Moved | None:
-    if record is None:
-        return None
-    return msgspec.structs.replace(record, time_us=record.time_us + shift_us)
-
-
 def foreign_rows(lines: Iterable[str], options: ReadOptions) -> Iterator[TableRow]:
     """Read the lines of another program's CSV; raises ValueError as `ForeignReader.rows`."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
@@ -307,23 +241,22 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
 
 def _open_table(path: Path, options: ReadOptions) -> RecordedTable:
     reader = TableReader()
-    return table_of_events(path, reader, read_events(path, reader, options.progress))
+    return table_of_blocks(path, reader, read_blocks(path, reader, options.progress))
 
 
-def table_of_events(path: Path, reader: TableReader, events: Iterator[TableEvent]) -> RecordedTable:
+def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock]) -> RecordedTable:
     """Begin to read a table; raises FlightError if its head is damaged, or there is no row."""
-    head: list[Line] = []
-    for event in events:
-        if isinstance(event, TableFault) and event.line <= HEAD_LINES:
-            raise FlightError(
-                f"{path}: line {event.line}: {event.reason}; `mavgate recover` writes the rows "
-                "that are sound"
-            )
-        if isinstance(event, Line):
-            head.append(event)
-        if isinstance(event, TableRow):
-            rest = (line for line in events if isinstance(line, Line))
-            return RecordedTable(reader.header or TableHeader(), chain(head, rest))
+    head: list[TableBlock] = []
+    for block in blocks:
+        head.append(block)
+        for _, comment in block.comments:
+            if isinstance(comment, TableFault) and comment.line <= HEAD_LINES:
+                raise FlightError(
+                    f"{path}: line {comment.line}: {comment.reason}; `mavgate recover` writes the "
+                    "rows that are sound"
+                )
+        if len(block):
+            return RecordedTable(reader.header or TableHeader(), chain(head, blocks))
     raise FlightError(f"{path}: holds no row")
 
 
@@ -339,23 +272,17 @@ def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
-    reader, builder = AutopilotReader(options.system_id), RowBuilder()
-
-    def rows() -> Iterator[TableRow]:
-        for batch in read_batches(path, options.progress, strict=True):
-            for imported in reader.feed_batch(batch):
-                yield from builder.add(imported)
-        yield from builder.flush()
-
-    stream = rows()
-    first = next(stream, None)
+    reader = AutopilotReader(options.system_id)
+    batches = read_batches(path, options.progress, strict=True)
+    blocks = chain(map(reader.feed, batches), [None])
+    stream = (reader.flush() if cells is None else cells for cells in blocks)
+    first = next((cells for cells in stream if len(cells)), None)
     if first is None:
         raise FlightError(
             f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )
-    return table_of_rows(
-        chain([first], stream), options, reader.system_id or 1, reader.unix_us_at_zero
-    )
+    header = _header_of_today(options, reader.system_id or 1, reader.unix_us_at_zero)
+    return RecordedTable(header, map(TableBlock, chain([first], stream)))
 
 
 def table_of_rows(
@@ -381,12 +308,19 @@ def table_of_rows(
     -------
     RecordedTable
     """
+    header = _header_of_today(options, vehicle_id, unix_us_at_zero)
+    blocks = (block_of(some) for some in iter(lambda: [*islice(rows, ROWS)], []))
+    return RecordedTable(header, blocks)
+
+
+def _header_of_today(
+    options: ReadOptions, vehicle_id: int, unix_us_at_zero: int | None
+) -> TableHeader:
     current = options.current.aircraft.get(vehicle_id, options.current.default)
     # Its values are calibrated already, whatever the calibration of the aircraft of that number.
     calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
     known = header_for(calibrated, vehicle_id)
-    header = msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
-    return RecordedTable(header, rows)
+    return msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
 
 
 _add_packaged("ULog", (b"ULog\x01\x12\x35",), "ulog_file")

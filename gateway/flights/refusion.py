@@ -12,38 +12,28 @@ from gateway import __version__
 from gateway.aircraft import Aircraft
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_ends
 from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableReader
+from gateway.flightlog.table.table import TableBlock, TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.joined import joined_tables
 from gateway.flights.reading import (
     ReadOptions,
     RecordedTable,
     aircraft_of,
     foreign_rows,
-    joined_rows,
     open_rows,
 )
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,
-    smooth_records,
+    smooth_blocks,
     with_smoothed_estimator,
 )
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import (
-    BaroRaw,
-    FusionState,
-    GpsFix,
-    ImuCalibrated,
-    ImuRaw,
-    NavState,
-    Outgoing,
-)
-from gateway.replay import InterpolatedPosition, Replay, header_for, records_of
+from gateway.records import FusionState, GpsFix, NavState, Outgoing
+from gateway.replay import InterpolatedPosition, Replay, header_for, heard_of
 
 SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
-
-Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
 
 
 class Refusion:
@@ -67,13 +57,13 @@ class Refusion:
     def __init__(
         self, files: Sequence[Path], options: ReadOptions, *, smooth: bool = False
     ) -> None:
-        self._table = table = joined_rows([open_rows(file, options) for file in files])
+        self._table = table = joined_tables([open_rows(file, options) for file in files])
         self._aircraft, self._zero_us = aircraft_of(table, options), table.header.unix_us_at_zero
         self._recorded = options.choice == "recorded"
         correct: Callable[[NavState], NavState] | None = None
         if smooth:
             self._aircraft = with_smoothed_estimator(self._aircraft)
-            correct = SmoothedStates(*smooth_records(_records_of(files, options), self._aircraft))
+            correct = SmoothedStates(*smooth_blocks(_blocks_of(files, options), self._aircraft))
         elif options.position == "interpolated":
             latency_s = self._aircraft.estimation.reference.gps_latency_s
             correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
@@ -107,14 +97,16 @@ class Refusion:
 
     def table(self) -> RecordedTable:
         """Return the rows with the new states, under a head that says how they were fused."""
-        rows = self._rows.rows(self._table.rows)
-        first = next(rows, None)
+        blocks = self._rows.blocks(self._table.blocks)
+        # The first may hold nothing but the head of the file.
+        first = next((block for block in blocks if len(block) or block.comments), None)
+        at_begin = [] if first is None else [c for row, c in first.comments if row == 0]
+        begins_cold = not any(isinstance(comment, FusionState) for comment in at_begin[:1])
         old, new = self._table.header, header_for(self._aircraft, self._table.header.vehicle_id)
         if not self._recorded or not old.settings:
             old = msgspec.structs.replace(old, settings=new.settings, calibration=new.calibration)
-        begins_cold = not isinstance(first, FusionState)
         header = msgspec.structs.replace(old, mavgate_version=__version__, cold_start=begins_cold)
-        return RecordedTable(header, chain([] if first is None else [first], rows))
+        return RecordedTable(header, chain([] if first is None else [first], blocks))
 
 
 def end_of(file: Path, options: ReadOptions) -> int | None:
@@ -134,15 +126,14 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
     return zero_us + rows[-1].time_us if rows else None
 
 
-def _records_of(files: Iterable[Path], options: ReadOptions) -> Iterator[Record]:
-    """Read all records in an extra pass before the rows."""
+def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:
+    """Read all once more, before the rows or beside them."""
     quiet = replace(options, progress=None)
-    table = joined_rows([open_rows(file, quiet) for file in files])
-    return (record for row in table.plain_rows for record in records_of(row))
+    return joined_tables([open_rows(file, quiet) for file in files]).blocks
 
 
 def _fixes_of(files: Iterable[Path], options: ReadOptions) -> Iterator[GpsFix]:
-    """Read the fixes beside the rows, a little ahead of them."""
-    quiet = replace(options, progress=None)
-    table = joined_rows([open_rows(file, quiet) for file in files])
-    return (row.gps for row in table.plain_rows if row.gps is not None)
+    heard = (
+        record for block in _blocks_of(files, options) for _, record in heard_of(block.cells, 1)
+    )
+    return (record for record in heard if isinstance(record, GpsFix))

@@ -1,22 +1,20 @@
-"""Rows of a table fused again: only sensing and estimation, many samples at once.
+"""Rows of a table fused again: sensing and estimation alone, a block at once.
 
-A flight that becomes a table needs no MAVLink, so the vehicle stage is left out, and the samples
-between two heights or fixes run through the estimator together. The states are the same, bit for
-bit, as if every record had arrived live.
+Nobody is told of a flight that becomes a table: the vehicle that would make MAVLink of the states
+is left out, and all samples of a block run through the estimator together. The states are the same,
+bit for bit, as if every record had come live.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Final
+
+import numpy as np
 
 from gateway.aircraft import Aircraft
-from gateway.flightlog.table.row import RowBuilder, TableRow
-from gateway.flightlog.table.table import TableHeader
-from gateway.flights.reading import Line
+from gateway.flightlog.table.cells import NODE_ID, FloatArray, has_group
+from gateway.flightlog.table.row import BARO, GPS, NAV, RAW, SI
+from gateway.flightlog.table.table import TableBlock, TableComment, TableHeader
 from gateway.records import FusionState
-from gateway.replay import settings_of
-
-BLOCK: Final = 1000
-"""Samples that run together at most."""
+from gateway.replay import heard_of, imu_log_of, settings_of
 
 
 class RowFusion:
@@ -33,51 +31,58 @@ class RowFusion:
     def __init__(self, aircraft: Aircraft, *, follow: bool) -> None:
         self._aircraft = aircraft
         self._follow = follow
-        self._builder = RowBuilder()
-        self._waiting: list[TableRow] = []
-        """Rows with a sample; their earlier records were processed already."""
         self.refused: list[str] = []
         """Why states of the file were not restored."""
 
-    def rows(self, lines: Iterable[Line]) -> Iterator[Line]:
-        """Yield the lines of a file, with the new states."""
-        for line in lines:
-            if not isinstance(line, TableRow):
-                yield from self._fused()
-                if self._goes_on(line):
-                    yield line
-                continue
-            if line.baro is not None or line.gps is not None:
-                yield from self._fused()
-                for record in (line.baro, line.gps):
-                    if record is not None:
-                        self._aircraft.hear(record)
-            self._waiting.append(line)
-            if len(self._waiting) == BLOCK:
-                yield from self._fused()
-        yield from self._fused()
+    def blocks(self, blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
+        """Yield what a file holds, with the new states; a row that holds nothing is left out."""
+        for block in blocks:
+            cells = block.cells
+            held = np.any([has_group(cells, group) for group in (BARO, GPS, RAW, SI)], axis=0)
+            cells = cells[held]
+            place_of = np.concatenate([[0], np.cumsum(held)]).tolist()
+            fused: list[FloatArray] = []
+            comments: list[tuple[int, TableComment]] = []
+            begin = 0
+            for row, comment in block.comments:
+                place = place_of[row]
+                if isinstance(comment, TableHeader | FusionState):
+                    fused.append(self._fused(cells[begin:place]))
+                    begin = place
+                if self._goes_on(comment):
+                    comments.append((place, comment))
+            fused.append(self._fused(cells[begin:]))
+            yield TableBlock(np.concatenate(fused), tuple(comments))
 
-    def _goes_on(self, line: Line) -> bool:
+    def _goes_on(self, comment: TableComment) -> bool:
         """Handle a line that is not a row; return whether it stays in the file."""
-        if isinstance(line, TableHeader):
+        if isinstance(comment, TableHeader):
             if self._follow:
-                self._aircraft.change(settings_of(line), 0)
+                self._aircraft.change(settings_of(comment), 0)
             return self._follow
-        if isinstance(line, FusionState):
+        if isinstance(comment, FusionState):
             try:
-                self._aircraft.restore(line)
+                self._aircraft.restore(comment)
             except ValueError as error:
                 self.refused.append(str(error))
                 return False
         return True
 
-    def _fused(self) -> Iterator[TableRow]:
-        samples = [row.raw or row.imu for row in self._waiting]
-        fused = iter(self._aircraft.fuse([sample for sample in samples if sample is not None]))
-        for row, sample in zip(self._waiting, samples, strict=True):
-            for record in (row.baro, row.gps):
-                if record is not None:
-                    yield from self._builder.add(record)
-            # A row without an IMU sample stays so.
-            yield from self._builder.flush() if sample is None else self._builder.add(next(fused))
-        self._waiting.clear()
+    def _fused(self, cells: FloatArray) -> FloatArray:
+        """Return rows with the samples as they are calibrated now, and the states of now."""
+        found = cells.copy()
+        has_counts = has_group(cells, RAW)
+        has_sample = has_counts | has_group(cells, SI)
+        samples = cells[has_sample]
+        log = imu_log_of(samples, self._aircraft.chain)
+        states = self._aircraft.fuse(log, heard_of(cells, self._aircraft.vehicle_id))
+        # A row that stands without an IMU sample has the time of its newest record.
+        told_us = np.where(has_group(cells, GPS), cells[:, GPS.start], cells[:, BARO.start])
+        found[~has_sample, 0] = told_us[~has_sample]
+        found[has_sample & ~has_counts, NODE_ID] = 0.0
+        found[has_sample, SI] = np.column_stack(
+            [log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.temperature_degc]
+        )
+        found[:, NAV] = np.nan
+        found[has_sample, NAV] = np.column_stack([samples[:, 0], states])
+        return found

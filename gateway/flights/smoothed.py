@@ -1,25 +1,24 @@
 """Recorded flights smoothed from both ends, instead of the estimates made in flight."""
 
 from collections.abc import Iterable
+from dataclasses import fields
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
 from gateway.aircraft import AircraftSettings, make_fusion
-from gateway.estimation.columns import (
-    GPS_COLUMNS,
-    IMU_COLUMNS,
-    GpsRow,
-    ImuRow,
-    imu_row,
-    nav_state,
-)
+from gateway.estimation.columns import GPS_COLUMNS, imu_rows, nav_state
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.smoothing.smoother import smooth
+from gateway.flightlog.table.cells import has_group
+from gateway.flightlog.table.row import RAW, SI
+from gateway.flightlog.table.table import NO_ROWS, TableBlock
 from gateway.flights.reading import FlightError
-from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw, NavState
+from gateway.records import BaroRaw, GpsFix, NavState
+from gateway.replay import calibrated_of, heard_of
+from gateway.sensing.chain import SensorChain
 
 SMOOTHED_ESTIMATOR: Final = "eskf"
 """The filter that the smoother goes over."""
@@ -31,15 +30,15 @@ def with_smoothed_estimator(aircraft: AircraftSettings) -> AircraftSettings:
     return msgspec.structs.replace(aircraft, estimation=estimation)
 
 
-def smooth_records(
-    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated], aircraft: AircraftSettings
+def smooth_blocks(
+    blocks: Iterable[TableBlock], aircraft: AircraftSettings
 ) -> tuple[IntArray, FloatArray]:
-    """Smooth the records of one aircraft.
+    """Smooth the rows of one aircraft.
 
     Parameters
     ----------
-    records : iterable of record
-        Raw or calibrated samples and fixes, in the order in which they came.
+    blocks : iterable of TableBlock
+        In the order of the recording.
     aircraft : AircraftSettings
         Calibration, filters, and the settings of the Kalman filter.
 
@@ -55,7 +54,7 @@ def smooth_records(
     FlightError
         If the clock went back: there is no order to smooth in.
     """
-    log, estimator = gather_samples(records, aircraft)
+    log, estimator = gather_samples(blocks, aircraft)
     if np.any(np.diff(log.imu_time_us) < 0):
         raise FlightError("its clock goes back, so it cannot be smoothed; cut it there")
     return log.imu_time_us, smooth(estimator, log)
@@ -85,46 +84,34 @@ class SmoothedStates:
 
 
 def gather_samples(
-    records: Iterable[BaroRaw | GpsFix | ImuRaw | ImuCalibrated], aircraft: AircraftSettings
+    blocks: Iterable[TableBlock], aircraft: AircraftSettings
 ) -> tuple[SampleLog, KernelEstimator[Any, Any]]:
-    """Collect a flight's records as calibrated arrays, with a fresh Kalman filter for them."""
+    """Lay a flight's rows out as arrays, calibrated, for the Kalman filter, which is fresh."""
     chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
     if not isinstance(estimator, KernelEstimator):
         raise TypeError(f"{SMOOTHED_ESTIMATOR} is {type(estimator)}, which cannot be smoothed")
-    imu_us: list[int] = []
-    imu: list[ImuRow] = []
-    baro_us: list[int] = []
-    baro: list[float] = []
-    gps_us: list[int] = []
-    gps: list[GpsRow] = []
-    for record in records:
-        match record:
-            case BaroRaw():
-                baro_us.append(record.time_us)
-                baro.append(chain.baro(record).alt_pressure_m)
-            case GpsFix():
-                gps_us.append(record.time_us)
-                gps.append(estimator.fix_row(record))
-            case ImuRaw():
-                imu_us.append(record.time_us)
-                imu.append(imu_row(chain.imu(record)))
-            case _:
-                imu_us.append(record.time_us)
-                sample = chain.imu_si(
-                    record.time_us,
-                    record.accel_b_mps2,
-                    record.gyro_b_radps,
-                    record.mag_b_ut,
-                    record.temperature_degc,
-                    record.flags,
-                )
-                imu.append(imu_row(sample))
-    log = SampleLog(
-        imu_time_us=np.array(imu_us, np.int64),
-        imu=np.array(imu, np.float64).reshape(-1, IMU_COLUMNS),
-        baro_time_us=np.array(baro_us, np.int64),
-        baro_alt_m=np.array(baro, np.float64),
-        gps_time_us=np.array(gps_us, np.int64),
-        gps=np.array(gps, np.float64).reshape(-1, GPS_COLUMNS),
+    logs = [_sample_log(block.cells, chain, estimator) for block in blocks]
+    if not logs:
+        logs = [_sample_log(NO_ROWS, chain, estimator)]
+    joined = [
+        np.concatenate([getattr(log, field.name) for log in logs]) for field in fields(SampleLog)
+    ]
+    return SampleLog(*joined), estimator
+
+
+def _sample_log(
+    cells: FloatArray, chain: SensorChain, estimator: KernelEstimator[Any, Any]
+) -> SampleLog:
+    samples = cells[has_group(cells, RAW) | has_group(cells, SI)]
+    accel, gyro, mag, _, flags = calibrated_of(samples, chain)
+    heard = [record for _, record in heard_of(cells, 1)]
+    heights = [chain.baro(record) for record in heard if isinstance(record, BaroRaw)]
+    fixes = [record for record in heard if isinstance(record, GpsFix)]
+    return SampleLog(
+        imu_time_us=samples[:, 0].astype(np.int64),
+        imu=imu_rows(accel, gyro, mag, flags),
+        baro_time_us=np.array([height.time_us for height in heights], np.int64),
+        baro_alt_m=np.array([height.alt_pressure_m for height in heights], np.float64),
+        gps_time_us=np.array([fix.time_us for fix in fixes], np.int64),
+        gps=np.array([*map(estimator.fix_row, fixes)], np.float64).reshape(-1, GPS_COLUMNS),
     )
-    return log, estimator

@@ -8,40 +8,27 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flightlog.geo_json import to_geojson
 from gateway.flightlog.mapshape import VehicleTrack, to_gpx, to_kml
-from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import (
-    TableHeader,
-    encode_head,
-    encode_line,
-)
+from gateway.flightlog.moment import place_in
+from gateway.flightlog.table.table import encode_block, encode_head
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flights.joined import Limits, joined_tables, trimmed
 from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import (
     NO_RECORDING,
     FlightError,
-    Line,
     ReadOptions,
     RecordedTable,
     aircraft_of,
     import_format,
     is_table,
-    joined_rows,
     open_rows,
     recorded_frames,
 )
 from gateway.flights.refusion import Refusion
-
-LINES: Final = 1000
-"""Lines of a table that are written at once."""
-
-Limits = tuple[Moment | None, Moment | None]
 
 
 class FlightToWrite:
@@ -103,10 +90,10 @@ class FlightToWrite:
     def table(self) -> RecordedTable:
         """Return the rows: as recorded, or fused again from the start and then cut."""
         if self._as_recorded:
-            table = joined_rows([open_rows(file, self.options) for file in self.files])
+            table = joined_tables([open_rows(file, self.options) for file in self.files])
         else:
             table = self.fused().table()
-        return _trimmed(table, self._limits)
+        return trimmed(table, self._limits)
 
     def by_aircraft(self) -> "list[FlightToWrite]":
         """Split tables by aircraft."""
@@ -193,13 +180,7 @@ def _write_tlog(flight: FlightToWrite) -> Iterator[bytes]:
 def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
     table = flight.table()
     yield encode_head(table.header).encode()
-    lines: list[str] = []
-    for row in table.rows:
-        lines.append(encode_line(row))
-        if len(lines) == LINES:
-            yield "".join(lines).encode()
-            lines.clear()
-    yield "".join(lines).encode()
+    yield from map(encode_block, table.blocks)
 
 
 def _write_kml(flight: FlightToWrite) -> Iterator[bytes]:
@@ -261,25 +242,3 @@ def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecor
             return
         if begin is None or record.time_us >= place_in(begin, first_us):
             yield record
-
-
-def _trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
-    begin, end = limits
-    zero_us = table.header.unix_us_at_zero or 0
-
-    def rows() -> Iterator[Line]:
-        first_us: int | None = None
-        begun = begin is None
-        for row in table.rows:
-            if isinstance(row, TableRow):
-                time_us = zero_us + row.time_us
-                first_us = time_us if first_us is None else first_us
-                if end is not None and time_us > place_in(end, first_us):
-                    return
-                begun = begun or (begin is not None and time_us >= place_in(begin, first_us))
-            # Settings changed before the start still apply, but a state from there does not.
-            if begun or isinstance(row, TableHeader):
-                yield row
-
-    cold_start = table.header.cold_start and begin is None
-    return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), rows())

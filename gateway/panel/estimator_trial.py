@@ -19,16 +19,17 @@ from gateway.analysis.flight_arrays import (
     FusionSettings,
     IntArray,
     fixes_of,
-    flight_of_records,
 )
 from gateway.analysis.fusion import fuse
 from gateway.analysis.metrics import euler_rad, rms
+from gateway.analysis.sources import flight_of_blocks
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.flightlog.table.autopilot import AutopilotReader
+from gateway.flightlog.table.table import TableBlock
+from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
 from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.field_history import FloatArray
 from gateway.panel.state.sample_memory import TimedFrames
-from gateway.records import NavState
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.services.parameters.parameters import ParameterTable
@@ -128,11 +129,11 @@ async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) ->
 
 def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:
     reader = AutopilotReader()
-    found = (record for time_us, frame in frames for record in reader.feed(frame, time_us))
-    records = [record for record in found if not isinstance(record, NavState)]
+    data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
+    rows = reader.feed(TlogScanner(strict=True).feed(data, final=True))
     try:
-        flight = flight_of_records(
-            records, NodeCalibration(), name="the last minutes", story="", fusion=settings
+        flight = flight_of_blocks(
+            [TableBlock(rows)], NodeCalibration(), settings, name="the last minutes", story=""
         )
     except ValueError as error:
         raise ComparisonError("no sensor samples came yet") from error

@@ -1,13 +1,19 @@
 """A node's calibration: counts in sensor axes to SI in body FRD."""
 
-from typing import Annotated, Final
+from collections.abc import Callable
+from typing import Annotated, Final, TypeVar
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from gateway.geometry.rotation import Matrix3, determinant, is_rotation
-from gateway.records import Int3, Vec3
+from gateway.records import ImuFlags, Int3, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 IDENTITY3: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -133,9 +139,61 @@ def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
-def temperature_from_counts(raw: int) -> float:
-    """Convert the MPU6050's temperature register to deg C."""
+Number = TypeVar("Number", float, FloatArray)
+
+
+def temperature_from_counts(raw: Number) -> Number:
+    """Convert the MPU6050's temperature word, or many of them, to deg C."""
     return raw / 340.0 + 36.53
+
+
+def vectors_from_counts(
+    scaled: Callable[[Int3, int], Vec3 | None], counts: FloatArray, ranges: FloatArray
+) -> FloatArray:
+    """Scale an array of counts, shape (n, 3), each vector by its own range.
+
+    Parameters
+    ----------
+    scaled : callable
+        One of the three above.
+    counts : ndarray, shape (n, 3)
+        Whole numbers.
+    ranges : ndarray, shape (n,)
+        What `scaled` takes beside them.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Bit for bit what `scaled` gives for each; NaN where it gives None.
+    """
+    found = np.full(counts.shape, np.nan)
+    for one in np.unique(ranges).tolist():
+        unit = scaled((1, 1, 1), int(one))
+        if unit is not None:
+            found[ranges == one] = counts[ranges == one] * unit[0]
+    if scaled is mag_from_counts:
+        found[(counts == MAG_OVERFLOW).any(axis=1)] = np.nan
+    return found
+
+
+def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
+    """Scale the magnetometer's counts of many payloads to uT in sensor axes.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n, 13)
+        In the order of `ImuRaw`.
+    flags : ndarray of int, shape (n,)
+        `ImuFlags`.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        NaN unless it is new and none of its axes overflowed.
+    """
+    told = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
+    field = vectors_from_counts(mag_from_counts, counts[:, 6:9], counts[:, 12])
+    return np.where((told == int(ImuFlags.MAG_NEW))[:, np.newaxis], field, np.nan)
 
 
 class Correction:
@@ -150,3 +208,8 @@ class Correction:
         x, y, z = v
         bias_x, bias_y, bias_z = self._bias
         return transform(self._matrix, (x - bias_x, y - bias_y, z - bias_z))
+
+    def apply_all(self, vectors: FloatArray) -> FloatArray:
+        """Correct an array of shape (n, 3); bit for bit what `apply` gives for each."""
+        x, y, z = (column - bias for column, bias in zip(vectors.T, self._bias, strict=True))
+        return np.column_stack([a * x + b * y + c * z for a, b, c in self._matrix])

@@ -5,7 +5,6 @@ from typing import Annotated, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gateway.records import BaroRaw, BaroSample, ImuFlags, ImuRaw, ImuSample, Vec3
 from gateway.sensing.calibration import (
@@ -15,7 +14,9 @@ from gateway.sensing.calibration import (
     accel_from_counts,
     gyro_from_counts,
     mag_from_counts,
+    new_field_ut,
     temperature_from_counts,
+    vectors_from_counts,
 )
 from gateway.sensing.filters import (
     Coefficients,
@@ -26,10 +27,9 @@ from gateway.sensing.filters import (
     design_highpass,
     design_lowpass,
 )
+from gateway.sensing.imu_log import ImuLog, IntArray
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
-
-IntArray = NDArray[np.int64]
 
 GAP_US: Final = 500_000
 """After a longer gap the filters are reset."""
@@ -209,10 +209,65 @@ class SensorChain:
             flags=flags,
         )
 
+    def imu_log(self, time_us: IntArray, counts: FloatArray, flags: IntArray) -> ImuLog:
+        """Turn many IMU payloads into samples; bit for bit what `imu` gives for each.
+
+        Parameters
+        ----------
+        time_us : ndarray of int, shape (n,)
+            Gateway clock.
+        counts : ndarray, shape (n, 13)
+            Whole numbers: three of the accelerometer, of the gyroscope and of the magnetometer,
+            the temperature, and the three ranges, as in `ImuRaw`.
+        flags : ndarray of int, shape (n,)
+            `ImuFlags`.
+        """
+        accel, gyro, mag, temperature_degc = self.calibrated(counts, flags)
+        return self.imu_si_log(time_us, accel, gyro, mag, temperature_degc, flags)
+
+    def calibrated(
+        self, counts: FloatArray, flags: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Calibrate many IMU payloads without filtering them; see `imu_log`.
+
+        Returns
+        -------
+        accel, gyro, mag : ndarray, shape (n, 3)
+            In body FRD; the field NaN unless it is new.
+        temperature_degc : ndarray, shape (n,)
+        """
+        accel = vectors_from_counts(accel_from_counts, counts[:, 0:3], counts[:, 10])
+        gyro = vectors_from_counts(gyro_from_counts, counts[:, 3:6], counts[:, 11])
+        return (
+            self._accel.apply_all(accel),
+            self._gyro.apply_all(gyro),
+            self._mag.apply_all(new_field_ut(counts, flags)),
+            temperature_from_counts(counts[:, 9]),
+        )
+
+    def imu_si_log(
+        self,
+        time_us: IntArray,
+        accel_b_mps2: FloatArray,
+        gyro_b_radps: FloatArray,
+        mag_b_ut: FloatArray,
+        temperature_degc: FloatArray,
+        flags: IntArray,
+    ) -> ImuLog:
+        """Filter many samples that are calibrated already; as `imu_si` each."""
+        accel, gyro = self.filter_log(time_us, accel_b_mps2, gyro_b_radps, flags)
+        return ImuLog(
+            time_us, accel_b_mps2, gyro_b_radps, accel, gyro, mag_b_ut, temperature_degc, flags
+        )
+
     def filter_log(
-        self, time_us: IntArray, accel_b_mps2: FloatArray, gyro_b_radps: FloatArray
+        self,
+        time_us: IntArray,
+        accel_b_mps2: FloatArray,
+        gyro_b_radps: FloatArray,
+        flags: IntArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Filter a whole log; bit-identical to `imu_si` for samples that are not filtered.
+        """Filter a whole log; bit for bit what `imu_si` gives for its samples.
 
         Parameters
         ----------
@@ -220,21 +275,29 @@ class SensorChain:
             Gateway clock.
         accel_b_mps2, gyro_b_radps : ndarray, shape (n, 3)
             Specific force and angular rate in body FRD.
+        flags : ndarray of int, shape (n,), optional
+            Tell what is filtered already; by default nothing.
 
         Returns
         -------
         accel, gyro : ndarray, shape (n, 3)
             After the low-pass and the high-pass.
         """
-        accel, gyro = np.empty_like(accel_b_mps2), np.empty_like(gyro_b_radps)
+        flags = np.zeros(len(time_us), np.int64) if flags is None else flags
+        accel, gyro = accel_b_mps2.copy(), gyro_b_radps.copy()
+        bare_accel = (flags & int(ImuFlags.ACCEL_FILTERED)) == 0
+        bare_gyro = (flags & int(ImuFlags.GYRO_FILTERED)) == 0
         begin = 0
         for k, now_us in enumerate([*time_us.tolist(), None]):
             rate_hz = None if now_us is None else self._measured(now_us)
             if now_us is not None and rate_hz is None:
                 continue
-            part = slice(begin, k)
-            accel[part] = _filtered_array(self._lowpass, accel_b_mps2[part])
-            gyro[part] = _filtered_array(self._highpass, gyro_b_radps[part])
+            for chosen, values, vector_filter in (
+                (bare_accel, accel, self._lowpass),
+                (bare_gyro, gyro, self._highpass),
+            ):
+                part = begin + np.flatnonzero(chosen[begin:k])
+                values[part] = _filtered_array(vector_filter, values[part])
             begin = k
             if rate_hz is not None:
                 self._begin_anew(rate_hz)

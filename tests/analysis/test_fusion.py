@@ -13,9 +13,9 @@ from tests.analysis.flights import short_case, short_flight
 
 def test_sensing_gives_the_chains_samples() -> None:
     flight, sensed = short_flight(), short_case().sensed
-    assert len(sensed.samples) == len(flight.time_us)
+    assert len(sensed.log.samples()) == len(flight.time_us)
     assert sensed.table[:, 6:] == pytest.approx(flight.mag_b_ut, nan_ok=True)
-    assert sensed.table[5, :3] == pytest.approx(sensed.samples[5].accel_lowpass_b_mps2)
+    assert sensed.table[5, :3] == pytest.approx(sensed.log.samples()[5].accel_lowpass_b_mps2)
     noisy = np.diff(flight.accel_b_mps2, axis=0).std()
     assert np.diff(sensed.table[:, :3], axis=0).std() < 0.7 * noisy
 
@@ -31,7 +31,7 @@ def test_a_whole_flight_at_once_equals_sample_by_sample(name: str) -> None:
         )
     ]
     fixes = list(flight.fixes)
-    for k, sample in enumerate(case.sensed.samples[:1500]):
+    for k, sample in enumerate(case.sensed.log.samples()[:1500]):
         # Between two IMU samples the barometer comes first, as in a log that is run at once.
         while baros and baros[0].time_us <= sample.time_us:
             estimator.update_baro(baros.pop(0))

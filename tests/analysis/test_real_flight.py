@@ -9,10 +9,11 @@ import pytest
 from gateway.analysis.blending import blend_table, grows
 from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.fusion import sense
-from gateway.analysis.sources import flight_of_rows
+from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.contest import with_value
 from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
+from gateway.flightlog.table.table import block_of
 from gateway.flights.reading import TRACKER_LOG
 from gateway.sensing.calibration import NodeCalibration
 
@@ -27,8 +28,8 @@ def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
         ("gps_latency_s", 0.28), ("declination", "fixed"), ("declination_deg", 11.0)
     ):  # fmt: skip
         fusion = with_value(fusion, f"estimation.reference.{name}", value)
-    flight = flight_of_rows(
-        ForeignReader(columns).rows(text.splitlines()),
+    flight = flight_of_blocks(
+        [block_of(ForeignReader(columns).rows(text.splitlines()))],
         NodeCalibration(), fusion, name="arduplane", story="",
     )  # fmt: skip
     table = blend_table(flight, fusion, sense(flight, fusion.sensing), 1.0)

@@ -8,9 +8,10 @@ from gateway.analysis.case import make_case
 from gateway.analysis.flight_arrays import FlightTrack, fixes_of
 from gateway.analysis.fusion import fuse
 from gateway.analysis.reporting.compose import make_report
-from gateway.analysis.sources import at_times, flight_of_rows, ideal_calibration, judged_by
+from gateway.analysis.sources import at_times, flight_of_blocks, ideal_calibration, judged_by
 from gateway.estimation.select import make_estimator
 from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import block_of
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
@@ -50,8 +51,12 @@ def rows(*, raw: bool) -> Iterator[TableRow]:
 
 @pytest.mark.parametrize("raw", [True, False])
 def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
-    flight = flight_of_rows(
-        rows(raw=raw), ideal_calibration(SIMULATED.errors), short_case().fusion, name="a", story=""
+    flight = flight_of_blocks(
+        [block_of(rows(raw=raw))],
+        ideal_calibration(SIMULATED.errors),
+        short_case().fusion,
+        name="a",
+        story="",
     )
     chain = SensorChain(flight.fusion.sensing, ideal_calibration(SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
@@ -74,8 +79,12 @@ def test_the_simulated_flight_comes_over_the_radio() -> None:
 
 
 def test_a_recording_without_reference_still_has_its_report() -> None:
-    flight = flight_of_rows(
-        rows(raw=False), NodeCalibration(), short_case().fusion, name="log.csv", story="A log."
+    flight = flight_of_blocks(
+        [block_of(rows(raw=False))],
+        NodeCalibration(),
+        short_case().fusion,
+        name="log.csv",
+        story="A log.",
     )
     assert flight.reference is None
     report = make_report(make_case(flight))
@@ -88,7 +97,7 @@ def test_a_recording_without_reference_still_has_its_report() -> None:
 
 def test_other_states_can_be_the_reference() -> None:
     plain = replace(short_flight(), reference=None)
-    judged = judged_by(plain, rows(raw=False), "ref.csv")
+    judged = judged_by(plain, [block_of(rows(raw=False))], "ref.csv")
     assert judged.reference is not None
     assert not judged.reference.is_exact
     assert "ref.csv" in judged.reference.story
@@ -98,7 +107,7 @@ def test_other_states_can_be_the_reference() -> None:
 
 def test_a_reference_without_states_is_refused() -> None:
     with pytest.raises(ValueError, match=r"ref\.csv: holds no states"):
-        judged_by(short_flight(), [TableRow(0)], "ref.csv")
+        judged_by(short_flight(), [block_of([TableRow(0)])], "ref.csv")
 
 
 def test_the_nearest_row_is_taken_if_it_is_near() -> None:

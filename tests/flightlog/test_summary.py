@@ -83,7 +83,7 @@ def test_a_table_is_summed_up(rng: np.random.Generator) -> None:
             text += "".join(map(row_to_line, builder.add(record)))
     text += encode_mark(TableMark(5, "here")) + "broken,line\n"
     summary, reader = TableSummary(), TableReader()
-    summary.add(reader.feed(text.encode(), final=True), reader.header)
+    summary.add(reader.feed_block(text.encode(), final=True), reader.header)
     info = summary.result(len(text))
     assert (info.kind, info.records, info.duration_s) == ("table", 100, 0.99)
     rates = {rate.name: rate.count for rate in info.vehicles[0].rates}

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.flightlog.mapshape import PlaceKind, VehicleTrack
-from gateway.flightlog.table.table import TableMark
+from gateway.flightlog.table.table import TableMark, block_of
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import RecordedTable
@@ -111,7 +111,7 @@ def test_a_table_tells_the_same(rng: np.random.Generator) -> None:
         for row in rows
     ]
     mark = TableMark(rows[-1].time_us, "over the gate")
-    (track,) = tracks_of_table(RecordedTable(header, iter([*rows, mark])), settings)
+    (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
     assert places(track) == [(PlaceKind.HOME, "Home"), (PlaceKind.MARK, "over the gate")]
     assert len(track.points) > 10
     known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]

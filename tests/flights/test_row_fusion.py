@@ -1,6 +1,7 @@
 """Rows fused many at once have the states that they have record by record through the pipeline."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import msgspec
 import pytest
@@ -8,9 +9,9 @@ import pytest
 from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.table.row import RowBuilder, TableRow, row_to_line
-from gateway.flightlog.table.table import TableHeader, TableMark
+from gateway.flightlog.table.table import TableEvent, TableHeader, TableMark, block_of
 from gateway.flights.reading import Line
-from gateway.flights.row_fusion import BLOCK, RowFusion
+from gateway.flights.row_fusion import RowFusion
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
 from gateway.replay import Replay, header_for
@@ -19,6 +20,7 @@ from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 
 DURATION_S = 25.0
+BLOCK = 700
 
 
 def settings_for(estimator: str) -> AircraftSettings:
@@ -55,8 +57,10 @@ def one_by_one(lines: list[Line], settings: AircraftSettings) -> Iterator[TableR
         yield from builder.flush()
 
 
-def at_once(lines: list[Line], settings: AircraftSettings) -> list[Line]:
-    return list(RowFusion(Aircraft(1, settings), follow=True).rows(lines))
+def at_once(lines: list[Line], settings: AircraftSettings) -> list[TableEvent]:
+    fusion = RowFusion(Aircraft(1, settings), follow=True)
+    blocks = [block_of(lines[k : k + BLOCK]) for k in range(0, len(lines), BLOCK)]
+    return [event for block in fusion.blocks(blocks) for event in block.events(1)]
 
 
 @pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
@@ -67,6 +71,27 @@ def test_the_same_bits(estimator: str) -> None:
     expected = [row_to_line(row) for row in one_by_one(lines, settings)]
     found = at_once(lines, settings)
     assert [row_to_line(row) for row in found if isinstance(row, TableRow)] == expected
+
+
+@pytest.mark.parametrize("estimator", ["complementary", "eskf"])
+def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -> None:
+    lines, settings = flown()[:900], settings_for(estimator)
+    rows = [row for row in lines if isinstance(row, TableRow)]
+    for k, row in enumerate(rows):
+        if k % 50 == 20 and row.raw is not None:
+            back = msgspec.structs.replace(row.raw, time_us=row.time_us - 10_000 * (k % 3))
+            rows[k] = replace(row, time_us=back.time_us, raw=back)
+    first = next(row for row in rows if row.baro and row.raw)
+    fix = next(row.gps for row in rows if row.gps)
+    for k in range(300, 800, 100):
+        rows.insert(
+            k, TableRow(rows[k].time_us, gps=msgspec.structs.replace(fix, time_us=rows[k].time_us))
+        )
+        rows.insert(k + 1, TableRow(rows[k].time_us, baro=first.baro))
+    expected = [row_to_line(row) for row in one_by_one([*rows], settings)]
+    assert [
+        row_to_line(r) for r in at_once([*rows], settings) if isinstance(r, TableRow)
+    ] == expected
 
 
 def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None:
@@ -89,5 +114,5 @@ def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None
 def test_a_state_of_other_settings_is_refused_and_left_out() -> None:
     state = Aircraft(1, settings_for("eskf")).fusion_state
     fusion = RowFusion(Aircraft(1, settings_for("paper")), follow=True)
-    assert list(fusion.rows([state])) == []
+    assert [block.comments for block in fusion.blocks([block_of([state])])] == [()]
     assert fusion.refused == ["it is of another version or other settings"]

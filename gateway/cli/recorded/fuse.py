@@ -1,6 +1,5 @@
 """`mavgate fuse`: run an estimator causally over a log, from CSV to CSV."""
 
-import itertools
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -11,7 +10,7 @@ import msgspec
 import numpy as np
 import typer
 
-from gateway.aircraft import AircraftSettings, make_fusion
+from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
@@ -31,29 +30,28 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
 from gateway.estimation.alignment.gps_latency import estimate_latency
-from gateway.estimation.columns import NAV_COLUMNS, nav_row
-from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import ESTIMATORS
+from gateway.flightlog.table.cells import has_group
+from gateway.flightlog.table.row import NAV
+from gateway.flightlog.table.table import TableBlock
 from gateway.flights.fused_rows import fused_lines
+from gateway.flights.joined import joined_tables
 from gateway.flights.reading import (
     FlightError,
     ReadOptions,
     RecordedTable,
     SettingsChoice,
     aircraft_of,
-    joined_rows,
     open_rows,
 )
 from gateway.flights.refusion import SETTLES
-from gateway.flights.smoothed import gather_samples, smooth_records, with_smoothed_estimator
+from gateway.flights.row_fusion import RowFusion
+from gateway.flights.smoothed import gather_samples, smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new
-from gateway.records import BaroRaw, FusionState, GpsFix, ImuCalibrated, ImuRaw, ImuSample
-from gateway.replay import header_for, records_of
-from gateway.sensing.chain import SensorChain
-
-Record = BaroRaw | GpsFix | ImuRaw | ImuCalibrated
+from gateway.records import FusionState
+from gateway.replay import header_for
 
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 HEAD_LINES: Final = 20
@@ -114,17 +112,16 @@ def fuse_log(
         )
         if kind_of(files[0]) is FileKind.FOREIGN and "gps_latency_s" not in facts and not config:
             gps_latency_s = _found_latency_s(files[0], gps_latency_s, options)
-        table = joined_rows([open_rows(part, options) for part in files])
+        table = joined_tables([open_rows(part, options) for part in files])
         aircraft = _adjusted(
             aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
         )
         try:
             if smooth:
                 aircraft = with_smoothed_estimator(aircraft)
-                time_us, states = smooth_records(_records(table), aircraft)
+                time_us, states = smooth_blocks(table.blocks, aircraft)
             else:
-                chain, running = _begin(table, aircraft)
-                time_us, states = fuse(_records(table), chain, running)
+                time_us, states = _fused(table, aircraft)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
         header = header_for(aircraft, table.header.vehicle_id)
@@ -144,7 +141,7 @@ def _found_latency_s(file: Path, given_s: float | None, options: ReadOptions) ->
         return given_s
     table = open_rows(file, replace(options, progress=None))
     aircraft = aircraft_of(table, options)
-    found = estimate_latency(gather_samples(_records(table), aircraft)[0])
+    found = estimate_latency(gather_samples(table.blocks, aircraft)[0])
     latency_s = aircraft.estimation.reference.gps_latency_s if found is None else found.latency_s
     how = (
         f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
@@ -157,69 +154,23 @@ def _found_latency_s(file: Path, given_s: float | None, options: ReadOptions) ->
     return latency_s
 
 
-def _records(table: RecordedTable) -> Iterator[Record]:
-    return (record for row in table.plain_rows for record in records_of(row))
+def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
+    """Fuse causally; from the state at the table's begin on where there is one that fits."""
+    fusion = RowFusion(Aircraft(table.header.vehicle_id, aircraft), follow=False)
+    rows = [block.cells for block in fusion.blocks(_with_begin(table.blocks))]
+    for reason in fusion.refused:
+        console_of(stderr=True).print(SETTLES.format(reason), markup=False)
+    cells = np.concatenate(rows)
+    cells = cells[has_group(cells, NAV)]
+    return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]
 
 
-def _begin(table: RecordedTable, aircraft: AircraftSettings) -> tuple[SensorChain, Estimator]:
-    """Start from the state at the table's start if there is one that fits."""
-    first = next(table.rows)
-    if isinstance(first, FusionState):
-        try:
-            return make_fusion(aircraft, first)
-        except ValueError as error:
-            console = console_of(stderr=True)
-            console.print(SETTLES.format(error), markup=False)
-    else:
-        table.rows = itertools.chain([first], table.rows)
-    return make_fusion(aircraft)
-
-
-def fuse(
-    records: Iterable[Record], chain: SensorChain, estimator: Estimator
-) -> tuple[IntArray, FloatArray]:
-    """Run an estimator over records in the order in which they came, as live.
-
-    Parameters
-    ----------
-    records : iterable of record
-        Raw or calibrated samples and fixes.
-    chain : SensorChain
-        Calibration and filters.
-    estimator : Estimator
-        Fresh, or restored to a state.
-
-    Returns
-    -------
-    time_us : ndarray, shape (n,)
-        Of the IMU samples.
-    states : ndarray, shape (n, NAV_COLUMNS)
-        See `gateway.estimation.columns`.
-    """
-    times, rows = [], []
-    for record in records:
-        match record:
-            case BaroRaw():
-                estimator.update_baro(chain.baro(record))
-            case GpsFix():
-                estimator.update_gps(record)
-            case _:
-                times.append(record.time_us)
-                rows.append(nav_row(estimator.update_imu(_sample(chain, record))))
-    return np.array(times, np.int64), np.array(rows, float).reshape(-1, NAV_COLUMNS)
-
-
-def _sample(chain: SensorChain, record: ImuRaw | ImuCalibrated) -> ImuSample:
-    if isinstance(record, ImuRaw):
-        return chain.imu(record)
-    return chain.imu_si(
-        record.time_us,
-        record.accel_b_mps2,
-        record.gyro_b_radps,
-        record.mag_b_ut,
-        record.temperature_degc,
-        record.flags,
-    )
+def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
+    """Leave of what stands between rows only a state at the very begin."""
+    for number, block in enumerate(blocks):
+        begin = block.comments[:1] if number == 0 else ()
+        kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
+        yield TableBlock(block.cells, kept)
 
 
 def _facts_of(path: Path) -> dict[str, float]:

@@ -25,7 +25,7 @@ from gateway.edges.disk.recording_streams import (
     Progress,
     kind_of,
     read_batches,
-    read_events,
+    read_blocks,
 )
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import FileInfo, VehicleInfo
@@ -33,8 +33,8 @@ from gateway.flightlog.table.table import (
     TableFault,
     TableHeader,
     TableReader,
+    encode_block,
     encode_head,
-    encode_line,
 )
 from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flights.describing import describe
@@ -124,16 +124,16 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
 def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
     reader = TableReader()
     begun = False
-    for event in read_events(file, reader, advance):
-        if not begun and not isinstance(event, TableFault):
+    for block in read_blocks(file, reader, advance):
+        faults = [comment for _, comment in block.comments if isinstance(comment, TableFault)]
+        if not begun and (len(block) or len(block.comments) > len(faults)):
             begun = True
             if reader.header is None:
                 report("the head is lost: the current settings and calibration will be used")
             yield encode_head(reader.header or TableHeader()).encode()
-        if isinstance(event, TableFault):
-            report(f"line {event.line}: {event.size} bytes: {event.reason}")
-        else:
-            yield encode_line(event).encode()
+        for fault in faults:
+            report(f"line {fault.line}: {fault.size} bytes: {fault.reason}")
+        yield encode_block(block)
     if not begun:
         raise FlightError(f"{file}: holds no row that can be read")
 

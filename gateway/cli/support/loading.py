@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from gateway.analysis.flight_arrays import Flight, FusionSettings
-from gateway.analysis.sources import flight_of_rows, judged_by, simulated_flight
+from gateway.analysis.sources import flight_of_blocks, judged_by, simulated_flight
 from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import (
     print_remarks,
@@ -21,13 +21,13 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.flights.joined import joined_tables
 from gateway.flights.reading import (
     FlightError,
     ReadOptions,
     SettingsChoice,
     aircraft_of,
     is_table,
-    joined_rows,
     open_rows,
 )
 
@@ -84,13 +84,13 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
     files = [*parts, loading.reference] if loading.reference is not None else parts
     with progress_of(files) as advance, refusing():
         options = _read_options(loading, advance)
-        table = joined_rows([open_rows(part, options) for part in parts])
+        table = joined_tables([open_rows(part, options) for part in parts])
         aircraft = aircraft_of(table, options)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:
-            flight = flight_of_rows(
-                table.plain_rows, aircraft.calibration, fusion, name=path.name, story=story
+            flight = flight_of_blocks(
+                table.blocks, aircraft.calibration, fusion, name=path.name, story=story
             )
         except ValueError as error:
             raise FlightError(str(error)) from error
@@ -98,7 +98,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         if loading.reference is None:
             return flight
         return judged_by(
-            flight, open_rows(loading.reference, options).plain_rows, loading.reference.name
+            flight, open_rows(loading.reference, options).blocks, loading.reference.name
         )
 
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Final, cast
 
-from gateway.flightlog.table.table import MAX_LINE, TableEvent, TableReader
+from gateway.flightlog.table.table import MAX_LINE, TableBlock, TableReader
 from gateway.flightlog.tlog.tlog import Batch, TlogScanner
 
 CHUNK: Final = 1 << 20
@@ -132,10 +132,10 @@ def read_batches(
     yield scanner.feed(b"", final=True)
 
 
-def read_events(
+def read_blocks(
     path: Path, reader: TableReader, progress: Progress | None = None
-) -> Iterator[TableEvent]:
-    """Read a table event by event; the reader then knows its head."""
+) -> Iterator[TableBlock]:
+    """Read a table block by block; the reader then knows its head."""
     for data in read_chunks(path, progress):
-        yield from reader.feed(data)
-    yield from reader.feed(b"", final=True)
+        yield reader.feed_block(data)
+    yield reader.feed_block(b"", final=True)

@@ -99,28 +99,33 @@ def run(
     imu_times_us: int,
     imu_rows: int,
     baro_count: int,
-    baro_times_us: int,
+    baro_places: int,
     baro_alts_m: int,
     gps_count: int,
+    gps_places: int,
     gps_times_us: int,
     gps_rows: int,
-    counters: int,
     outputs: int,
 ) -> None:
-    """Advance over a log: at each IMU sample, what came before it first."""
+    """Advance over a log: at each IMU sample first the heights, then the fixes before it."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     imu_time_us = array_at(imu_times_us, (imu_count,), INT)
     imu = array_at(imu_rows, (imu_count, IMU_COLUMNS), FLOAT)
-    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
+    baro_before = array_at(baro_places, (baro_count,), INT)
     baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
+    gps_before = array_at(gps_places, (gps_count,), INT)
     gps_time_us = array_at(gps_times_us, (gps_count,), INT)
     gps = array_at(gps_rows, (gps_count, GPS_COLUMNS), FLOAT)
-    taken = array_at(counters, (2,), INT)
     out = array_at(outputs, (imu_count, NAV_COLUMNS), FLOAT)
+    baros = fixes = 0
     for i in range(imu_count):
-        now_us = imu_time_us[i]
-        take_earlier(s, p, now_us, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
-        take_imu(s, p, now_us, imu[i])
+        while baros < baro_count and baro_before[baros] <= i:
+            take_baro(s, p, baro_alt_m[baros])
+            baros += 1
+        while fixes < gps_count and gps_before[fixes] <= i:
+            take_gps(s, p, gps_time_us[fixes], gps[fixes])
+            fixes += 1
+        take_imu(s, p, imu_time_us[i], imu[i])
         write_output(s, out[i])
 
 
@@ -157,10 +162,9 @@ def kernels_of(
         "write_output": write_output,
     }
     mark = declaration.__name__
-    earlier = compiled_with(take_earlier, names, mark)
 
     def entry(template: Callable[Arguments, None]) -> EntryPoint[Arguments]:
-        return EntryPoint(compiled_with(template, names | {"take_earlier": earlier}, mark))
+        return EntryPoint(compiled_with(template, names, mark))
 
     return Kernels(
         declaration=declaration,
@@ -169,5 +173,5 @@ def kernels_of(
         baro=entry(baro_step),
         gps=entry(gps_step),
         run=entry(run),
-        earlier=earlier,
+        earlier=compiled_with(take_earlier, names, mark),
     )

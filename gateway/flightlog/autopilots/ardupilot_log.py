@@ -11,7 +11,9 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
-from gateway.flightlog.table.autopilot import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US, Imported
+from gateway.flightlog.table.autopilot import VELOCITY_AGE_US
+from gateway.flightlog.table.autopilot_cells import MILLI, UT_PER_GAUSS
+from gateway.flightlog.table.row import Imported
 from gateway.geometry.quaternion import from_euler
 from gateway.records import (
     NAN,

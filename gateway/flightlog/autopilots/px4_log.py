@@ -16,14 +16,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.flightlog.table.autopilot import (
-    UNIX_YEAR_2000_US,
-    UT_PER_GAUSS,
-    VELOCITY_AGE_US,
-    Imported,
-)
+from gateway.flightlog.table.autopilot import VELOCITY_AGE_US
+from gateway.flightlog.table.autopilot_cells import UNIX_YEAR_2000_US, UT_PER_GAUSS
 from gateway.flightlog.table.foreign import pressure_at_height
-from gateway.flightlog.table.row import MAX_TIME_US
+from gateway.flightlog.table.row import LARGEST_WHOLE, Imported
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,
@@ -108,7 +104,7 @@ class Px4Log:
     def _in_order(self, topic: Topic) -> Topic:
         """Sort by time, and leave out rows without one."""
         time_us = topic["timestamp"].astype(np.int64)
-        sound = (time_us > 0) & (time_us < MAX_TIME_US)
+        sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
         self.dropped += int(np.count_nonzero(~sound))
         order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
         return {name: column[order] for name, column in topic.items()}

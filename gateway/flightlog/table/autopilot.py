@@ -4,121 +4,77 @@ The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends 
 SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
 definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
 
-GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. It is not derived from
-heights, because a receiver's height jumps when it finds or loses its fix.
+GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. Heights do not tell it,
+for that of a receiver that finds or loses its fix jumps by any amount. Of what the autopilot itself
+believes (ATTITUDE, with the place known then) the last before each sample is kept.
 """
 
-import math
-from collections import namedtuple
-from collections.abc import Callable, Iterable
-from functools import cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.flightlog.tlog.payload_columns import columns_of
+from gateway.compiled.entry_point import dispatched
+from gateway.flightlog.table.autopilot_cells import (
+    UNIX_YEAR_2000_US,
+    baro_cells,
+    gps_cells,
+    imu_cells,
+    nav_cells,
+)
+from gateway.flightlog.table.cells import FloatArray
+from gateway.flightlog.table.row import BARO, COLUMNS, GPS, NAV, SI
+from gateway.flightlog.tlog.payload_columns import columns_of, layout_of
 from gateway.flightlog.tlog.tlog import Batch
 from gateway.flightlog.tlog.tlog_scan import IntArray
-from gateway.geometry.quaternion import from_euler
-from gateway.records import (
-    NAN,
-    BaroRaw,
-    GpsFix,
-    GpsFixType,
-    ImuCalibrated,
-    ImuFlags,
-    NavFlags,
-    NavState,
-    NodeId,
-    Vec3,
-)
-from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.units import US_PER_S
 
-UT_PER_GAUSS: Final = 100.0
-MILLI: Final = 1e-3
-CENTI: Final = 1e-2
-UNKNOWN_U16: Final = 65535
-MAG_FIELDS: Final = 0b111 << 6
-"""HIGHRES_IMU's bits of what is new."""
-UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
-"""Later times are civil time, earlier ones count from the start of the autopilot."""
 VELOCITY_AGE_US: Final = US_PER_S // 2
 """An older velocity down is not used."""
 
-Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
-
-_FIX_TYPES: Final = {2: GpsFixType.FIX_2D, 3: GpsFixType.FIX_3D}
-_IMU_RANK: Final = {
+ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
+POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+PRESSURE: Final = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
+FIX: Final = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT
+IMU_RANK: Final = {
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 3,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 2,
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
 }
+_WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
+_PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
+
+_BARO, _GPS, _IMU = 1, 2, 3
+"""The order of a row: what is not behind its predecessor in it begins a row."""
+_HEAD: Final = slice(0, 4)
 
 
 class AutopilotReader:
-    """Convert one vehicle's frames to records.
+    """Turn one vehicle's messages into rows of a table.
 
     Parameters
     ----------
     system_id : int or None
-        The vehicle; by default the first system that sends an IMU message.
+        Whose; the first system that sends an IMU message by default.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
         self.system_id = system_id
         self.unix_us_at_zero: int | None = None
-        """Civil time of the records' time zero, by the times of the recording."""
-        self.undecoded = 0
-        self._decoder = mavlink.MAVLink(None)
-        self._zero_us: int | None = None
+        """Civil time of the rows' time zero, by the times of the recording."""
         self._rank = 0
-        self._newest_us = 0
-        self._place: Any = None
-        """The newest GLOBAL_POSITION_INT, and when it was recorded."""
-        self._place_us = 0
-        self._waiting: tuple[Any, int, Any] | None = None
-        """The newest ATTITUDE of a batch, its time, and the place known then."""
-        self._handlers: dict[int, Callable[[Any, int], list[Imported]]] = {
-            mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
-            mavlink.MAVLINK_MSG_ID_RAW_IMU: self._milli_imu,
-            mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._milli_imu,
-            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._pressure,
-            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
-            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._position,
-            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps,
-        }
+        self._clock = np.zeros(2, np.int64)
+        """The vehicle's own time at zero, and the newest of the rows' times."""
+        self._places = np.empty(0, _PLACE)
+        self._places_us = np.empty(0, np.int64)
+        """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
+        self._state = np.full((1, NAV.stop - NAV.start), np.nan)
+        """What the autopilot believed last; NaN once a sample has it."""
+        self._open = np.empty((0, len(COLUMNS)))
+        """The row that waits for its sample, if any."""
 
-    def feed(self, frame: bytes, time_us: int) -> list[Imported]:
-        """Take the next frame of the recording.
-
-        Parameters
-        ----------
-        frame : bytes
-            A complete frame.
-        time_us : int
-            When it was recorded, µs since 1970.
-
-        Returns
-        -------
-        list of Imported
-            What it holds; nothing for most frames. Never raises on data.
-        """
-        message_id = message_id_of(frame)
-        handler = self._handlers.get(message_id)
-        if handler is None:
-            return []
-        if not self._takes(message_id, *origin_of(frame)):
-            return []
-        try:
-            message = self._decoder.decode(bytearray(frame))
-        except mavlink.MAVError:
-            self.undecoded += 1
-            return []
-        return handler(message, time_us)
-
-    def feed_batch(self, batch: Batch) -> list[Imported]:
+    def feed(self, batch: Batch) -> FloatArray:
         """Take the next records of the recording, of which every checksum was checked.
 
         Parameters
@@ -128,188 +84,169 @@ class AutopilotReader:
 
         Returns
         -------
-        list of Imported
-            As from `feed`, but of the autopilot's states only the last before each sample.
+        ndarray, shape (n, len(COLUMNS))
+            The rows that are complete now; see `gateway.flightlog.table.cells`.
         """
-        wanted = np.flatnonzero(np.isin(batch.message_ids, list(self._handlers)))
-        found: list[Imported] = []
-        for message_id, origin, time_us, message in zip(
-            batch.message_ids[wanted].tolist(),
-            batch.origins[wanted].tolist(),
-            batch.time_us[wanted].tolist(),
-            _messages(batch, wanted),
-            strict=True,
-        ):
-            if not self._takes(message_id, *divmod(origin, 256)):
-                continue
-            if message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE:
-                place = self._newest_place(time_us)
-                self._waiting = (message, self._time(message, time_us), place)
-                continue
-            if message_id in _IMU_RANK and self._waiting is not None:
-                found.append(_own_state(*self._waiting))
-                self._waiting = None
-            found += self._handlers[message_id](message, time_us)
-        return found
+        taken = self._taken(batch)
+        message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
+        fields = {
+            int(one): columns_of(batch, taken[message_ids == one], mavlink.mavlink_map[int(one)])
+            for one in np.unique(message_ids)
+        }
+        time_us = self._times(message_ids, recorded_us, fields)
+        places = self._places_at(message_ids, recorded_us, fields)
+        states = self._states_at(message_ids, time_us, places, fields)
+        return self._rows(message_ids, time_us, places, states, fields)
 
-    def _takes(self, message_id: int, system_id: int, component_id: int) -> bool:
-        """Return whether a message is of the vehicle, and no poorer than others of its kind."""
-        rank = _IMU_RANK.get(message_id, 0)
-        if self.system_id is None and rank:
-            self.system_id = system_id
-        if system_id != self.system_id or component_id != 1 or (rank and rank < self._rank):
-            return False
-        self._rank = max(rank, self._rank)
-        return True
+    def flush(self) -> FloatArray:
+        """Return the row that still waits for a sample, if any, without one."""
+        rows, self._open = self._open, self._open[:0]
+        return rows
 
-    def _time(self, message: Any, recorded_us: int) -> int:
-        """Convert a message's time to the records' clock, which never goes back."""
-        if hasattr(message, "time_usec"):
-            own_us = int(message.time_usec)
-        else:
-            own_us = int(message.time_boot_ms) * 1000
-        if own_us == 0 or own_us > UNIX_YEAR_2000_US:
-            own_us = recorded_us
-        if self._zero_us is None:
-            self._zero_us = own_us
-            self.unix_us_at_zero = recorded_us
-        elapsed_us = own_us - self._zero_us
-        if not 0 <= elapsed_us - self._newest_us <= US_PER_S:
-            # Another clock than the IMU's, or a restart: use the time of recording.
-            elapsed_us = recorded_us - (self.unix_us_at_zero or 0)
-        self._newest_us = max(self._newest_us, elapsed_us)
-        return self._newest_us
+    def _taken(self, batch: Batch) -> IntArray:
+        """Choose what is of the vehicle, and no poorer than others of its kind."""
+        wanted = np.flatnonzero(np.isin(batch.message_ids, _WANTED))
+        ranks = np.zeros(len(wanted), np.int64)
+        for message_id, rank in IMU_RANK.items():
+            ranks[batch.message_ids[wanted] == message_id] = rank
+        if self.system_id is None:
+            first = np.flatnonzero(ranks)[:1]
+            if not len(first):
+                return wanted[:0]
+            self.system_id = int(batch.origins[wanted[first[0]]]) >> 8
+            wanted, ranks = wanted[first[0] :], ranks[first[0] :]
+        own = batch.origins[wanted] == self.system_id << 8 | 1
+        wanted, ranks = wanted[own], ranks[own]
+        best = np.maximum.accumulate(np.concatenate([[self._rank], ranks]))
+        self._rank = int(best[-1])
+        taken: IntArray = wanted[(ranks == 0) | (ranks >= best[:-1])]
+        return taken
 
-    def _highres_imu(self, m: Any, recorded_us: int) -> list[Imported]:
-        time_us = self._time(m, recorded_us)
-        mag: Vec3 = (m.xmag * UT_PER_GAUSS, m.ymag * UT_PER_GAUSS, m.zmag * UT_PER_GAUSS)
-        new_mag = bool(m.fields_updated & MAG_FIELDS) and any(mag)
-        return [
-            self._imu(
-                time_us,
-                (m.xacc, m.yacc, m.zacc),
-                (m.xgyro, m.ygyro, m.zgyro),
-                mag if new_mag else None,
-                m.temperature,
-            )
-        ]
+    def _times(
+        self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
+    ) -> IntArray:
+        """Put messages on the rows' clock, which never falls."""
+        own_us = np.zeros(len(message_ids), np.int64)
+        for message_id, values in fields.items():
+            if "time_usec" in (values.dtype.names or ()):
+                told = values["time_usec"]
+                own = np.where(told > UNIX_YEAR_2000_US, 0, told).astype(np.int64)
+            else:
+                own = values["time_boot_ms"].astype(np.int64) * 1000
+            own_us[message_ids == message_id] = own
+        clocked = message_ids != POSITION
+        if self.unix_us_at_zero is None and clocked.any():
+            first = int(np.argmax(clocked))
+            self.unix_us_at_zero = int(recorded_us[first])
+            self._clock[0] = own_us[first] or recorded_us[first]
+        own_us[~clocked] = -1
+        return _on_clock(own_us, recorded_us, self.unix_us_at_zero or 0, self._clock)
 
-    def _milli_imu(self, m: Any, recorded_us: int) -> list[Imported]:
-        g, mgauss = STANDARD_GRAVITY_MPS2 * MILLI, UT_PER_GAUSS * MILLI
-        mag: Vec3 = (m.xmag * mgauss, m.ymag * mgauss, m.zmag * mgauss)
-        return [
-            self._imu(
-                self._time(m, recorded_us),
-                (m.xacc * g, m.yacc * g, m.zacc * g),
-                (m.xgyro * MILLI, m.ygyro * MILLI, m.zgyro * MILLI),
-                mag if any(mag) else None,
-                m.temperature * CENTI if getattr(m, "temperature", 0) else NAN,
-            )
-        ]
+    def _places_at(
+        self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
+    ) -> tuple[NDArray[np.void], IntArray]:
+        """Return all GLOBAL_POSITION_INT, and which was known at each message; -1 for none."""
+        is_place = message_ids == POSITION
+        known = len(self._places)
+        places = np.concatenate([self._places, fields.get(POSITION, np.empty(0, _PLACE))])
+        places_us = np.concatenate([self._places_us, recorded_us[is_place]])
+        at = np.cumsum(is_place) - 1 + known
+        if len(places):
+            is_old = np.abs(recorded_us - places_us[at]) > VELOCITY_AGE_US
+            at = np.where(is_old, -1, at)
+        self._places, self._places_us = places[-1:], places_us[-1:]
+        return places, at
 
-    def _imu(
-        self, time_us: int, accel: Vec3, gyro: Vec3, mag: Vec3 | None, temperature_degc: float
-    ) -> ImuCalibrated:
-        flags = ImuFlags.MAG_NEW if mag else ImuFlags(0)
-        node = NodeId(self.system_id or 1, 0)
-        return ImuCalibrated(time_us, node, accel, gyro, mag, temperature_degc, flags)
+    def _states_at(
+        self,
+        message_ids: IntArray,
+        time_us: IntArray,
+        places: tuple[NDArray[np.void], IntArray],
+        fields: dict[int, NDArray[np.void]],
+    ) -> FloatArray:
+        """Return what the autopilot believed at each sample; NaN where it told nothing new."""
+        is_state, is_imu = message_ids == ATTITUDE, np.isin(message_ids, [*IMU_RANK])
+        newest = np.cumsum(is_state)
+        # Of states that come one behind another the last counts; the end of all is a sample too.
+        at = np.append(newest[is_imu], newest[-1:] if len(newest) else 0)
+        before = np.concatenate([[0], at[:-1]])
+        chosen = np.flatnonzero(is_state)[at[at > before] - 1]
+        values = fields.get(ATTITUDE)
+        states = np.full((len(at), NAV.stop - NAV.start), np.nan)
+        if values is not None:
+            values = values[at[at > before] - 1]
+            states[at > before] = nav_cells(values, time_us[chosen], places[0], places[1][chosen])
+        if not at[0]:
+            states[0] = self._state[0]
+        self._state = states[-1:]
+        return states[:-1]
 
-    def _pressure(self, m: Any, recorded_us: int) -> list[Imported]:
-        time_us, node = self._time(m, recorded_us), NodeId(self.system_id or 1, 0)
-        return [BaroRaw(time_us, node, time_us, m.press_abs * PA_PER_HPA, m.temperature * CENTI)]
+    def _rows(
+        self,
+        message_ids: IntArray,
+        time_us: IntArray,
+        places: tuple[NDArray[np.void], IntArray],
+        states: FloatArray,
+        fields: dict[int, NDArray[np.void]],
+    ) -> FloatArray:
+        kinds = np.select(
+            [message_ids == PRESSURE, message_ids == FIX, np.isin(message_ids, [*IMU_RANK])],
+            [_BARO, _GPS, _IMU],
+        )
+        waiting = [k for k, group in ((_BARO, BARO), (_GPS, GPS)) if self._holds(group)]
+        order = np.concatenate([np.array(waiting, np.int64), kinds[kinds > 0]])
+        numbers = np.cumsum(np.diff(order, prepend=_IMU) <= 0)
+        row_of = np.full(len(message_ids), -1)
+        row_of[kinds > 0] = numbers[len(waiting) :] - 1
+        rows = np.full((numbers[-1] if len(numbers) else 0, len(COLUMNS)), np.nan)
+        rows[: len(self._open)] = self._open
+        for message_id, values in fields.items():
+            here = message_ids == message_id
+            row, now_us = row_of[here], time_us[here]
+            if message_id == PRESSURE:
+                rows[row, BARO] = baro_cells(values, now_us)
+            elif message_id == FIX:
+                rows[row, GPS] = gps_cells(values, now_us, places[0], places[1][here])
+            elif message_id in IMU_RANK:
+                rows[row, _HEAD], rows[row, SI] = imu_cells(message_id, values, now_us)
+        rows[row_of[kinds == _IMU], NAV] = states
+        has_sample = np.isin(np.arange(len(rows)), row_of[kinds == _IMU])
+        told_us = np.where(np.isnan(rows[:, GPS.start]), rows[:, BARO.start], rows[:, GPS.start])
+        rows[~has_sample, 0] = told_us[~has_sample]
+        whole = len(rows) - (len(rows) > 0 and not has_sample[-1])
+        self._open = rows[whole:]
+        return rows[:whole]
 
-    def _position(self, m: Any, recorded_us: int) -> list[Imported]:
-        self._place, self._place_us = m, recorded_us
-        return []
-
-    def _newest_place(self, recorded_us: int) -> Any:
-        """Return the newest GLOBAL_POSITION_INT, unless it is too old."""
-        return self._place if abs(recorded_us - self._place_us) <= VELOCITY_AGE_US else None
-
-    def _attitude(self, m: Any, recorded_us: int) -> list[Imported]:
-        """Take the autopilot's own solution, for comparison."""
-        place = self._newest_place(recorded_us)
-        return [_own_state(m, self._time(m, recorded_us), place)]
-
-    def _gps(self, m: Any, recorded_us: int) -> list[Imported]:
-        time_us = self._time(m, recorded_us)
-        fix_type = _FIX_TYPES.get(min(m.fix_type, 3), GpsFixType.NONE)
-        return [
-            GpsFix(
-                time_us=time_us,
-                node=NodeId(self.system_id or 1, 1),
-                node_time_us=time_us,
-                itow_ms=0,
-                fix_type=fix_type,
-                fix_ok=fix_type is not GpsFixType.NONE,
-                satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
-                lat_dege7=m.lat,
-                lon_dege7=m.lon,
-                alt_amsl_m=m.alt * MILLI,
-                vel_n_mps=self._velocity(m, fix_type, recorded_us),
-                alt_ellipsoid_m=m.alt_ellipsoid * MILLI if m.alt_ellipsoid else NAN,
-                h_acc_m=m.h_acc * MILLI or NAN,
-                v_acc_m=m.v_acc * MILLI or NAN,
-                speed_acc_mps=m.vel_acc * MILLI or NAN,
-                course_acc_deg=m.hdg_acc * 1e-5 or NAN,
-                pdop=_known(m.eph, CENTI),
-                utc_us=m.time_usec if m.time_usec > UNIX_YEAR_2000_US else None,
-            )
-        ]
-
-    def _velocity(self, m: Any, fix_type: GpsFixType, recorded_us: int) -> Vec3:
-        """Join speed and course of a fix with the velocity down of just before."""
-        if fix_type is GpsFixType.NONE:
-            return (NAN, NAN, NAN)
-        speed, course_rad = _known(m.vel, CENTI), math.radians(_known(m.cog, CENTI))
-        place = self._newest_place(recorded_us)
-        climbs = place is not None and fix_type is GpsFixType.FIX_3D
-        down = place.vz * CENTI if climbs else NAN
-        return (speed * math.cos(course_rad), speed * math.sin(course_rad), down)
+    def _holds(self, group: slice) -> bool:
+        return len(self._open) > 0 and not np.isnan(self._open[0, group.start])
 
 
-def _known(value: int, scale: float) -> float:
-    return NAN if value == UNKNOWN_U16 else value * scale
+@dispatched
+def _on_clock(
+    own_us: IntArray, recorded_us: IntArray, unix_us_at_zero: int, clock: IntArray
+) -> IntArray:
+    """Give each message its time since zero.
 
-
-def _own_state(m: Any, time_us: int, place: Any) -> NavState:
-    """Build a state from ATTITUDE and GLOBAL_POSITION_INT, which may be None."""
-    flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-    if place is not None:
-        flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
-    vel = (NAN,) * 3 if place is None else (place.vx, place.vy, place.vz)
-    unknown: Vec3 = (NAN, NAN, NAN)
-    return NavState(
-        time_us=time_us,
-        q_nb=from_euler(m.roll, m.pitch, m.yaw),
-        rate_b_radps=(m.rollspeed, m.pitchspeed, m.yawspeed),
-        lat_deg=NAN if place is None else place.lat * DEG_PER_DEGE7,
-        lon_deg=NAN if place is None else place.lon * DEG_PER_DEGE7,
-        alt_amsl_m=NAN if place is None else place.alt * MILLI,
-        vel_n_mps=(vel[0] * CENTI, vel[1] * CENTI, vel[2] * CENTI),
-        attitude_std_rad=unknown,
-        vel_std_mps=unknown,
-        pos_std_m=unknown,
-        flags=flags,
-    )
-
-
-@cache
-def _record_of(kind: Any) -> Callable[[Iterable[Any]], Any]:
-    fields: Any = namedtuple("Fields", kind.ordered_fieldnames)  # type: ignore[misc]
-    make: Callable[[Iterable[Any]], Any] = fields._make
-    return make
-
-
-def _messages(batch: Batch, wanted: IntArray) -> list[Any]:
-    """Return some records with their fields as attributes, as pymavlink decodes them."""
-    found: list[Any] = [None] * len(wanted)
-    message_ids = batch.message_ids[wanted]
-    for message_id in np.unique(message_ids).tolist():
-        kind = mavlink.mavlink_map[message_id]
-        make = _record_of(kind)
-        places = np.flatnonzero(message_ids == message_id)
-        rows = columns_of(batch, wanted[places], kind).tolist()
-        for place, values in zip(places.tolist(), rows, strict=True):
-            found[place] = make(values)
+    Parameters
+    ----------
+    own_us : ndarray, shape (n,)
+        By the vehicle; 0 where it tells none, less for a message that has no time.
+    recorded_us : ndarray, shape (n,)
+    unix_us_at_zero : int
+        When the first was recorded.
+    clock : ndarray, shape (2,)
+        The vehicle's time at zero, and the newest time, which is changed.
+    """
+    found = np.empty_like(own_us)
+    zero_us, newest_us = clock[0], clock[1]
+    for i in range(len(own_us)):
+        if own_us[i] >= 0:
+            told_us = recorded_us[i] if own_us[i] == 0 else own_us[i]
+            elapsed_us = told_us - zero_us
+            if not 0 <= elapsed_us - newest_us <= US_PER_S:
+                # Another clock than the IMU's, or a restart: use the time of recording.
+                elapsed_us = recorded_us[i] - unix_us_at_zero
+            newest_us = max(newest_us, elapsed_us)
+        found[i] = newest_us
+    clock[1] = newest_us
     return found

@@ -5,7 +5,10 @@ order, or two of a kind between two IMU samples, there are rows without an IMU s
 so that the file keeps every record in order.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 from gateway.records import (
@@ -23,7 +26,11 @@ from gateway.records import (
 )
 
 Cell = int | float | None
-Text = list[str]
+
+# They are the same for many rows.
+_node: Final = lru_cache(64)(NodeId)
+_imu_flags: Final = lru_cache(256)(ImuFlags)
+_nav_flags: Final = lru_cache(256)(NavFlags)
 
 HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
 RAW_COLUMNS: Final = (
@@ -59,11 +66,26 @@ NAV_COLUMNS: Final = (
 )
 COLUMNS: Final = HEAD_COLUMNS + RAW_COLUMNS + SI_COLUMNS + BARO_COLUMNS + GPS_COLUMNS + NAV_COLUMNS
 
-_RAW: Final = len(HEAD_COLUMNS)
-_SI: Final = _RAW + len(RAW_COLUMNS)
-_BARO: Final = _SI + len(SI_COLUMNS)
-_GPS: Final = _BARO + len(BARO_COLUMNS)
-_NAV: Final = _GPS + len(GPS_COLUMNS)
+
+def _columns_of(names: tuple[str, ...]) -> slice:
+    first = COLUMNS.index(names[0])
+    return slice(first, first + len(names))
+
+
+RAW: Final = _columns_of(RAW_COLUMNS)
+SI: Final = _columns_of(SI_COLUMNS)
+MAG: Final = _columns_of(("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut"))
+BARO: Final = _columns_of(BARO_COLUMNS)
+GPS: Final = _columns_of(GPS_COLUMNS)
+NAV: Final = _columns_of(NAV_COLUMNS)
+
+WHOLE_COLUMNS: Final = frozenset(
+    name
+    for name in COLUMNS
+    if name in {*HEAD_COLUMNS, *RAW_COLUMNS, "gps_fix_type", "gps_fix_ok", "gps_satellites"}
+    or name.endswith(("_us", "_node_id", "_dege7", "_itow_ms", "_flags"))
+)
+"""Those that hold whole numbers."""
 
 _NO_RAW: Final = (None,) * len(RAW_COLUMNS)
 _NO_SI: Final = (None,) * len(SI_COLUMNS)
@@ -73,8 +95,9 @@ _NO_NAV: Final = (None,) * len(NAV_COLUMNS)
 _NO_VECTOR: Final = (None, None, None)
 
 
-MAX_TIME_US: Final = 1 << 53
-"""Three centuries; a larger value is an error, and other programs would round it."""
+LARGEST_WHOLE: Final = 1 << 53
+"""Up to here every whole number is a float. As a time it is three centuries; a clock that says more
+is broken, and other programs round such a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,33 +132,38 @@ def cells_of(row: TableRow) -> tuple[Cell, ...]:
     )
 
 
-def row_from_cells(cells: Text, vehicle_id: int) -> TableRow:
-    """Read a row from the texts of its cells, in the order of `COLUMNS`.
+def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
+    """Make a row of the numbers of its cells, in the order of `COLUMNS`.
 
-    Raises
-    ------
-    ValueError
-        If a cell is not a number, or a required one is empty.
+    Parameters
+    ----------
+    cells : sequence of float
+        NaN for an empty one; as `settle` leaves them.
+    vehicle_id : int
+        Of the aircraft.
     """
     time_us = int(cells[0])
-    flags = ImuFlags(int(cells[3] or 0))
-    row = TableRow(
+    has_raw, has_si = (not math.isnan(cells[group.start]) for group in (RAW, SI))
+    flags = _imu_flags(int(cells[3])) if has_raw or has_si else ImuFlags(0)
+    return TableRow(
         time_us=time_us,
-        baro=_read_baro(cells[_BARO:_GPS], vehicle_id) if cells[_BARO] else None,
-        gps=_read_gps(cells[_GPS:_NAV], vehicle_id) if cells[_GPS] else None,
-        raw=_read_raw(cells, time_us, vehicle_id, flags) if cells[_RAW] else None,
-        imu=_read_si(cells, time_us, vehicle_id, flags) if cells[_SI] else None,
-        state=_read_nav(cells[_NAV:]) if cells[_NAV] else None,
+        baro=baro_of_cells(cells[BARO], vehicle_id),
+        gps=fix_of_cells(cells[GPS], vehicle_id),
+        raw=_read_raw(cells, time_us, vehicle_id, flags) if has_raw else None,
+        imu=_read_si(cells, time_us, vehicle_id, flags) if has_si else None,
+        state=state_of_cells(cells[NAV]),
     )
-    check_times(row)
-    return row
 
 
 def check_times(row: TableRow) -> None:
     """Check that all times of a row are possible; raises ValueError if not."""
     for record in (row, row.baro, row.gps, row.state):
-        if record is not None and not -MAX_TIME_US <= record.time_us <= MAX_TIME_US:
+        if record is not None and abs(record.time_us) > LARGEST_WHOLE:
             raise ValueError(f"{record.time_us} us is no time of a flight")
+
+
+Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
+"""What the log of another program holds."""
 
 
 class RowBuilder:
@@ -243,21 +271,17 @@ def _nav_cells(state: NavState) -> tuple[Cell, ...]:
     )
 
 
-def _number(text: str) -> float:
-    return float(text) if text else float("nan")
-
-
-def _vector(cells: Text) -> Vec3:
+def _vector(cells: Sequence[float]) -> Vec3:
     x, y, z = cells
-    return (_number(x), _number(y), _number(z))
+    return (x, y, z)
 
 
-def _read_raw(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuRaw:
-    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, *ranges = map(int, cells[_RAW:_SI])
+def _read_raw(cells: Sequence[float], time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuRaw:
+    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, *ranges = map(int, cells[RAW])
     accel_range_g, gyro_range_dps, mag_lsb_per_gauss = ranges
     return ImuRaw(
         time_us=time_us,
-        node=NodeId(vehicle_id, int(cells[1])),
+        node=_node(vehicle_id, int(cells[1])),
         node_time_us=int(cells[2]),
         accel_raw=(ax, ay, az),
         gyro_raw=(gx, gy, gz),
@@ -270,64 +294,75 @@ def _read_raw(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> Im
     )
 
 
-def _read_si(cells: Text, time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuCalibrated:
-    si = cells[_SI:_BARO]
+def _read_si(
+    cells: Sequence[float], time_us: int, vehicle_id: int, flags: ImuFlags
+) -> ImuCalibrated:
+    si = cells[SI]
     return ImuCalibrated(
         time_us=time_us,
-        node=NodeId(vehicle_id, int(cells[1] or 0)),
+        node=_node(vehicle_id, int(cells[1])),
         accel_b_mps2=_vector(si[0:3]),
         gyro_b_radps=_vector(si[3:6]),
-        mag_b_ut=_vector(si[6:9]) if si[6] else None,
-        temperature_degc=_number(si[9]),
+        mag_b_ut=None if math.isnan(si[6]) else _vector(si[6:9]),
+        temperature_degc=si[9],
         flags=flags,
     )
 
 
-def _read_baro(cells: Text, vehicle_id: int) -> BaroRaw:
+def baro_of_cells(cells: Sequence[float], vehicle_id: int) -> BaroRaw | None:
+    """Make a payload of the cells of `BARO_COLUMNS`; None where they are empty."""
+    if math.isnan(cells[0]):
+        return None
     return BaroRaw(
         time_us=int(cells[0]),
-        node=NodeId(vehicle_id, int(cells[1])),
+        node=_node(vehicle_id, int(cells[1])),
         node_time_us=int(cells[2]),
-        pressure_pa=_number(cells[3]),
-        temperature_degc=_number(cells[4]),
+        pressure_pa=cells[3],
+        temperature_degc=cells[4],
     )
 
 
-def _read_gps(cells: Text, vehicle_id: int) -> GpsFix:
+def fix_of_cells(cells: Sequence[float], vehicle_id: int) -> GpsFix | None:
+    """Make a fix of the cells of `GPS_COLUMNS`; None where they are empty."""
+    if math.isnan(cells[0]):
+        return None
     return GpsFix(
         time_us=int(cells[0]),
-        node=NodeId(vehicle_id, int(cells[1])),
+        node=_node(vehicle_id, int(cells[1])),
         node_time_us=int(cells[2]),
         itow_ms=int(cells[3]),
         fix_type=GpsFixType(int(cells[4])),
-        fix_ok=cells[5] == "1",
+        fix_ok=cells[5] == 1.0,
         satellites=int(cells[6]),
         lat_dege7=int(cells[7]),
         lon_dege7=int(cells[8]),
-        alt_amsl_m=_number(cells[9]),
+        alt_amsl_m=cells[9],
         vel_n_mps=_vector(cells[10:13]),
-        alt_ellipsoid_m=_number(cells[13]),
-        h_acc_m=_number(cells[14]),
-        v_acc_m=_number(cells[15]),
-        speed_acc_mps=_number(cells[16]),
-        course_acc_deg=_number(cells[17]),
-        pdop=_number(cells[18]),
-        utc_us=int(cells[19]) if cells[19] else None,
+        alt_ellipsoid_m=cells[13],
+        h_acc_m=cells[14],
+        v_acc_m=cells[15],
+        speed_acc_mps=cells[16],
+        course_acc_deg=cells[17],
+        pdop=cells[18],
+        utc_us=None if math.isnan(cells[19]) else int(cells[19]),
     )
 
 
-def _read_nav(cells: Text) -> NavState:
-    w, x, y, z = map(_number, cells[1:5])
+def state_of_cells(cells: Sequence[float]) -> NavState | None:
+    """Make a state of the cells of `NAV_COLUMNS`; None where they are empty."""
+    if math.isnan(cells[0]):
+        return None
+    w, x, y, z = cells[1:5]
     return NavState(
         time_us=int(cells[0]),
         q_nb=(w, x, y, z),
         rate_b_radps=_vector(cells[5:8]),
-        lat_deg=_number(cells[8]),
-        lon_deg=_number(cells[9]),
-        alt_amsl_m=_number(cells[10]),
+        lat_deg=cells[8],
+        lon_deg=cells[9],
+        alt_amsl_m=cells[10],
         vel_n_mps=_vector(cells[11:14]),
         attitude_std_rad=_vector(cells[14:17]),
         vel_std_mps=_vector(cells[17:20]),
         pos_std_m=_vector(cells[20:23]),
-        flags=NavFlags(int(cells[23])),
+        flags=_nav_flags(int(cells[23])),
     )

@@ -16,12 +16,29 @@ with `#` hold JSON; spreadsheets and pandas (`comment="#"`) skip them. An empty 
 known, or nothing new.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
-from gateway.flightlog.table.row import COLUMNS, TableRow, row_from_cells, row_to_line
+from gateway.flightlog.table.cells import (
+    FloatArray,
+    read_cells,
+    read_lines,
+    settle,
+    write_lines,
+)
+from gateway.flightlog.table.row import (
+    COLUMNS,
+    Cell,
+    TableRow,
+    cells_of,
+    row_of_cells,
+    row_to_line,
+)
 from gateway.records import FusionState, NodeStatus
 
 FORMAT_PREFIX: Final = "# mavgate table "
@@ -56,6 +73,8 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """The calibration of the aircraft's IMU node."""
 
 
+IntArray = NDArray[np.int64]
+
 REMARK: Final = "Mark: "
 """Begin of the STATUSTEXT with an operator's remark."""
 
@@ -76,6 +95,12 @@ class TableFault:
     size: int
     reason: str
 
+
+_COMMENTS: Final[dict[str, Any]] = {
+    MARK_PREFIX: TableMark,
+    NODE_PREFIX: NodeStatus,
+    STATE_PREFIX: FusionState,
+}
 
 TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
 """A header here is one after rows: the settings were changed."""
@@ -121,6 +146,60 @@ def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeSt
             return encode_node(event)
 
 
+TableComment = TableHeader | TableMark | TableFault | FusionState | NodeStatus
+"""What stands between rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableBlock:
+    """Rows of a stretch of a table as columns, and what stands between them."""
+
+    cells: FloatArray
+    """Shape (n, len(COLUMNS)); NaN is an empty cell."""
+    comments: tuple[tuple[int, TableComment], ...] = ()
+    """In the order of the file, each with the number of the row before which it stands: up to n."""
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def events(self, vehicle_id: int) -> Iterator[TableEvent]:
+        """Yield rows and what stands between them, one by one, as of this aircraft."""
+        begin = 0
+        for row, comment in (*self.comments, (len(self), None)):
+            for cells in self.cells[begin:row].tolist():
+                yield row_of_cells(cells, vehicle_id)
+            begin = row
+            if comment is not None:
+                yield comment
+
+
+def block_of(events: Iterable[TableEvent]) -> TableBlock:
+    """Lay rows, and what stands between them, out as columns."""
+    rows: list[tuple[Cell, ...]] = []
+    comments: list[tuple[int, TableComment]] = []
+    for event in events:
+        if isinstance(event, TableRow):
+            rows.append(cells_of(event))
+        else:
+            comments.append((len(rows), event))
+    cells = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return TableBlock(cells, tuple(comments))
+
+
+def encode_block(block: TableBlock) -> bytes:
+    """Write rows and what stands between them, but for faults."""
+    text, begin = b"", 0
+    for row, comment in (*block.comments, (len(block), None)):
+        text += write_lines(block.cells[begin:row])
+        begin = row
+        if comment is not None and not isinstance(comment, TableFault):
+            text += encode_line(comment).encode()
+    return text
+
+
+NO_ROWS: Final = np.empty((0, len(COLUMNS)))
+
+
 class TableReader:
     """Decode any chunks of a table into rows, marks and faults; never raises on data.
 
@@ -137,7 +216,19 @@ class TableReader:
         self._width = 0
         self._places: list[int] | None = None
 
+    @property
+    def vehicle_id(self) -> int:
+        """The aircraft of the table; 1 where it does not tell."""
+        return 1 if self.header is None else self.header.vehicle_id
+
     def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
+        """Take the next bytes of the file, and return what is in them one by one.
+
+        See `feed_block`.
+        """
+        return [*self.feed_block(data, final=final).events(self.vehicle_id)]
+
+    def feed_block(self, data: bytes, *, final: bool = False) -> TableBlock:
         """Take the next bytes of the file.
 
         Parameters
@@ -150,62 +241,108 @@ class TableReader:
 
         Returns
         -------
-        list of TableEvent
-            In the order of the file.
+        TableBlock
+            All that came in whole lines.
         """
-        *lines, rest = (self._rest + data).split(b"\n")
-        events = [event for line in lines if (event := self._take(line)) is not None]
-        if len(rest) > MAX_LINE or (self._skipped and not lines):
+        text, newline, rest = (self._rest + data).rpartition(b"\n")
+        block = self._take(text + newline) if newline else TableBlock(NO_ROWS)
+        if len(rest) > MAX_LINE or (self._skipped and not newline):
             self._skipped += len(rest)
             rest = b""
         self._rest = rest
         if final and (rest or self._skipped):
             self.lines += 1
             size = self._skipped + len(rest)
-            events.append(TableFault(self.lines, size, "the line has no end"))
-        return events
+            cut = TableFault(self.lines, size, "the line has no end")
+            block = TableBlock(block.cells, (*block.comments, (len(block), cut)))
+        return block
 
-    def _take(self, line: bytes) -> TableEvent | None:
-        self.lines += 1
-        size, self._skipped = self._skipped + len(line) + 1, 0
-        if size > len(line) + 1:
-            return TableFault(self.lines, size, "the line is too long")
+    def _take(self, text: bytes) -> TableBlock:
+        """Take whole lines: all at once where they are rows alone."""
+        if self._width and not self._skipped and b"#" not in text:
+            cells = self._read(text)
+            if cells is not None and not settle(cells):
+                self.lines += len(cells)
+                return TableBlock(cells)
+        rows: list[bytes] = []
+        places: list[int] = []
+        comments: list[tuple[int, TableComment]] = []
+        for line in text.split(b"\n")[:-1]:
+            self.lines += 1
+            size, self._skipped = self._skipped + len(line) + 1, 0
+            if size > len(line) + 1:
+                comments.append((self.lines, TableFault(self.lines, size, "the line is too long")))
+            elif self._width and line.rstrip(b"\r") and not line.startswith(b"#"):
+                rows.append(line)
+                places.append(self.lines)
+            elif (comment := self._take_other(line)) is not None:
+                comments.append((self.lines, comment))
+        return self._joined(rows, np.array(places, np.int64), comments)
+
+    def _joined(
+        self, rows: list[bytes], lines: IntArray, comments: list[tuple[int, TableComment]]
+    ) -> TableBlock:
+        """Read rows, and put what is none of them to where it stands by the numbers of lines."""
+        if not rows:
+            return TableBlock(NO_ROWS, tuple((0, comment) for _, comment in comments))
+        text = b"\n".join([*rows, b""])
+        cells = self._read(text.replace(b"\r\n", b"\n") if b"\r" in text else text)
+        faults: dict[int, str] = {}
+        if cells is None:
+            cells, faults = self._read_singly(rows)
+        faults = {**settle(cells), **faults}
+        for row, reason in faults.items():
+            number = int(lines[row])
+            comments.append((number, TableFault(number, len(rows[row]) + 1, reason)))
+        sound = np.delete(lines, [*faults])
+        comments.sort(key=lambda placed: placed[0])
+        at = np.searchsorted(sound, [number for number, _ in comments]).tolist()
+        placed = zip(at, (comment for _, comment in comments), strict=True)
+        return TableBlock(np.delete(cells, [*faults], axis=0), tuple(placed))
+
+    def _read(self, text: bytes) -> FloatArray | None:
+        cells = read_lines(text, self._width)
+        if cells is None or self._places is None:
+            return cells
+        # The last column is none of the file's.
+        return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._places]
+
+    def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
+        """Read rows of which some are none: those are told, and stay empty."""
+        cells = np.full((len(rows), len(COLUMNS)), np.nan)
+        faults: dict[int, str] = {}
+        for row, line in enumerate(rows):
+            try:
+                cells[row] = read_cells(line.rstrip(b"\r"), self._width, self._places)
+            except ValueError as error:
+                faults[row] = str(error)
+        return cells, faults
+
+    def _take_other(self, line: bytes) -> TableComment | None:
+        """Take a line that is no row: of the head, empty, or between rows."""
         try:
-            text = line.decode("utf-8-sig" if self.lines == 1 else "utf-8").rstrip("\r")
-            if text.startswith("#"):
-                return self._take_comment(text)
-            if not text:
-                return None
-            return self._take_cells(text.split(","))
-        except (ValueError, msgspec.DecodeError) as error:
-            return TableFault(self.lines, size, str(error))
+            return self._read_other(line)
+        except ValueError as error:
+            return TableFault(self.lines, len(line) + 1, str(error))
 
-    def _take_comment(self, text: str) -> TableMark | TableHeader | FusionState | NodeStatus | None:
-        if text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
+    def _read_other(self, line: bytes) -> TableComment | None:
+        text = line.decode("utf-8-sig" if self.lines == 1 else "utf-8").rstrip("\r")
+        if text and not text.startswith("#"):
+            self._take_names(text.split(","))
+        elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
             version = text.removeprefix(FORMAT_PREFIX)
             raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
-        if text.startswith(MARK_PREFIX):
-            return msgspec.json.decode(text.removeprefix(MARK_PREFIX), type=TableMark)
-        if text.startswith(NODE_PREFIX):
-            return msgspec.json.decode(text.removeprefix(NODE_PREFIX), type=NodeStatus)
-        if text.startswith(STATE_PREFIX):
-            return msgspec.json.decode(text.removeprefix(STATE_PREFIX), type=FusionState)
-        if text.startswith(HEADER_PREFIX):
+        elif text.startswith(HEADER_PREFIX):
             header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
             if self.header is not None:
                 return header
             self.header = header
+        else:
+            for prefix, kind in _COMMENTS.items():
+                if text.startswith(prefix):
+                    found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)
+                    return found
         return None
-
-    def _take_cells(self, cells: list[str]) -> TableRow | None:
-        if not self._width:
-            self._take_names(cells)
-            return None
-        if len(cells) != self._width:
-            raise ValueError(f"{len(cells)} cells where there should be {self._width}")
-        if self._places is not None:
-            cells = [cells[place] if place >= 0 else "" for place in self._places]
-        return row_from_cells(cells, self.header.vehicle_id if self.header else 1)
 
     def _take_names(self, names: list[str]) -> None:
         if "time_us" not in names:

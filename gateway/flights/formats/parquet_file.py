@@ -15,18 +15,18 @@ import pyarrow.parquet as pq
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.disk.recording_streams import GZIP, read_chunks
-from gateway.flightlog.table.row import COLUMNS, HEAD_COLUMNS, RAW_COLUMNS, TableRow, cells_of
+from gateway.flightlog.table.row import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
 from gateway.flightlog.table.table import (
     FORMAT_LINE,
     HEADER_PREFIX,
-    TableEvent,
+    TableBlock,
     TableReader,
     encode_header,
     encode_line,
 )
 from gateway.flights.formats.decoded import decoded
 from gateway.flights.formats.pieces import Pieces
-from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_events
+from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_blocks
 from gateway.flights.writing import FlightToWrite
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import origin_of
@@ -46,8 +46,6 @@ UNITS: Final = {
     "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
 }  # fmt: skip
 """By the ending of a column's name."""
-WHOLE: Final = {*HEAD_COLUMNS, *RAW_COLUMNS, "gps_fix_type", "gps_satellites", "nav_flags"}
-WHOLE_ENDINGS: Final = ("_us", "_node_id", "_dege7", "_itow_ms")
 TRUTHS: Final = {"gps_fix_ok"}
 
 _TYPES: Final = {
@@ -69,17 +67,17 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a table that was written here; raises FlightError if it is not one."""
     reader = TableReader()
 
-    def events() -> Iterator[TableEvent]:
+    def blocks() -> Iterator[TableBlock]:
         try:
             for text in _lines(path, options):
-                yield from reader.feed(text.encode())
+                yield reader.feed_block(text)
         except (pa.ArrowException, OSError) as error:
             # An error of the operating system has a number, one of the library has none.
             if getattr(error, "errno", None) is not None:
                 raise
             raise FlightError(f"{path}: cannot be read as Parquet: {error}") from error
 
-    return table_of_events(path, reader, events())
+    return table_of_blocks(path, reader, blocks())
 
 
 def _write_table(table: RecordedTable) -> Iterator[bytes]:
@@ -119,7 +117,7 @@ def _writer(pieces: Pieces, schema: pa.Schema) -> pq.ParquetWriter:
 def _column(name: str) -> pa.Field:
     if name in TRUTHS:
         kind = pa.bool_()
-    elif name in WHOLE or name.endswith(WHOLE_ENDINGS):
+    elif name in WHOLE_COLUMNS:
         kind = pa.int64()
     else:
         kind = pa.float64()
@@ -139,8 +137,8 @@ def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _lines(path: Path, options: ReadOptions) -> Iterator[str]:
-    """Yield the lines of the CSV that the file was made of."""
+def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
+    """Yield the lines of the CSV that the file was made of, many at once."""
     packed = io.BytesIO(b"".join(read_chunks(path))) if path.suffix == GZIP else path
     with pq.ParquetFile(packed, page_checksum_verification=True) as file:
         known = file.schema_arrow.metadata or {}
@@ -148,8 +146,8 @@ def _lines(path: Path, options: ReadOptions) -> Iterator[str]:
         if "time_us" not in names:
             raise FlightError(f"{path}: has no column time_us, so it is no table of mavgate's")
         if HEADER in known:
-            yield f"{FORMAT_LINE}\n{HEADER_PREFIX}{known[HEADER].decode()}\n"
-        yield ",".join(names) + "\n"
+            yield f"{FORMAT_LINE}\n{HEADER_PREFIX}{known[HEADER].decode()}\n".encode()
+        yield (",".join(names) + "\n").encode()
         wanted = [*names, *({COMMENTS} & set(file.schema_arrow.names))]
         total, size = max(file.metadata.num_rows, 1), path.stat().st_size
         for batch in file.iter_batches(ROWS // 4, columns=wanted):
@@ -157,11 +155,14 @@ def _lines(path: Path, options: ReadOptions) -> Iterator[str]:
             comments: Iterable[str | None] = [None] * batch.num_rows
             if len(columns) > len(names):
                 comments = columns.pop()
-            for comment, cells in zip(comments, zip(*columns, strict=True), strict=True):
-                yield (comment or "") + ",".join(map(_text, cells)) + "\n"
+            rows = zip(comments, zip(*columns, strict=True), strict=True)
+            lines = (
+                (comment or "") + ",".join(map(_text, cells)) + "\n" for comment, cells in rows
+            )
+            yield "".join(lines).encode()
             if options.progress is not None:
                 options.progress(size * batch.num_rows // total)
-        yield (file.metadata.metadata or {}).get(END.encode(), b"").decode()
+        yield (file.metadata.metadata or {}).get(END.encode(), b"")
 
 
 def _text(cell: Any) -> str:

@@ -14,12 +14,13 @@ from gateway.analysis.case import Case, make_case
 from gateway.analysis.flight_arrays import Flight, FusionSettings, flight_of_records
 from gateway.analysis.fusion import fuse_states
 from gateway.analysis.key_figures import summarise, withheld_error_m
-from gateway.analysis.sources import flight_of_rows
+from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.contest import Axis, SweepError, Trials, base_score, grid, make_contest
 from gateway.edges.disk.recordings import recording_name
 from gateway.flights.describing import describe
 from gateway.flights.fused_rows import fused_lines
-from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, joined_rows, open_rows
+from gateway.flights.joined import joined_tables
+from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, open_rows
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.replay import header_for
 from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
@@ -214,11 +215,11 @@ class ReadFlight:
 
 def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
-    table = joined_rows([open_rows(file, options) for file in files])
+    table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_of(table, options)
     fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
-    flight = flight_of_rows(
-        table.plain_rows, aircraft.calibration, fusion, name=name, story="One of a season."
+    flight = flight_of_blocks(
+        table.blocks, aircraft.calibration, fusion, name=name, story="One of a season."
     )
     known = table.header
     header = msgspec.structs.replace(

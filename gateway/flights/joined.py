@@ -1,0 +1,115 @@
+"""Tables of one aircraft behind one another, cut and moved in time."""
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+
+from gateway.flightlog.moment import Moment, place_in
+from gateway.flightlog.table.cells import TIMES, BoolArray
+from gateway.flightlog.table.table import (
+    NO_ROWS,
+    TableBlock,
+    TableComment,
+    TableHeader,
+    TableMark,
+)
+from gateway.flightlog.tlog.stamps import JUMP_US
+from gateway.flights.reading import FlightError, RecordedTable
+from gateway.records import FusionState, NodeStatus
+
+Limits = tuple[Moment | None, Moment | None]
+
+
+def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
+    """Put tables of one aircraft behind one another on the clock of the first.
+
+    Parts of one recording share a clock; other recordings are put in their place by civil time.
+
+    Raises
+    ------
+    FlightError
+        If they are of several aircraft.
+    """
+    vehicles = sorted({table.header.vehicle_id for table in tables})
+    if len(vehicles) > 1:
+        listed = " and ".join(map(str, vehicles))
+        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
+    first = tables[0].header
+    remarks: list[str] = []
+
+    def blocks() -> Iterator[TableBlock]:
+        known = first
+        for table in tables:
+            header = table.header
+            if (header.settings, header.calibration) != (known.settings, known.calibration):
+                yield TableBlock(NO_ROWS, ((0, header),))
+            for block in table.blocks:
+                for _, comment in block.comments:
+                    known = comment if isinstance(comment, TableHeader) else known
+                yield shifted(block, _shift_us(header, first))
+            remarks.extend(table.remarks)
+
+    return RecordedTable(first, blocks(), remarks)
+
+
+def _shift_us(header: TableHeader, first: TableHeader) -> int:
+    """Return how far two clocks are apart; the parts of a recording have one, by whatever name."""
+    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
+        return 0
+    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
+    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
+
+
+def shifted(block: TableBlock, shift_us: int) -> TableBlock:
+    """Move rows and all that they hold in time; a state holds times of its own and is left out."""
+    if not shift_us:
+        return block
+    cells = block.cells.copy()
+    cells[:, TIMES] += shift_us
+    kept = ((k, c) for k, c in block.comments if not isinstance(c, FusionState))
+    return TableBlock(cells, tuple((k, _moved(c, shift_us)) for k, c in kept))
+
+
+def _moved(comment: TableComment, shift_us: int) -> TableComment:
+    if isinstance(comment, TableMark | NodeStatus):
+        return msgspec.structs.replace(comment, time_us=comment.time_us + shift_us)
+    return comment
+
+
+def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
+    """Cut a table at its begin and end, each a moment or None."""
+    begin, end = limits
+    zero_us = table.header.unix_us_at_zero or 0
+
+    def blocks() -> Iterator[TableBlock]:
+        first_us: int | None = None
+        begun = begin is None
+        for block in table.blocks:
+            times_us = zero_us + block.cells[:, 0]
+            if first_us is None and len(block):
+                first_us = int(times_us[0])
+            start, stop, was_begun = 0, len(block), begun
+            if end is not None and first_us is not None:
+                stop = _first(times_us > place_in(end, first_us))
+            if not begun and begin is not None and first_us is not None:
+                start = _first(times_us[:stop] >= place_in(begin, first_us))
+                begun = start < stop
+            # What was changed before the begin still holds, but a state from there does not.
+            comments = tuple(
+                (max(k - start, 0), c)
+                for k, c in block.comments
+                if k <= stop and (was_begun or (begun and k > start) or isinstance(c, TableHeader))
+            )
+            yield TableBlock(block.cells[start:stop], comments)
+            if stop < len(block):
+                return
+
+    cold_start = table.header.cold_start and begin is None
+    return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), blocks())
+
+
+def _first(where: BoolArray) -> int:
+    """Return the number of the first that is true, or how many there are."""
+    found = np.flatnonzero(where)
+    return int(found[0]) if len(found) else len(where)

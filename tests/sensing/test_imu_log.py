@@ -1,0 +1,64 @@
+"""Many payloads at once are calibrated and filtered to the bits that they have one by one."""
+
+import numpy as np
+import pytest
+
+from gateway.records import ImuFlags, ImuRaw, NodeId
+from gateway.sensing.calibration import MAG_OVERFLOW, NodeCalibration
+from gateway.sensing.chain import SensingSettings, SensorChain
+
+NODE = NodeId(1, 0)
+CALIBRATION = NodeCalibration(
+    accel_bias_mps2=(0.1, -0.2, 0.3),
+    accel_matrix=((1.01, 0.02, 0.0), (0.0, 0.99, 0.01), (0.03, 0.0, 1.02)),
+    gyro_bias_radps=(0.01, 0.02, -0.03),
+    mag_hard_iron_ut=(3.0, -4.0, 5.0),
+)
+
+
+def payloads(seed: int) -> list[ImuRaw]:
+    """Make payloads of all ranges and flags, with gaps, overflows and clocks that go back."""
+    rng = np.random.default_rng(seed)
+    found, time_us = [], 0
+    for _ in range(400):
+        time_us += int(rng.choice([10_000, 10_000, 10_000, 20_000, 0, -5_000, 700_000]))
+        mag = tuple(rng.choice([-300, 200, 5, MAG_OVERFLOW], 3, p=[0.4, 0.3, 0.25, 0.05]).tolist())
+        found.append(
+            ImuRaw(
+                time_us=time_us,
+                node=NODE,
+                node_time_us=time_us,
+                accel_raw=tuple(rng.integers(-32768, 32768, 3).tolist()),
+                gyro_raw=tuple(rng.integers(-32768, 32768, 3).tolist()),
+                mag_raw=mag,
+                temperature_raw=int(rng.integers(-4000, 4000)),
+                accel_range_g=int(rng.choice([2, 4, 8, 16])),
+                gyro_range_dps=int(rng.choice([250, 500, 1000, 2000, 125, 0])),
+                mag_lsb_per_gauss=int(rng.choice([1090, 820, 0])),
+                flags=ImuFlags(int(rng.integers(0, 256))),
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_same_bits(seed: int) -> None:
+    raws = payloads(seed)
+    settings = SensingSettings(gyro_highpass_hz=0.1)
+    one, many = (SensorChain(settings, CALIBRATION) for _ in range(2))
+    expected = [one.imu(raw) for raw in raws]
+    counts = np.array(
+        [
+            (*r.accel_raw, *r.gyro_raw, *r.mag_raw, r.temperature_raw, r.accel_range_g,
+             r.gyro_range_dps, r.mag_lsb_per_gauss)
+            for r in raws
+        ],
+        np.float64,
+    )  # fmt: skip
+    flags = np.array([int(raw.flags) for raw in raws])
+    found = []
+    for part in (slice(0, 7), slice(7, 8), slice(8, 8), slice(8, None)):
+        time_us = np.array([raw.time_us for raw in raws[part]], np.int64)
+        found += many.imu_log(time_us, counts[part], flags[part]).samples()
+    assert repr(found) == repr(expected)
+    assert many.snapshot() == one.snapshot()
