@@ -1,30 +1,39 @@
 """Measure work on many recordings: one after the other, in processes, on a Dask cluster.
 
-    python tools/bench_batch.py make                     # simulated recordings; --quick: short ones
-    python tools/bench_batch.py fuse --by serial         # or processes, or dask
-    python tools/bench_batch.py report --by processes --flights 6
-    python tools/bench_batch.py sweep --by processes
-    python tools/bench_batch.py growth                   # cost against the number of recordings
-    python tools/bench_batch.py hangar                   # a catalogue of 10,000
+    python tools/bench_batch.py                        # all of it, in some 20 minutes
+    python tools/bench_batch.py fuse --flights 24      # or report, sweep: serial beside processes
+    python tools/bench_batch.py dask --flights 24      # fuse: a cluster of two beside processes
+    python tools/bench_batch.py growth --flights 200   # cost and memory against the number of files
+    python tools/bench_batch.py hangar --files 10000   # a catalogue: index, index again, ask
+    python tools/bench_batch.py --quick                # all of it with few, short flights
 
-The recordings lie in --folder and stay there, so each part can be run by itself. Times are wall
-clock and CPU of all processes; memory is that of the largest process. What a cluster costs to start
-is told apart.
+Recordings are simulated once and stay in --folder. Each measurement has a fresh process of its own,
+so that memory is that of this work alone. `start` is what is paid once: to load or compile the
+estimators, to start a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
 """
 
 import argparse
+import multiprocessing
 import os
 import resource
 import shutil
-import statistics
+import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
+from statistics import median
+from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 
 from gateway.aircraft import AircraftSettings
+from gateway.analysis.processes import cores
 from gateway.analysis.sources import ideal_calibration
 from gateway.analysis.tuning.contest import parse_axis
 from gateway.flightlog.table.row import TableRow, row_to_line
@@ -34,18 +43,12 @@ from gateway.pipeline import PipelineSettings
 from gateway.records import BaroRaw, GpsFix, ImuRaw
 from gateway.replay import header_for
 from gateway.season.batch.dask_executor import DaskCluster
-from gateway.season.batch.flight_tasks import (
-    FlightTask,
-    FuseTask,
-    ReportTask,
-    SweepTask,
-    warm_up,
-)
+from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, SweepTask, warm_up
 from gateway.season.batch.result_folder import ResultFolder
-from gateway.season.batch.season_run import run_season
+from gateway.season.batch.season_run import LOOKING, run_season
 from gateway.season.batch.storage import items_of
 from gateway.season.executors import Executor, LocalProcesses
-from gateway.season.hangar.hangar_file import HANGAR_NAME, find_flights
+from gateway.season.hangar.hangar_file import HANGAR_NAME, find_flights, geojson_of
 from gateway.season.hangar.indexing import index_folder
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
@@ -56,48 +59,225 @@ from gateway.wire.link import Link
 
 SEEDS = 4
 """Different flights; the others are these under another aircraft and day."""
+WORKERS = 2
+SHORT_S = 60.0
+CATALOGUED_S = 10.0
 DAY_0_US = 1_780_000_000 * US_PER_S
 DAY_US = 86_400 * US_PER_S
 OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
-QUERIES = ("", "duration > 3 and loss > 0.05", "vehicle = 2 and began >= '2026-09-01'")
+QUERIES = (
+    "duration > 3 and loss > 0.01",
+    "vehicle = 2 and began >= '2030-01-01'",
+    "lat_min > -8 and lat_max < -7 and began like '2027%'",
+    "gps_outages > 0 or faults > 0",
+    "error is not null",
+)
+SHARE = {"fuse": 1, "report": 16, "sweep": 4}
+"""Of the flights that are fused, `all` reports and sweeps one in so many."""
+BROKEN = 100
+"""One file in so many of the catalogue is broken."""
+ROW = "{:<8} {:<10} {:>7} {:>7} {:>8} {:>8} {:>9} {:>9} {:>9} {:>8}"
+HEAD = ("part", "by", "flights", "failed", "start, s", "wall, s", "s/flight", "CPU, s", "worker MB",
+        "here MB")  # fmt: skip
+PARTS = ("all", "make", "fuse", "report", "sweep", "dask", "growth", "hangar")
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 def main() -> None:
-    """Run one part."""
+    """Run one part, or all."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", choices=("make", "fuse", "report", "sweep", "growth", "hangar"))
-    parser.add_argument("--folder", type=Path, default=Path("/tmp/mavgate-season"))
-    parser.add_argument("--flights", type=int, default=24)
-    parser.add_argument("--files", type=int, default=10_000, help="of the catalogue")
-    parser.add_argument("--by", choices=("serial", "processes", "dask"), default="processes")
-    parser.add_argument("--quick", action="store_true", help="flights of 60 s, fewer of them")
+    parser.add_argument("part", nargs="?", choices=PARTS, default="all")
+    parser.add_argument(
+        "--folder", type=Path, default=Path(tempfile.gettempdir(), "mavgate-season")
+    )
+    parser.add_argument("--flights", type=int, help="recordings; `all` reports and sweeps fewer")
+    parser.add_argument("--files", type=int, help="of the catalogue")
+    parser.add_argument("--quick", action="store_true", help="few flights, of 60 s")
     chosen = parser.parse_args()
-    folder = chosen.folder / ("quick" if chosen.quick else "full")
-    match chosen.part:
-        case "make":
-            make(folder / "flights", chosen.flights, 60.0 if chosen.quick else FLIGHT_S)
-        case "hangar":
-            hangar(folder, 500 if chosen.quick else chosen.files)
-        case "growth":
-            growth(folder, chosen.flights)
-        case part:
-            work(folder, part, chosen.by, chosen.flights)
+    quick = chosen.quick
+    folder = chosen.folder / ("quick" if quick else "full")
+    flights = chosen.flights or (8 if quick else 200)
+    files = chosen.files or (500 if quick else 10_000)
+    whole = chosen.part == "all"
+    began = time.perf_counter()
+    if chosen.part != "hangar":
+        make(folder / "flights", flights, SHORT_S if quick else FLIGHT_S)
+    if whole or chosen.part in (*SHARE, "dask", "growth"):
+        work(folder, chosen.part, flights)
+    if whole or chosen.part == "hangar":
+        fresh_process(hangar, folder / f"hangar-{files}", files)
+    print(f"\n{time.perf_counter() - began:.0f} s in all")
+
+
+def work(folder: Path, part: str, flights: int) -> None:
+    """Measure the parts that work on flights, and tell what is to be told of them together."""
+    print("\n" + ROW.format(*HEAD), flush=True)
+    done: dict[tuple[str, str, int], Cost] = {}
+
+    def cost(task: str, by: str, count: int) -> Cost:
+        if (task, by, count) not in done:
+            found = done[task, by, count] = fresh_process(measure, folder, task, by, count)
+            print(ROW.format(task, by, count, *found.cells(count)), flush=True)
+        return done[task, by, count]
+
+    told: list[str] = []
+    for task, share in SHARE.items():
+        if part in ("all", task):
+            count = max(flights // share, WORKERS) if part == "all" else flights
+            serial, pool = cost(task, "serial", count), cost(task, "processes", count)
+            told.append(
+                f"{task} by {WORKERS} processes: {serial.wall_s / pool.wall_s:.2f} times as fast "
+                f"as one after the other (goal 1.8), CPU {pool.cpu_s / serial.cpu_s:.2f} times"
+            )
+    if part in ("all", "dask"):
+        pool, dask = cost("fuse", "processes", flights), cost("fuse", "dask", flights)
+        told.append(
+            f"fuse on a cluster of {WORKERS}: {100 * (dask.wall_s / pool.wall_s - 1):+.1f} % wall "
+            f"beside the local processes (goal below +15 %)"
+        )
+    if part in ("all", "growth"):
+        counts = sorted({max(flights // share, 1) for share in (8, 4, 2, 1)})
+        least, *_, most = (cost("fuse", "processes", count) for count in counts)
+        told.append(
+            f"fuse of {counts[-1]} flights beside {counts[0]}: "
+            f"{most.wall_s / counts[-1] / (least.wall_s / counts[0]):.2f} times the wall a flight, "
+            f"largest worker {most.worker_mb - least.worker_mb:+.0f} MB, "
+            f"this process {most.here_mb - least.here_mb:+.0f} MB"
+        )
+    print("\n" + "\n".join(told))
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one measurement found."""
+
+    failed: int
+    start_s: float
+    wall_s: float
+    cpu_s: float
+    worker_mb: float
+    here_mb: float
+
+    def cells(self, flights: int) -> tuple[str, ...]:
+        """Write it for the table."""
+        each = f"{self.wall_s / flights:.2f}"
+        times = (f"{self.start_s:.1f}", f"{self.wall_s:.1f}", each, f"{self.cpu_s:.1f}")
+        return (str(self.failed), *times, f"{self.worker_mb:.0f}", f"{self.here_mb:.0f}")
+
+
+def measure(folder: Path, part: str, by: str, count: int) -> Cost:
+    """Do a task on recordings, once."""
+    items = items_of([str(folder / "flights")])[:count]
+    out = folder / f"out-{part}-{by}"
+    shutil.rmtree(out, ignore_errors=True)
+    began = time.perf_counter()
+    with executor_of(by) as (executor, workers):
+        start_s = time.perf_counter() - began
+        cpu_s, _ = workers()
+        began = time.perf_counter()
+        results = run_season(task_of(part), items, executor, ResultFolder(out), progress_of(part))
+        wall_s = time.perf_counter() - began
+        after_s, worker_mb = workers()
+    shutil.rmtree(out)
+    failed = sum(result.error is not None for result in results)
+    here_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return Cost(failed, start_s, wall_s, after_s - cpu_s, worker_mb, here_mb)
+
+
+def task_of(part: str) -> FlightTask:
+    """Return the task of a part."""
+    if part == "sweep":
+        axes = tuple(parse_axis(name, "0.1,0.5,0.9") for name in ("alpha", "beta"))
+        return SweepTask(OPTIONS, axes, "held_m", 5, 0.0)
+    return FuseTask(OPTIONS) if part == "fuse" else ReportTask(OPTIONS)
+
+
+Used = Callable[[], tuple[float, float]]
+"""Returns the CPU of all processes together in s, and the memory of the largest worker in MB."""
+
+
+@contextmanager
+def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
+    """Have somebody who works, ready to; a cluster has two processes of one thread."""
+    if by != "dask":
+        warm_up()
+        yield LocalProcesses(1 if by == "serial" else WORKERS), _children
+        return
+    distributed: Any = import_module("distributed")
+    with distributed.LocalCluster(
+        n_workers=WORKERS, threads_per_worker=1, processes=True, host="127.0.0.1",
+        dashboard_address=None,
+    ) as cluster:  # fmt: skip
+        client = DaskCluster(cluster.scheduler_address)
+        # What a worker does once in its life: load the machine code.
+        dict(client.run(_ready, range(4 * WORKERS)))
+
+        def used() -> tuple[float, float]:
+            told = cluster.get_client().run(_own_usage).values()
+            return sum(cpu for cpu, _ in told) + time.process_time(), max(mb for _, mb in told)
+
+        try:
+            yield client, used
+        finally:
+            client.close()
+
+
+def _ready(_: int) -> int:
+    warm_up()
+    time.sleep(0.2)
+    return os.getpid()
+
+
+def _own_usage() -> tuple[float, float]:
+    return time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _children() -> tuple[float, float]:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime + time.process_time(), used.ru_maxrss / 1024
 
 
 def make(folder: Path, count: int, duration_s: float) -> None:
-    """Write simulated recordings of some aircraft on some days."""
+    """Write the recordings that are not there yet: some aircraft on some days, in processes."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(min(SEEDS, count)):
-        head, rows = simulated_rows(seed + 1, duration_s)
-        for number in range(seed, count, SEEDS):
-            header = msgspec.structs.replace(
-                head,
-                vehicle_id=1 + number % 3,
-                unix_us_at_zero=DAY_0_US + number // 3 * DAY_US,
-            )
-            path = folder / f"flight{number:05d}_01_v{header.vehicle_id}.csv"
-            path.write_text(encode_head(header) + rows)
-    print(f"{count} recordings of {duration_s:.0f} s in {folder}")
+    there = {path.name for path in folder.iterdir()}
+    wanted = [number for number in range(count) if _name(number) not in there]
+    if not wanted:
+        return
+    began = time.perf_counter()
+    works = [
+        (folder, seed, [number for number in wanted if number % SEEDS == seed], duration_s)
+        for seed in range(SEEDS)
+    ]
+    show = progress_of(f"recordings of {duration_s:.0f} s")
+    for done, _ in enumerate(LocalProcesses(cores()).run(_make_some, works), 1):
+        show("", done, len(works))
+    print(
+        f"{len(wanted)} recordings of {duration_s:.0f} s simulated in {folder}: "
+        f"{time.perf_counter() - began:.0f} s"
+    )
+
+
+def _make_some(work: tuple[Path, int, Sequence[int], float]) -> None:
+    folder, seed, numbers, duration_s = work
+    if not numbers:
+        return
+    head, rows = simulated_rows(seed + 1, duration_s)
+    for number in numbers:
+        header = msgspec.structs.replace(
+            head,
+            vehicle_id=1 + number % 3,
+            unix_us_at_zero=DAY_0_US + number // 3 * DAY_US,
+        )
+        partial = folder / f".{number}"
+        partial.write_text(encode_head(header) + rows)
+        partial.rename(folder / _name(number))
+
+
+def _name(number: int) -> str:
+    return f"flight{number:05d}_01_v{1 + number % 3}.csv"
 
 
 def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
@@ -111,106 +291,89 @@ def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
         for frame in simulate(settings).frames(duration_s)
         for record in link.feed(frame.data, round(frame.time_s * US_PER_S))
     )
-    rows = "".join(
-        row_to_line(TableRow(record.time_us, **{columns[type(record)]: record}))
+    known: Iterator[tuple[int, dict[str, Any]]] = (
+        (record.time_us, {columns[type(record)]: record})
         for record in records
         if type(record) in columns
     )
+    rows = "".join(row_to_line(TableRow(time_us, **cells)) for time_us, cells in known)
     return header_for(AircraftSettings(calibration=calibration), 1), rows
 
 
-def task_of(part: str) -> FlightTask:
-    """Return the task of a part."""
-    if part == "sweep":
-        axes = tuple(parse_axis(name, "0.1,0.5,0.9") for name in ("alpha", "beta"))
-        return SweepTask(OPTIONS, axes, "held_m", 5, 0.0)
-    return FuseTask(OPTIONS) if part == "fuse" else ReportTask(OPTIONS)
-
-
-@contextmanager
-def executor_of(by: str) -> Iterator[Executor]:
-    """Have somebody who works; a cluster has two processes of one thread."""
-    if by != "dask":
-        warm_up()
-        yield LocalProcesses(1 if by == "serial" else 2)
-        return
-    from distributed import LocalCluster
-
-    began = time.perf_counter()
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
-    ) as cluster:
-        client = DaskCluster(cluster.scheduler_address)
-        # What a worker does once in its life: load the machine code.
-        dict(client.run(_ready, range(8)))
-        print(f"cluster started and ready in {time.perf_counter() - began:.1f} s")
-        yield client
-        client.close()
-
-
-def _ready(_: int) -> int:
-    warm_up()
-    time.sleep(0.2)
-    return os.getpid()
-
-
-def work(folder: Path, part: str, by: str, count: int) -> float:
-    """Do a task on recordings, and print what it cost; returns seconds."""
-    items = items_of([str(folder / "flights")])[:count]
-    out = folder / f"out-{part}-{by}"
-    shutil.rmtree(out, ignore_errors=True)
-    with executor_of(by) as executor:
-        began = time.perf_counter()
-        results = run_season(task_of(part), items, executor, ResultFolder(out), _silent)
-        wall_s = time.perf_counter() - began
-    failed = sum(result.error is not None for result in results)
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    own = resource.getrusage(resource.RUSAGE_SELF)
-    cpu_s = children.ru_utime + children.ru_stime
-    print(
-        f"{part} by {by}: {len(items)} flights, {failed} failed: {wall_s:.1f} s wall, "
-        f"{wall_s / len(items):.2f} s a flight; {cpu_s:.1f} s CPU of the workers; largest worker "
-        f"{children.ru_maxrss / 1024:.0f} MB, this process {own.ru_maxrss / 1024:.0f} MB"
-    )
-    return wall_s
-
-
-def growth(folder: Path, most: int) -> None:
-    """Fuse more and more recordings."""
-    for count in (most // 4, most // 2, most):
-        work(folder, "fuse", "processes", count)
-
-
-def hangar(folder: Path, count: int) -> None:
+def hangar(place: Path, count: int) -> None:
     """Index many short recordings, again with nothing new, again with some new, and ask."""
-    place = folder / "hangar"
-    if not place.exists() or len(list(place.glob("*.csv"))) != count:
-        make(place, count, 10.0)
+    make(place, count, CATALOGUED_S)
+    paths = sorted(place.glob("flight*.csv"))
+    for number in range(count // BROKEN):
+        (place / f"broken{number:05d}.csv").write_text(f"x,y\n1,{number}\n")
     (place / HANGAR_NAME).unlink(missing_ok=True)
-    size = sum(path.stat().st_size for path in place.glob("*.csv"))
-    _timed_index(place, f"first index of {count} recordings of 10 s, {size / 1e9:.2f} GB")
-    _timed_index(place, "again, nothing new")
-    for path in sorted(place.glob("*.csv"))[: count // 100]:
+    size = sum(path.stat().st_size for path in paths)
+    print(
+        f"\ncatalogue of {count} recordings of {CATALOGUED_S:.0f} s, {size / 1e9:.2f} GB, "
+        f"and {count // BROKEN} broken files"
+    )
+    _index(place, "first index")
+    _index(place, "again, nothing new")
+    for path in paths[::100]:
         path.write_bytes(path.read_bytes() + b'# mark: {"time_us": 1, "text": "new"}\n')
-    _timed_index(place, "again, one in a hundred changed")
-    print(f"catalogue: {(place / HANGAR_NAME).stat().st_size / 1e6:.1f} MB")
-    for query in QUERIES:
-        times = []
+    _index(place, "again, 1 % changed")
+    print(f"  {(place / HANGAR_NAME).stat().st_size / 1e6:.1f} MB in {HANGAR_NAME}")
+    asked: dict[str, Callable[[], Any]] = {
+        query: partial(find_flights, place, query) for query in QUERIES
+    }
+    asked["every flight there is"] = partial(find_flights, place)
+    asked["the tracks of all as GeoJSON"] = lambda: geojson_of(place)["features"]
+    for what, ask in asked.items():
+        times, found = [], 0
         for _ in range(9):
             began = time.perf_counter()
-            found = find_flights(place, query)
+            found = len(ask())
             times.append(time.perf_counter() - began)
-        print(f"{query or 'all'}: {len(found)} flights, {1e3 * statistics.median(times):.1f} ms")
+        goal = " (goal 50)" if what in QUERIES else ""
+        print(f"  {1e3 * median(times):7.1f} ms{goal:<10} {found:6} flights: {what}")
 
 
-def _timed_index(place: Path, what: str) -> None:
-    began = time.perf_counter()
-    report = index_folder(place, OPTIONS, LocalProcesses())
-    print(f"{what}: {time.perf_counter() - began:.1f} s; {report}")
+def _index(place: Path, what: str) -> None:
+    began, before = time.perf_counter(), _children()[0]
+    report = index_folder(place, OPTIONS, LocalProcesses(WORKERS), _bar("index"))
+    wall_s, cpu_s = time.perf_counter() - began, _children()[0] - before
+    print(
+        f"  {what:<20} {wall_s:7.2f} s wall {cpu_s:7.2f} s CPU; {report.read} read, "
+        f"{report.unchanged} unchanged, {report.broken} broken",
+        flush=True,
+    )
 
 
-def _silent(what: str, done: int, total: int) -> None:
-    pass
+def fresh_process(
+    function: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
+) -> Result:
+    """Call in a process that has done nothing before."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments, **named).result()
+
+
+def progress_of(part: str) -> Callable[[str, int, int], None]:
+    """Return what shows on a terminal how far a part is."""
+    show = _bar(part)
+
+    def tell(what: str, done: int, total: int) -> None:
+        if what != LOOKING:
+            show(done, total)
+
+    return tell
+
+
+def _bar(part: str) -> Callable[[int, int], None]:
+    """Return what shows a count: in one line of a terminal, in four lines of a file."""
+
+    def show(done: int, total: int) -> None:
+        if sys.stderr.isatty():
+            end = "\r" if done < total else "\r\x1b[K"
+            print(f"{part}: {done} of {total}", end=end, file=sys.stderr, flush=True)
+        elif total and done * 4 // total > (done - 1) * 4 // total:
+            print(f"{part}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return show
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from hashlib import sha256
+from typing import Final
 
 import msgspec
 
@@ -15,6 +16,8 @@ from gateway.season.executors import Executor, WorkFailed
 
 Tell = Callable[[str, int, int], None]
 """Called with what was done last, how many are done, and of how many."""
+LOOKING: Final = "looking for changes"
+"""What is done first: it tells which recordings are to be worked on."""
 
 
 def run_season(
@@ -81,7 +84,7 @@ def _stamps(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[
     found: list[str | WorkFailed] = [""] * len(items)
     for done, (number, outcome) in enumerate(executor.run(stamp_of_item, items), 1):
         found[number] = outcome
-        tell("looking for changes", done, len(items))
+        tell(LOOKING, done, len(items))
     return found
 
 
