@@ -115,7 +115,7 @@ def test_a_version_is_compared_with_another(
     assert (
         "eskf against the other results: +100.0 % error over 4 flights on 4 aircraft-days" in text
     )
-    assert "complementary against the other results: +0.0 %" in text
+    assert "complementary against the other results: the same error on all 4 flights" in text
     assert text.count("worse: ") == 4
     assert "got worse" in (out / "index.html").read_text()
     missing = run("fuse", season, "-o", out, "--against", tmp_path / "nowhere")

@@ -120,7 +120,12 @@ class SeasonWork:
                 text = f"{task.name}: {what.rsplit('/', 1)[-1][-40:]}"
                 progress.update(bar, description=text, completed=done, total=total, refresh=True)
 
-            results = run_season(task, items, executor, folder, report)
+            try:
+                results = run_season(task, items, executor, folder, report)
+            except KeyboardInterrupt:
+                if folder is not None:
+                    console.print("interrupted; what is done is kept: the same command goes on")
+                raise
         _print_failures(results)
         return results
 

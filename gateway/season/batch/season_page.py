@@ -87,13 +87,15 @@ def write_season_page(
     ]
     if compared is not None:
         sections.append(_versus_section(compared))
-    sections.append(
-        Section(
-            "Flights",
-            "Every recording, in the order given.",
-            tables=[ReportTable("flights", flight_table(results), "All recordings.")],
+    if broken:
+        sections.append(_failed_section(broken))
+    if len(broken) < len(results):
+        flights = flight_table([result for result in results if result.error is None])
+        # The page is narrow; a flight's distance is in flights.csv.
+        table = ReportTable(
+            "flight_errors", flights.drop(columns=["failed", "distance, m"]), "Flights."
         )
-    )
+        sections.append(Section("Flights", "In the order given.", tables=[table]))
     seconds = sum(r.figures.get("summary", {}).get("duration, s", 0.0) for r in results)
     vehicles = {flight.vehicle for flight in errors}
     facts = [
@@ -148,7 +150,18 @@ def _versus_section(compared: Versus) -> Any:
     return Section("Against the other results", lead, tables=tables)
 
 
+def _failed_section(broken: Sequence[FlightResult]) -> Any:
+    from gateway.analysis.reporting.page import ReportTable, Section
+
+    rows = [(result.place.rsplit("/", 1)[-1], result.error) for result in broken]
+    frame = pd.DataFrame(rows, columns=["recording", "why"])
+    lead = "They are in none of the other tables."
+    return Section("Recordings that failed", lead, tables=[ReportTable("failed", frame, "Failed.")])
+
+
 def _picture(errors: Sequence[FlightErrors]) -> Any:
+    from matplotlib.ticker import FuncFormatter
+
     from gateway.analysis.reporting import style
     from gateway.analysis.reporting.page import Picture
     from gateway.analysis.reporting.sections.estimators import COLOURS, OTHER
@@ -159,13 +172,22 @@ def _picture(errors: Sequence[FlightErrors]) -> Any:
         figure, (axes,) = style.panels(width_in, 1, 2.6)
         for name in names:
             values = np.sort([f.held_m[name] for f in errors if name in f.held_m])
-            share = np.arange(1, len(values) + 1) / len(values)
-            axes.step(values, share, where="post", label=name, color=COLOURS.get(name, OTHER))
+            share = np.arange(len(values) + 1) / len(values)
+            axes.step(
+                [values[0], *values],
+                share,
+                where="post",
+                label=name,
+                color=COLOURS.get(name, OTHER),
+            )
         axes.set_xlabel("error at withheld fixes, m")
         axes.set_ylabel("share of the flights")
         axes.set_xscale("log")
+        decimal = FuncFormatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_major_formatter(decimal)
+        axes.xaxis.set_minor_formatter(decimal)
         axes.legend()
         return figure
 
-    caption = "Which share of the flights has at most so great an error, by estimator."
+    caption = "Share of the flights whose error is at most this, by estimator."
     return Picture("season_errors", draw, caption)

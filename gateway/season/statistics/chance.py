@@ -36,6 +36,8 @@ class Lead:
         change = f"{_percent(self.ratio)} error over {self.flights} flights"
         if self.p is None or self.low is None or self.high is None:
             return f"{change}, all of one aircraft and day: nothing tells it from chance"
+        if self.low == self.high == self.ratio == 1.0:
+            return f"the same error on all {self.flights} flights"
         told = "more than chance" if self.p < CHANCE else "it may be chance"
         return (
             f"{change} on {self.units} aircraft-days, 95 % between {_percent(self.low)} and "
