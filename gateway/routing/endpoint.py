@@ -200,7 +200,7 @@ def parse_endpoint(url: str) -> Endpoint:
             kind=kind,
             host=host,
             port=port,
-            place=f"{kind}:{place}",
+            place=_own_place(kind, place, options),
             name=name_from(options.get("name", f"{kind}:{place}")),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
@@ -317,6 +317,12 @@ def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
     if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
         raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
     return {"site": site, "keys": keys}
+
+
+def _own_place(kind: str, place: str, options: dict[str, str]) -> str:
+    """Return what no two endpoints may share: one router takes several sites of a gateway."""
+    site = options.get("site", "") if kind == EndpointKind.ZENOH else ""
+    return f"{kind}:{place}?site={site}" if site else f"{kind}:{place}"
 
 
 def _path(text: str) -> str:

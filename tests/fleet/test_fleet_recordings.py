@@ -213,6 +213,25 @@ class TestFetch:
         assert self.fetch(tmp_path, CONTENT, good)
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
+    def test_a_recording_that_has_grown_since_is_gone_on_with(self, tmp_path: Path) -> None:
+        asked: list[int] = []
+
+        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+            if verb == "fleet.digest":
+                return {"sha256": hashlib.sha256(CONTENT[: params["size"]]).hexdigest()}
+            asked.append(params["offset"])
+            begin = params["offset"]
+            return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
+
+        for size in (10_000, 25_000):
+            one = RecordingFetch("site", tmp_path, ask, wait=lambda _: None)
+            assert one.fetch(NAME, size, lambda _: None)
+            assert (tmp_path / NAME).read_bytes() == CONTENT[:size]
+        assert asked.count(0) == 1
+        (tmp_path / NAME).write_bytes(b"another")
+        with pytest.raises(FetchError, match="differs"):
+            RecordingFetch("site", tmp_path, ask).fetch(NAME, 25_000, lambda _: None)
+
     def test_another_file_under_the_name_is_begun_anew(self, tmp_path: Path) -> None:
         (tmp_path / f".{NAME}.part").write_bytes(b"x" * 5000)
         assert self.fetch(tmp_path, CONTENT, hashlib.sha256(CONTENT[:10_000]).hexdigest())

@@ -121,6 +121,8 @@ def test_a_site_of_a_fleet() -> None:
     assert endpoint.config == "/etc/zenoh.json5"
     assert endpoint.interval_us == {30: 200_000}
     assert parse_endpoint("zenoh:tls/h:7447?keys=mavlink_raw").keys == "mavlink_raw"
+    places = {parse_endpoint(f"zenoh:tcp/h:7447?site={site}&rate=30:5").place for site in "ab"}
+    assert places == {"zenoh:tcp/h:7447?site=a", "zenoh:tcp/h:7447?site=b"}
 
 
 def test_lists() -> None:

@@ -9,6 +9,7 @@ import base64
 import fcntl
 import hashlib
 import os
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -119,7 +120,7 @@ class RecordingFetch:
             if self._is_same(target, size, name):
                 advance(size)
                 return False
-            if not self._force:
+            if not self._force and not self._has_grown(target, size, name):
                 raise FetchError(f"{target} is there and differs; --force fetches it anew")
         self._folder.mkdir(parents=True, exist_ok=True)
         with part.open("a+b") as file:
@@ -127,6 +128,10 @@ class RecordingFetch:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise FetchError(f"{target} is being fetched by another program") from error
+            if target.exists() and not file.seek(0, os.SEEK_END):
+                # What is there may be the beginning; if it is not, it is begun anew.
+                with target.open("rb") as known:
+                    shutil.copyfileobj(known, file)
             self._fill(file, name, size, advance)
             file.flush()
             os.fsync(file.fileno())
@@ -135,10 +140,15 @@ class RecordingFetch:
         return True
 
     def _is_same(self, target: Path, size: int, name: str) -> bool:
-        if target.stat().st_size != size:
-            return False
+        return target.stat().st_size == size and self._is_beginning(target, name)
+
+    def _has_grown(self, target: Path, size: int, name: str) -> bool:
+        return target.stat().st_size < size and self._is_beginning(target, name)
+
+    def _is_beginning(self, target: Path, name: str) -> bool:
         with target.open("rb") as file:
-            return self._digest(name, size) == _digest_of(file).hexdigest()
+            digest = _digest_of(file).hexdigest()
+            return self._digest(name, file.tell()) == digest
 
     def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
         """Fetch until the file is whole and is the site's."""
