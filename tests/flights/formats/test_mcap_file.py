@@ -195,4 +195,5 @@ def test_the_layout_shows_what_is_in_a_file(flight: Path) -> None:
         re.findall(r'"((?:3D|map|Gauge|Plot|RosOut)![a-z]+)"', json.dumps(layout["layout"]))
     )
     assert panels == set(layout["configById"])
+    assert all("foxglovePanelTitle" in panel for panel in layout["configById"].values())
     assert {panel.split("!")[0] for panel in panels} == {"3D", "map", "Gauge", "Plot", "RosOut"}
