@@ -50,11 +50,15 @@ def test_simulated(flight: Flight, name: str, how: str) -> None:
     assert place_m < PLACE_M
 
 
-REAL_LIMIT_DEG: dict[tuple[str, str], float] = {
-    ("complementary", "late_gps"): 4.0,
-    ("complementary", "no_mag"): 4.0,
-    ("complementary", "mid_air"): 3.6,
-}
+@pytest.mark.parametrize("seed", [12, 32])
+def test_a_large_bias_is_learned_by_a_start_in_flight(seed: int) -> None:
+    """These gyroscopes read up to 2.5 deg/s too much, and no rest has shown it."""
+    tilt_deg, heading_deg, place_m = off(
+        simulated_flight(seed, calibrated=False), "complementary", "mid_air"
+    )
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < LIMIT_DEG
+    assert place_m < PLACE_M
 
 
 @pytest.mark.parametrize("how", SPOILS)
@@ -62,9 +66,8 @@ REAL_LIMIT_DEG: dict[tuple[str, str], float] = {
 def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     tilt_deg, heading_deg, place_m = off(flight, name, how)
-    limit_deg = REAL_LIMIT_DEG.get((name, how), LIMIT_DEG)
-    assert tilt_deg < limit_deg
-    assert heading_deg < limit_deg
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
 
 

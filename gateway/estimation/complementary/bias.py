@@ -12,9 +12,15 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import BIAS_WALK_RAD2PS3, carry_drift, correct_drift
+from gateway.estimation.complementary.drift import (
+    BIAS_WALK_RAD2PS3,
+    UNCLIPPED,
+    carry_drift,
+    cleared_row,
+    correct_drift,
+)
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
-from gateway.estimation.kernel_record import as_quat
+from gateway.estimation.kernel_record import as_quat, write_vec
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -22,14 +28,14 @@ from gateway.units import RAD_PER_DEG
 SETTLED_S: Final = 5.0
 """What levels a new attitude in this time is its own error rather than the bias."""
 HAND_MPS2: Final = 1.0
-"""Where GPS tells no acceleration, turns that pull by this much make the level worth half."""
+"""Without an acceleration from GPS, turns that pull by this much make the level worth half."""
 CLIP_RADPS: Final = 2.0 * RAD_PER_DEG
 """No single observation moves the bias by more than its gain times this."""
 
 
 @compiled
 def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: float) -> None:
-    """Update the bias at the end of an epoch.
+    """Update the bias at the end of an epoch in which gravity levelled the attitude.
 
     Parameters
     ----------
@@ -43,16 +49,12 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
         Length of the epoch, s.
     """
     carry_drift(s, p)
-    growth = BIAS_WALK_RAD2PS3 * dt
     watch_turn(s, tau_s, dt)
     settled = s.force_lp_s > max(tau_s, SETTLED_S)
     if s.at_rest == 1:
-        variance = noise_for(p.bias_rest_radps, growth)
-        for k in range(3):
-            row = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
-            correct_bias(s, p, row, s.gyro_rest[k], variance)
+        update_bias_at_rest(s, p, dt)
     elif settled:
-        variance = noise_for(p.bias_motion_radps, growth)
+        variance = noise_for(p.bias_motion_radps, BIAS_WALK_RAD2PS3 * dt)
         if s.by_gps == 0:
             variance *= 1.0 + (s.turning_mps2 / HAND_MPS2) ** 2
         for k in range(2):
@@ -60,6 +62,15 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
             # The low-passed frame falls behind by the bias error, and gravity pulls it back.
             correct_bias(s, p, row, s.turn_lp[6 + k] - s.tilt_sum[k] / dt, variance)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+
+
+@compiled
+def update_bias_at_rest(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
+    """Update the bias by what the gyroscope shows at rest, after `dt` seconds of it."""
+    variance = noise_for(p.bias_rest_radps, BIAS_WALK_RAD2PS3 * dt)
+    for k in range(3):
+        row = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
+        correct_bias(s, p, row, s.gyro_rest[k], variance)
 
 
 @compiled
@@ -81,12 +92,13 @@ def watch_turn(s: ComplementaryState, tau_s: float, dt: float) -> None:
         for j in range(3):
             settle(s, 3 * k + j, row[j], cutoff, dt, tau_s)
         settle(s, 6 + k, product, cutoff, dt, tau_s)
+    s.turn_begins = 0
 
 
 @compiled
 def settle(s: ComplementaryState, k: int, u: float, cutoff: float, dt: float, tau_s: float) -> None:
     """Low-pass one channel; while gravity's filter is still a mean, follow at once."""
-    if s.force_lp_s < tau_s:
+    if s.force_lp_s < tau_s or s.turn_begins == 1:
         s.turn_lp[k], s.turn_in[k], s.turn_lp_rate[k] = u, u, 0.0
     else:
         low_pass(s.turn_lp, s.turn_lp_rate, s.turn_in, k, u, cutoff, dt)
@@ -99,4 +111,5 @@ def correct_bias(
     """Correct the bias by `row @ bias = measured`."""
     expected = row[0] * s.bias_b[0] + row[1] * s.bias_b[1] + row[2] * s.bias_b[2]
     innovation = max(-CLIP_RADPS, min(CLIP_RADPS, measured - expected))
-    correct_drift(s, p, (row[0], row[1], row[2], 0.0, 0.0), innovation, variance)
+    write_vec(cleared_row(s), row)
+    correct_drift(s, p, innovation, variance, UNCLIPPED)

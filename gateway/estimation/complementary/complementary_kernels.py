@@ -17,6 +17,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.drift import (
     DOUBT,
     begin_drift,
+    end_level,
     note_turn,
     raise_bias_variance,
 )
@@ -31,7 +32,7 @@ from gateway.estimation.complementary.reorientation import (
     lose_attitude,
     watch_gravity,
 )
-from gateway.estimation.complementary.tilt import refresh, strapdown, take_gravity
+from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown, take_gravity
 from gateway.estimation.filtering.sample_clock import begin_clock, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -159,9 +160,12 @@ def advance(
         watch_rest(s, p, gyro, accel, moving, dt)
         raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
         watch_gravity(s, p)
-    coasting = since_fix < p.coast_s and speed(s) > MOVING_MPS
+    coasting = since_fix < p.coast_s and s.at_rest == 0 and is_under_way(s)
     by_gps = since_fix < FRESH_GPS_S or coasting
     if sound_accel and not (by_gps and is_heading_good(s)):
+        if s.level_by_gps == 1:
+            end_level(s, p)
+            go_on_by_gravity(s, p)
         take_gravity(s, rotate(as_quat(s.q_ib), accel), p.tau_accel_s, dt)
         s.epoch_s += dt
         if s.epoch_s >= EPOCH_S:
@@ -172,6 +176,20 @@ def advance(
     if s.at_rest == 1 and since_fix > FRESH_GPS_S:
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
+
+
+@compiled
+def go_on_by_gravity(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Let gravity's low-pass, which rested, hold the level from where it is."""
+    hold_level(s)
+    s.force_lp_s = max(s.force_lp_s, p.tau_accel_s)
+    s.turn_begins = 1
+
+
+@compiled
+def is_under_way(s: ComplementaryState) -> bool:
+    """Return whether the last fixes saw the aircraft move."""
+    return math.hypot(s.fix_vel[0], s.fix_vel[1]) > MOVING_MPS
 
 
 @compiled

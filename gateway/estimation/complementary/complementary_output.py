@@ -1,4 +1,4 @@
-"""What the complementary estimator tells: its output row and flags."""
+"""The output of the complementary estimator: its row and flags."""
 
 from typing import Final
 

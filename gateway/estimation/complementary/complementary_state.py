@@ -1,6 +1,6 @@
 """Settings, gains and state of the complementary estimator."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState, filter_gains
 from gateway.estimation.kernel_record import FloatArray, filled_record
@@ -10,6 +10,9 @@ from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
+STATES: Final = 10
+"""Of the Kalman filter in `drift`."""
+
 
 class ComplementarySettings(Settings, frozen=True):
     """Time constants and thresholds of the complementary estimator."""
@@ -17,23 +20,14 @@ class ComplementarySettings(Settings, frozen=True):
     tau_accel_s: Annotated[
         float,
         setting(
-            "Time constant of the accelerometer's low-pass in the inertial frame. Small follows "
-            "accelerations, large trusts the gyroscope; cutoff = sqrt(2) / (2 pi tau).",
+            "Time constant of the accelerometer's low-pass in the inertial frame, without GPS. "
+            "Small follows accelerations, large trusts the gyroscope; cutoff = sqrt(2) / "
+            "(2 pi tau).",
             "s",
             ge=0.1,
             le=60.0,
         ),
     ] = 3.0
-    tau_accel_gps_s: Annotated[
-        float,
-        setting(
-            "The same while the GPS velocity takes the acceleration out. Small passes the noise "
-            "of the GPS velocity, large the drift of the gyroscope.",
-            "s",
-            ge=0.1,
-            le=60.0,
-        ),
-    ] = 5.0
     coast_s: Annotated[
         float,
         setting(
@@ -48,7 +42,7 @@ class ComplementarySettings(Settings, frozen=True):
         float,
         setting(
             "Time in which the compass's slow error becomes another. Small takes it for noise and "
-            "follows its mean, large for a constant that the GPS has to tell.",
+            "follows its mean, large for a constant that only GPS can reveal.",
             "s",
             ge=0.5,
             le=600.0,
@@ -63,12 +57,12 @@ class ComplementarySettings(Settings, frozen=True):
     ] = 0.3
     bias_initial_degps: Annotated[
         float, setting("Gyroscope bias to be expected at the start.", "deg/s", ge=0.01, le=20.0)
-    ] = 0.5
+    ] = 0.7
     bias_motion_degps: Annotated[
         float,
         setting(
-            "Accuracy to which the gyroscope bias is learned in motion. Small learns slowly, "
-            "large follows manoeuvres.",
+            "Accuracy to which the gyroscope bias is learned in motion without GPS. Small learns "
+            "slowly, large follows manoeuvres.",
             "deg/s",
             ge=0.01,
             le=5.0,
@@ -127,7 +121,6 @@ class ComplementaryGains(FilterGains):
     """The settings in SI units."""
 
     tau_accel_s: float
-    tau_accel_gps_s: float
     coast_s: float
     tau_heading_s: float
     heading_noise_rad: float
@@ -158,6 +151,8 @@ class ComplementaryState(FilterState):
     """Time behind the low-pass; its start is a plain mean."""
     turn_lp: Annotated[FloatArray, (8,)]
     """Low-pass of the two level rows of `R_eb` and of their products with the bias."""
+    turn_begins: int
+    """1 if that low-pass begins anew."""
     turn_lp_rate: Annotated[FloatArray, (8,)]
     turn_in: Annotated[FloatArray, (8,)]
     tilt_sum: Annotated[FloatArray, (2,)]
@@ -168,17 +163,21 @@ class ComplementaryState(FilterState):
     """Turn about down from the level frame to NED."""
     compass_rad: float
     """Slow error of the compass."""
-    drift_cov: Annotated[FloatArray, (5, 5)]
-    """Covariance of the bias, the heading and the compass's error."""
-    drift_gain: Annotated[FloatArray, (5,)]
-    """Scratch."""
-    down_turn: Annotated[FloatArray, (3,)]
-    """Integral of the down row of `R_nb` since the covariance was carried on."""
-    carried_s: float
-    carried_turn: float
-    """Time since, and angle that the aircraft has turned by."""
     accel_bias_b: Annotated[FloatArray, (3,)]
-    """Error of the specific force as the fixes' velocities tell it, m/s2."""
+    """Error of the specific force, m/s2."""
+    level_by_gps: int
+    """1 while GPS velocities level the attitude, 0 while gravity's low-pass does."""
+    drift_cov: Annotated[FloatArray, (STATES, STATES)]
+    """Covariance of the states of `drift`; nothing of the level while gravity holds it."""
+    drift_row: Annotated[FloatArray, (STATES,)]
+    """Scratch: how a number that is measured depends on the states."""
+    drift_gain: Annotated[FloatArray, (STATES,)]
+    """Scratch."""
+    carried_turn_eb: Annotated[FloatArray, (3, 3)]
+    """Integral of `R_eb` since the covariance was carried on, s."""
+    carried_s: float
+    carried_rad: float
+    """Time since, and angle that the aircraft has turned by."""
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float

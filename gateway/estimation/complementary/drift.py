@@ -1,10 +1,13 @@
-"""What the gyroscope drifts by and what that does to the heading: a Kalman filter of five states.
+"""Errors of attitude and sensors: a Kalman filter of ten states.
 
-The gyroscope's bias in body FRD, the heading, and the compass's slow error, by iron and by the
-place. That error is of some degrees, but it changes slowly: so a heading that walks away from the
-compass tells the bias, long before the compass tells the heading; and what the GPS says of the
-heading tells the compass's error. The level is not among the states; what it says of the bias
-comes in by `bias`.
+The gyroscope bias in body FRD, the heading, the slow error of the compass (iron, and the place),
+the tilt of the level frame, and the accelerometer bias in body FRD. The compass is wrong by some
+degrees, but that error changes slowly: a heading that drifts away from the compass reveals the
+gyroscope bias long before the compass corrects the heading, and a heading from GPS reveals the
+error of the compass.
+
+While the low-pass of gravity levels the attitude, neither the tilt nor the accelerometer bias is
+estimated; `bias` then corrects the gyroscope bias by what the low-pass corrects.
 """
 
 import math
@@ -12,141 +15,252 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.complementary.complementary_state import (
+    STATES,
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.kernel_record import as_quat
-from gateway.geometry.quaternion import rotate_inverse, wrap_pi
+from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
+from gateway.geometry.quaternion import (
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate_inverse,
+    wrap_pi,
+)
 from gateway.units import RAD_PER_DEG
 
 HEADING: Final = 3
 """Turn about down from the level frame to NED; the three before are the bias."""
 COMPASS: Final = 4
-STATES: Final = 5
-Row = tuple[float, float, float, float, float]
+TILT: Final = 5
+"""Turn of the level frame about its own first two axes."""
+FORCE: Final = 7
+"""The accelerometer's bias."""
 
 BIAS_WALK_RAD2PS3: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
 """A drift of 0.1 deg/s in 100 s."""
-HEADING_WALK_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2
+ATTITUDE_WALK_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2
 """Of the gyroscope's noise."""
 TURN_WALK_RAD: Final = 1e-5
-"""Variance of the heading after a turn of 1 rad, by scale and axes of the gyroscope."""
-KNOWN_BIAS_RADPS: Final = 0.1 * RAD_PER_DEG
-LEVEL_HASTE_SPRAD: Final = 5.0 / RAD_PER_DEG
-"""A bias less certain than that tilts the horizon, which then is levelled the faster."""
-LEAST_LEVEL_S: Final = 2.0
-"""Faster levelling would pass the noise of the GPS velocity."""
+"""Variance of the attitude after a turn of 1 rad, by scale and axes of the gyroscope."""
+FORCE_BIAS_MPS2: Final = 0.1
+FORCE_BIAS_LIMIT_MPS2: Final = 0.5
+FORCE_WALK_M2PS5: Final = 0.002**2
+"""Bias of the accelerometer at the start, at most, and its random walk."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
 UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
-LEAST_VAR: Final = 1e-6
-"""Rounding must not make a variance negative."""
+UNCLIPPED: Final = 1e9
+"""An innovation of so many standard deviations counts whole."""
 
 
 @compiled
 def begin_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
-    """Set what is expected of a gyroscope and a compass that nothing is known of."""
+    """Set the covariance of sensors that nothing is known of."""
     for k in range(3):
         s.drift_cov[k, k] = p.bias_initial_radps**2
+        s.drift_cov[FORCE + k, FORCE + k] = FORCE_BIAS_MPS2**2
     forget_heading(s, p)
+
+
+@compiled
+def begin_state(s: ComplementaryState, k: int, variance: float) -> None:
+    """Take a value for one state that has nothing to do with what was known."""
+    for j in range(STATES):
+        s.drift_cov[k, j] = s.drift_cov[j, k] = 0.0
+    s.drift_cov[k, k] = variance
 
 
 @compiled
 def forget_heading(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Know nothing of the heading, nor of the compass's error."""
-    start_heading(s, s.heading_rad, UNKNOWN_VAR)
-    for j in range(STATES):
-        s.drift_cov[COMPASS, j] = s.drift_cov[j, COMPASS] = 0.0
+    start_heading(s, p, s.heading_rad, UNKNOWN_VAR)
     s.compass_rad = 0.0
-    s.drift_cov[COMPASS, COMPASS] = p.heading_noise_rad**2
+    begin_state(s, COMPASS, p.heading_noise_rad**2)
 
 
 @compiled
-def start_heading(s: ComplementaryState, heading_rad: float, variance: float) -> None:
+def start_heading(
+    s: ComplementaryState, p: ComplementaryGains, heading_rad: float, variance: float
+) -> None:
     """Take a heading that has nothing to do with what was known."""
-    for j in range(STATES):
-        s.drift_cov[HEADING, j] = s.drift_cov[j, HEADING] = 0.0
-    s.drift_cov[HEADING, HEADING] = variance
+    carry_drift(s, p)
+    begin_state(s, HEADING, variance)
     s.heading_rad = wrap_pi(heading_rad)
-    s.down_turn[0] = s.down_turn[1] = s.down_turn[2] = s.carried_s = s.carried_turn = 0.0
+
+
+@compiled
+def start_level(s: ComplementaryState, p: ComplementaryGains, std: float) -> None:
+    """Hold the level by GPS from here on, beginning with a standard deviation in rad."""
+    carry_drift(s, p)
+    s.level_by_gps = 1
+    begin_state(s, TILT, std * std)
+    begin_state(s, TILT + 1, std * std)
+
+
+@compiled
+def end_level(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Leave the level to gravity's low-pass from here on."""
+    carry_drift(s, p)
+    s.level_by_gps = 0
+    for k in range(TILT, STATES):
+        begin_state(s, k, s.drift_cov[k, k] if k >= FORCE else 0.0)
+
+
+@compiled
+def states_in_use(s: ComplementaryState) -> int:
+    """Return how many states there are: without GPS, neither tilt nor accelerometer."""
+    return STATES if s.level_by_gps == 1 else TILT
 
 
 @compiled
 def note_turn(s: ComplementaryState, dt: float) -> None:
-    """Note how a bias turns the heading in one sample, and how far the aircraft turned."""
-    down = rotate_inverse(as_quat(s.q_eb), (0.0, 0.0, 1.0))
-    x, y, z = s.rate_b[0], s.rate_b[1], s.rate_b[2]
+    """Note how a bias turns the attitude in one sample, and how far the aircraft turned."""
+    q, turn = as_quat(s.q_eb), s.carried_turn_eb
+    down = rotate_inverse(q, (0.0, 0.0, dt))
     for k in range(3):
-        s.down_turn[k] += down[k] * dt
+        turn[2, k] += down[k]
+    if s.level_by_gps == 1:
+        first, second = rotate_inverse(q, (dt, 0.0, 0.0)), rotate_inverse(q, (0.0, dt, 0.0))
+        for k in range(3):
+            turn[0, k] += first[k]
+            turn[1, k] += second[k]
+    wx, wy, wz = s.rate_b[0], s.rate_b[1], s.rate_b[2]
     s.carried_s += dt
-    s.carried_turn += math.sqrt(x * x + y * y + z * z) * dt
+    s.carried_rad += math.sqrt(wx * wx + wy * wy + wz * wz) * dt
 
 
 @compiled
 def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Carry the covariance on to now."""
-    P, r = s.drift_cov, s.down_turn
-    before = r[0] * P[HEADING, 0] + r[1] * P[HEADING, 1] + r[2] * P[HEADING, 2]
-    for j in range(STATES):
-        if j != HEADING:
-            P[HEADING, j] -= r[0] * P[0, j] + r[1] * P[1, j] + r[2] * P[2, j]
-            P[j, HEADING] = P[HEADING, j]
-    after = r[0] * P[HEADING, 0] + r[1] * P[HEADING, 1] + r[2] * P[HEADING, 2]
-    walked = HEADING_WALK_RAD2PS * s.carried_s + TURN_WALK_RAD * s.carried_turn
-    variance = P[HEADING, HEADING] - before - after + walked
-    P[HEADING, HEADING] = min(max(variance, LEAST_VAR), UNKNOWN_VAR)
+    if s.carried_s == 0.0:
+        return
+    P, turn = s.drift_cov, s.carried_turn_eb
+    first, n = 0 if s.level_by_gps == 1 else 2, states_in_use(s)
+    walked = ATTITUDE_WALK_RAD2PS * s.carried_s + TURN_WALK_RAD * s.carried_rad
+    for axis in range(first, 3):
+        k = HEADING if axis == 2 else TILT + axis
+        for j in range(n):
+            P[k, j] -= turn[axis, 0] * P[0, j] + turn[axis, 1] * P[1, j] + turn[axis, 2] * P[2, j]
+    for axis in range(first, 3):
+        k = HEADING if axis == 2 else TILT + axis
+        for j in range(n):
+            P[j, k] -= turn[axis, 0] * P[j, 0] + turn[axis, 1] * P[j, 1] + turn[axis, 2] * P[j, 2]
+        P[k, k] += walked
+    limit_variance(s, HEADING, UNKNOWN_VAR)
     kept = math.exp(-s.carried_s / p.tau_heading_s)
-    for j in range(STATES):
-        P[COMPASS, j] *= kept
-        P[j, COMPASS] *= kept
+    scale_state(s, COMPASS, kept)
     P[COMPASS, COMPASS] += (1.0 - kept * kept) * p.heading_noise_rad**2
     s.compass_rad *= kept
     for k in range(3):
-        P[k, k] = min(P[k, k] + BIAS_WALK_RAD2PS3 * s.carried_s, p.bias_initial_radps**2)
-        r[k] = 0.0
-    s.carried_s = s.carried_turn = 0.0
+        P[k, k] += BIAS_WALK_RAD2PS3 * s.carried_s
+        P[FORCE + k, FORCE + k] += FORCE_WALK_M2PS5 * s.carried_s
+        limit_variance(s, k, p.bias_initial_radps**2)
+        limit_variance(s, FORCE + k, FORCE_BIAS_MPS2**2)
+        turn[0, k] = turn[1, k] = turn[2, k] = 0.0
+    s.carried_s = s.carried_rad = 0.0
+
+
+@compiled
+def scale_state(s: ComplementaryState, k: int, share: float) -> None:
+    """Scale a row and a column of the covariance."""
+    for j in range(STATES):
+        s.drift_cov[k, j] *= share
+        s.drift_cov[j, k] *= share
+
+
+@compiled
+def limit_variance(s: ComplementaryState, k: int, most: float) -> None:
+    """Scale a row and a column so that the variance is no larger."""
+    variance = s.drift_cov[k, k]
+    if variance > most:
+        scale_state(s, k, math.sqrt(most / variance))
+
+
+@compiled
+def cleared_row(s: ComplementaryState) -> FloatArray:
+    """Return the row of a measurement, all zero, to be filled."""
+    for k in range(STATES):
+        s.drift_row[k] = 0.0
+    return s.drift_row
 
 
 @compiled
 def correct_drift(
-    s: ComplementaryState, p: ComplementaryGains, row: Row, innovation: float, variance: float
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    innovation: float,
+    variance: float,
+    clip: float,
 ) -> None:
-    """Update the five states by one number.
+    """Update the states by one scalar measurement.
 
     Parameters
     ----------
     s : ComplementaryState
-        Changed in place; its covariance has been carried on.
+        Changed in place; its covariance has been carried on, `drift_row` holds the measurement's
+        derivatives by the states.
     p : ComplementaryGains
         Constants.
-    row : tuple of 5 floats
-        How the number depends on the states.
     innovation : float
-        What was measured less what was expected.
+        Measured less expected value.
     variance : float
         Of the measurement.
+    clip : float
+        An innovation counts up to so many of its standard deviations.
     """
     if not math.isfinite(innovation):
         return
-    P, gain = s.drift_cov, s.drift_gain
-    spread = variance
-    for k in range(STATES):
+    spread = variance + expected_variance(s)
+    reduce_covariance(s, spread)
+    most = clip * math.sqrt(spread)
+    apply_gain(s, p, max(-most, min(most, innovation)) / spread)
+
+
+@compiled
+def expected_variance(s: ComplementaryState) -> float:
+    """Return the variance of the expected measurement; fills `drift_gain` with `P h`."""
+    P, gain, row, n = s.drift_cov, s.drift_gain, s.drift_row, states_in_use(s)
+    for k in range(n):
         gain[k] = 0.0
-        for j in range(STATES):
-            gain[k] += P[k, j] * row[j]
-    for k in range(STATES):
+    for j in range(n):
+        if row[j] != 0.0:
+            for k in range(n):
+                gain[k] += P[j, k] * row[j]
+    spread = 0.0
+    for k in range(n):
         spread += row[k] * gain[k]
-    for k in range(STATES):
-        for j in range(STATES):
-            P[k, j] -= gain[k] * gain[j] / spread
-    share, limit = innovation / spread, p.bias_limit_radps
+    return spread
+
+
+@compiled
+def reduce_covariance(s: ComplementaryState, spread: float) -> None:
+    """Reduce the covariance after a measurement whose innovation has the variance `spread`."""
+    P, gain, n = s.drift_cov, s.drift_gain, states_in_use(s)
+    for k in range(n):
+        share = gain[k] / spread
+        for j in range(k + 1):
+            P[k, j] -= share * gain[j]
+            P[j, k] = P[k, j]
+        P[k, k] = max(P[k, k], 0.0)
+
+
+@compiled
+def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float) -> None:
+    """Correct the states by a multiple of `drift_gain`."""
+    gain, limit = s.drift_gain, p.bias_limit_radps
     for k in range(3):
         s.bias_b[k] = max(-limit, min(limit, s.bias_b[k] + gain[k] * share))
     s.heading_rad = wrap_pi(s.heading_rad + gain[HEADING] * share)
     s.compass_rad += gain[COMPASS] * share
-    for k in range(STATES):
-        P[k, k] = max(P[k, k], LEAST_VAR * LEAST_VAR)
+    if s.level_by_gps == 0:
+        return
+    for k in range(3):
+        force = s.accel_bias_b[k] + gain[FORCE + k] * share
+        s.accel_bias_b[k] = max(-FORCE_BIAS_LIMIT_MPS2, min(FORCE_BIAS_LIMIT_MPS2, force))
+    turn = from_rotation_vector((gain[TILT] * share, gain[TILT + 1] * share, 0.0))
+    write_quat(s.q_ei, normalise(multiply(turn, as_quat(s.q_ei))))
 
 
 @compiled
@@ -154,17 +268,6 @@ def bias_std(s: ComplementaryState) -> float:
     """Return the standard deviation of the bias per axis, rad/s."""
     P = s.drift_cov
     return math.sqrt((P[0, 0] + P[1, 1] + P[2, 2]) / 3.0)
-
-
-@compiled
-def level_time_s(s: ComplementaryState, p: ComplementaryGains) -> float:
-    """Return the time constant of gravity's low-pass with GPS: shorter while the bias is unknown.
-
-    The horizon hangs behind by what the bias turns it in this time.
-    """
-    unknown = max(bias_std(s) - KNOWN_BIAS_RADPS, 0.0)
-    shortest = min(p.tau_accel_gps_s, LEAST_LEVEL_S)
-    return max(p.tau_accel_gps_s / (1.0 + LEVEL_HASTE_SPRAD * unknown), shortest)
 
 
 @compiled
@@ -181,7 +284,9 @@ def raise_bias_variance(s: ComplementaryState, std: float) -> None:
 
 
 @compiled
-def raise_heading_variance(s: ComplementaryState, std: float) -> None:
-    """Make the heading less certain by a standard deviation in rad."""
-    variance = s.drift_cov[HEADING, HEADING] + std * std
-    s.drift_cov[HEADING, HEADING] = min(variance, UNKNOWN_VAR)
+def raise_attitude_variance(s: ComplementaryState, std: float) -> None:
+    """Make the attitude less certain by a standard deviation in rad about each axis."""
+    s.drift_cov[HEADING, HEADING] = min(s.drift_cov[HEADING, HEADING] + std * std, UNKNOWN_VAR)
+    if s.level_by_gps == 1:
+        s.drift_cov[TILT, TILT] += std * std
+        s.drift_cov[TILT + 1, TILT + 1] += std * std

@@ -12,7 +12,7 @@ from gateway.estimation.alignment.gps_velocity import (
 )
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.columns import GPS_DECLINATION
-from gateway.estimation.complementary.bias import update_bias
+from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
 )
@@ -20,7 +20,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import level_time_s, raise_heading_variance
+from gateway.estimation.complementary.drift import raise_attitude_variance
 from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
@@ -74,7 +74,7 @@ def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
         turn = (math.cos(half), 0.0, 0.0, math.sin(half))
         write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
     turned = (GAP_TILT_RATE + turning) * dt
-    raise_heading_variance(s, turned)
+    raise_attitude_variance(s, turned)
     if turned > GAP_LOST_RAD and not still:
         lose_attitude(s, p)
     refresh(s)
@@ -118,8 +118,8 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     if is_sound(vel, FASTEST_MPS) and s.lost == 0:
         at_s = look_back(s, at_s)
         interval = take_fix_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
-        if interval > 0.0:
-            update_bias(s, p, level_time_s(s, p), interval)
+        if interval > 0.0 and s.at_rest == 1:
+            update_bias_at_rest(s, p, interval)
     refresh(s)
 
 
@@ -127,7 +127,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
 def align(
     s: ComplementaryState, p: ComplementaryGains, at_s: float, vel: Vec3, noise_mps: float
 ) -> None:
-    """Give the velocity of a fix to the alignment, and heed what that says."""
+    """Give the velocity of a fix to the alignment, and review the attitude by it."""
     if not is_sound(vel, FASTEST_MPS):
         return
     if s.time_s - s.fix_s > DEAD_RECKONING_MAX_S and is_flown_unaided(s, vel):
@@ -139,7 +139,7 @@ def align(
 
 @compiled
 def velocity_from_position(s: ComplementaryState, pos: Vec3, past: tuple[Vec3, Vec3]) -> Vec3:
-    """Stand in for a velocity that the receiver does not tell."""
+    """Return a velocity from the position alone, for a receiver that reports none."""
     share = 0.0 if s.fix_s == NEVER_S else 0.5 / max(s.time_s - s.fix_s, 0.5)
     (p0, p1, p2), (v0, v1, v2) = past
     return (

@@ -1,30 +1,47 @@
 """The GPS velocity as the reference of the specific force.
 
-From fix to fix the velocity tells the mean acceleration. Taken out of the mean specific force it
-leaves gravity, so neither a banked turn nor a take-off run tilts the horizon; and matched with
-its horizontal part it tells the heading, compass or none. Everything happens between the two
-times at which the fixes were valid: the latency costs nothing but its share of gyroscope drift.
+From fix to fix the change of velocity is the mean acceleration. Less gravity it is what the
+accelerometer must have measured; the difference corrects tilt, heading and sensor biases
+together. So neither a banked turn nor a take-off run tilts the horizon, with or without a compass.
+Both times are those at which the fixes were valid: the latency costs only its share of gyroscope
+drift.
 """
 
 import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.wahba import PAIR_WINDOW_S
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import level_time_s
-from gateway.estimation.complementary.heading import is_heading_good, take_match
-from gateway.estimation.complementary.tilt import take_gravity
+from gateway.estimation.complementary.drift import (
+    FORCE,
+    HEADING,
+    TILT,
+    carry_drift,
+    cleared_row,
+    correct_drift,
+    start_level,
+)
+from gateway.estimation.complementary.heading import is_heading_good
 from gateway.estimation.kernel_record import as_quat, as_vec, write_vec
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 MIN_BASELINE_S: Final = 0.15
 """Fixes closer together are joined: the difference of their velocities is mostly noise."""
 MAX_BASELINE_S: Final = 2.5
-"""Over a longer gap the mean acceleration says little about the attitude now."""
+"""Over a longer gap the mean acceleration contains little about the present attitude."""
+JITTER_S: Final = 0.03
+"""How much the latency of a fix varies."""
+FORCE_NOISE_MPS2: Final = 0.1
+"""Error of the accelerometer beside its bias, with a correlation time of a second."""
+LEVEL_STD_RAD: Final = 0.05
+"""Error of a level that came from gravity."""
+OUTLIER_SIGMA: Final = 3.0
 
 
 @compiled
@@ -65,7 +82,7 @@ def take_fix_velocity(
     write_vec(s.fix_force_i, force_i)
     write_vec(s.fix_vel, vel)
     s.fix_valid_s = valid_s
-    if dt > MAX_BASELINE_S:
+    if dt > MAX_BASELINE_S or s.heading_known == 0:
         return 0.0
     mean = (
         (force_i[0] - old_force[0]) / dt,
@@ -73,12 +90,76 @@ def take_fix_velocity(
         (force_i[2] - old_force[2]) / dt,
     )
     accel = ((vel[0] - old_vel[0]) / dt, (vel[1] - old_vel[1]) / dt, (vel[2] - old_vel[2]) / dt)
-    take_match(s, p, rotate(as_quat(s.q_ei), mean), accel, dt, noise_mps)
-    if not is_heading_good(s):
-        return 0.0
+    if s.at_rest == 1:
+        accel = (0.0, 0.0, 0.0)
+    carry_drift(s, p)
+    if s.level_by_gps == 0 and is_heading_good(s):
+        start_level(s, p, LEVEL_STD_RAD)
+    force = rotate(as_quat(s.q_ei), mean)
+    variance = match_variance(s, force, noise_mps) / dt
+    for axis in range(3):
+        match_force(s, p, axis, mean, accel, variance)
+    if s.at_rest == 0:
+        s.heading_true = 1
+    return dt if s.level_by_gps == 1 else 0.0
+
+
+@compiled
+def match_variance(s: ComplementaryState, force_e: Vec3, noise_mps: float) -> float:
+    """Return the variance of the mean acceleration over one second, m2/s4.
+
+    In a manoeuvre it includes the jitter of the latency.
+    """
+    steady = FORCE_NOISE_MPS2 * FORCE_NOISE_MPS2
+    if s.level_by_gps == 0:
+        steady += (LEVEL_STD_RAD * STANDARD_GRAVITY_MPS2) ** 2
+    if s.at_rest == 1:
+        return steady
+    late_mps = JITTER_S * math.hypot(force_e[0], force_e[1])
+    return steady + 2.0 * (noise_mps * noise_mps + late_mps * late_mps) / PAIR_WINDOW_S
+
+
+@compiled
+def match_force(
+    s: ComplementaryState,
+    p: ComplementaryGains,
+    axis: int,
+    mean_i: Vec3,
+    accel_n: Vec3,
+    variance: float,
+) -> None:
+    """Correct the states by one axis of the force in the level frame.
+
+    Parameters
+    ----------
+    s : ComplementaryState
+        Changed in place.
+    p : ComplementaryGains
+        Constants.
+    axis : int
+        0 to 2.
+    mean_i : tuple of 3 floats
+        Mean specific force in the inertial frame, m/s2.
+    accel_n : tuple of 3 floats
+        Mean acceleration in NED, m/s2.
+    variance : float
+        Of the difference along an axis, m2/s4.
+    """
+    q_eb, b = as_quat(s.q_eb), s.accel_bias_b
+    raw, bias = rotate(as_quat(s.q_ei), mean_i), rotate(q_eb, (b[0], b[1], b[2]))
+    f = (raw[0] - bias[0], raw[1] - bias[1], raw[2] - bias[2])
     half = -0.5 * s.heading_rad
-    in_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel)
-    in_i = rotate_inverse(as_quat(s.q_ei), in_e)
-    gravity = (mean[0] - in_i[0], mean[1] - in_i[1], mean[2] - in_i[2])
-    take_gravity(s, gravity, level_time_s(s, p), dt)
-    return dt
+    accel_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel_n)
+    gravity = STANDARD_GRAVITY_MPS2 if axis == 2 else 0.0
+    row = cleared_row(s)
+    if axis == 0:
+        row[TILT + 1], row[HEADING] = f[2], -f[1]
+    elif axis == 1:
+        row[TILT], row[HEADING] = -f[2], f[0]
+    else:
+        row[TILT], row[TILT + 1] = f[1], -f[0]
+    level = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
+    in_b = rotate_inverse(q_eb, level)
+    for k in range(3):
+        row[FORCE + k] = -in_b[k]
+    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA)

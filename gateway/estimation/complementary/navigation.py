@@ -2,7 +2,7 @@
 
 Horizontally the paper's eq. 1, 2, 7 and 8 as recursions; the weights follow from a time constant,
 so they suit any fix rate. Vertically the barometer, offset to the GPS height, blends in the same
-way and also learns the error of the vertical acceleration; the fixes tell the other two.
+way and also learns the error of the vertical acceleration.
 """
 
 import math
@@ -16,7 +16,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S
-from gateway.geometry.quaternion import rotate, rotate_inverse
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -24,9 +24,6 @@ DRIFT_MPS2: Final = 1.0
 """Acceleration error that dead reckoning may have had, for the gates."""
 BLUNDER_H_ACC_M: Final = 30.0
 ACCEL_BIAS_LIMIT_MPS2: Final = 1.0
-TAU_ACCEL_BIAS_S: Final = 60.0
-"""Time in which the accelerometer's bias is learned from the fixes."""
-LEVEL_BIAS_LIMIT_MPS2: Final = 0.5
 REST_DECAY_S: Final = 0.5
 
 
@@ -49,7 +46,7 @@ def dead_reckon(s: ComplementaryState, force_b: Vec3, dt: float) -> None:
     north, east, down = rotate(as_quat(s.q_nb), unbiased)
     accel = (north, east, down + STANDARD_GRAVITY_MPS2 - s.accel_bias_d)
     if s.lost == 1:
-        # With no attitude to turn it by, the force tells nothing: straight on between fixes.
+        # With no attitude to turn it by, the force is of no use: straight on between fixes.
         accel = (0.0, 0.0, 0.0)
     for k in range(3):
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * accel[k] * dt) * dt
@@ -69,7 +66,7 @@ def restart_at(s: ComplementaryState, pos: Vec3, vel: Vec3, lag: float) -> None:
     if not math.isfinite(down):
         return
     if s.has_height == 1 and s.baro_known == 1:
-        # The barometer has held the height so far; the fix tells its offset to the sea.
+        # The barometer has held the height so far; the fix gives its offset to the sea.
         s.baro_offset_m += down - s.pos_n[2]
     s.pos_n[2] = down
     s.has_height = 1
@@ -119,8 +116,6 @@ def blend_fix(
         step = gain_vel * (vel[k] - past[1][k])
         s.pos_n[k] += gain_pos * (pos[k] - past[0][k]) + step * lag
         s.vel_n[k] += step
-    if s.at_rest == 0:
-        learn_accel_bias(s, gain_vel, vel, past[1])
     if not math.isfinite(pos[2]):
         return
     if s.has_height == 0:
@@ -136,18 +131,6 @@ def blend_fix(
         step = gain_vel * (vel[2] - past[1][2])
         s.pos_n[2] += gain_pos * (pos[2] - past[0][2]) + step * lag
         s.vel_n[2] += step
-
-
-@compiled
-def learn_accel_bias(s: ComplementaryState, gain_vel: float, vel: Vec3, past_vel: Vec3) -> None:
-    """Take what the fixes keep moving the level velocity by for an error fixed in the body.
-
-    Only dead reckoning is relieved of it: the attitude holds its own against such an error.
-    """
-    off = rotate_inverse(as_quat(s.q_nb), (vel[0] - past_vel[0], vel[1] - past_vel[1], 0.0))
-    for k in range(3):
-        bias = s.accel_bias_b[k] - gain_vel / TAU_ACCEL_BIAS_S * off[k]
-        s.accel_bias_b[k] = max(-LEVEL_BIAS_LIMIT_MPS2, min(LEVEL_BIAS_LIMIT_MPS2, bias))
 
 
 @compiled

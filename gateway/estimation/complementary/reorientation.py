@@ -1,6 +1,7 @@
 """An attitude that is lost, and one that the alignment has found."""
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import (
@@ -22,16 +23,17 @@ from gateway.estimation.complementary.drift import (
     heading_variance,
     raise_bias_variance,
     start_heading,
+    start_level,
 )
-from gateway.estimation.complementary.tilt import refresh
-from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
+from gateway.estimation.complementary.manoeuvre import LEVEL_STD_RAD
+from gateway.estimation.complementary.tilt import hold_level, refresh
+from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
-from gateway.geometry.quaternion import multiply, normalise, rotate_inverse
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.geometry.quaternion import multiply, normalise
 
-LEVEL_STD_RAD = 0.05
-"""What the level of this estimator may be off in a manoeuvre."""
+LEAST_LEVEL_RAD: Final = 0.02
+"""A level that was found is off by the accelerometer's bias at least."""
 
 
 @compiled
@@ -53,7 +55,7 @@ def begin_level(s: ComplementaryState) -> None:
 
 @compiled
 def watch_gravity(s: ComplementaryState, p: ComplementaryGains) -> None:
-    """Look at gravity where GPS tells no velocity."""
+    """Look at gravity where there is no GPS velocity."""
     dt = align_by_gravity(s, s.time_s, as_vec(s.integrals), GRAVITY_PAIR_S)
     if dt > 0.0:
         review_attitude(s, p, dt)
@@ -74,7 +76,7 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
         if tells_heading(s) and s.at_rest == 0:
             forget_heading(s, p)
             turn_rad = heading_difference(as_quat(s.found_q_nb), q)
-            start_heading(s, s.heading_rad + turn_rad, found_heading_std(s) ** 2)
+            start_heading(s, p, s.heading_rad + turn_rad, found_heading_std(s) ** 2)
             s.heading_known = s.heading_true = 1
             refresh(s)
         return
@@ -82,17 +84,18 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
     raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
     forget_heading(s, p)
     if s.at_rest == 1:
-        # Of a heading the GPS tells only its own noise then.
+        # At rest a heading from GPS is only noise.
         s.heading_known = 0
     if s.heading_known == 1:
         s.heading_true = 1
-        start_heading(s, s.heading_rad, found_heading_std(s) ** 2)
+        start_heading(s, p, s.heading_rad, found_heading_std(s) ** 2)
     begin_level(s)
     # The level frame is NED turned about down by the heading; the gyroscope's frame stays.
     half = -0.5 * s.heading_rad
     level = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found)
     q_ib = as_quat(s.q_ib)
     write_quat(s.q_ei, normalise(multiply(level, (q_ib[0], -q_ib[1], -q_ib[2], -q_ib[3]))))
-    gravity = rotate_inverse(as_quat(s.q_ei), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
-    write_vec(s.force_lp_i, gravity)
+    hold_level(s)
+    if s.by_gps == 1 and s.heading_known == 1:
+        start_level(s, p, max(s.level_std, LEAST_LEVEL_RAD))
     refresh(s)

@@ -20,8 +20,10 @@ from gateway.geometry.quaternion import (
     multiply,
     normalise,
     rotate,
+    rotate_inverse,
 )
 from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 
 @compiled
@@ -118,3 +120,13 @@ def level(s: ComplementaryState) -> None:
     write_quat(s.q_ei, normalise(multiply(normalise(correction), as_quat(s.q_ei))))
     s.tilt_sum[0] -= y
     s.tilt_sum[1] += x
+
+
+@compiled
+def hold_level(s: ComplementaryState) -> None:
+    """Let gravity's low-pass go on from the present level."""
+    gravity = rotate_inverse(as_quat(s.q_ei), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    for k in range(3):
+        s.force_lp_i[k] = s.force_in_i[k] = gravity[k]
+        s.force_lp_rate_i[k] = 0.0
+    s.tilt_sum[0] = s.tilt_sum[1] = 0.0
