@@ -1,10 +1,15 @@
 """Summary of any recording, for `mavgate info`."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway.edges.disk.recording_streams import (
     FileKind,
+    Progress,
     kind_of,
     other_format,
     read_batches,
@@ -12,25 +17,23 @@ from gateway.edges.disk.recording_streams import (
 )
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary
 from gateway.flightlog.table.table import TableReader
-from gateway.flights.joined import shifted
-from gateway.flights.reading import (
-    NO_RECORDING,
-    FlightError,
-    ReadOptions,
-    is_table,
-    open_rows,
-)
+from gateway.flights.flight_terms import NO_RECORDING, FlightError
+
+if TYPE_CHECKING:
+    from gateway.flights.reading import ReadOptions
 
 
-def describe(file: Path, options: ReadOptions) -> FileInfo:
+def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOptions]) -> FileInfo:
     """Summarise a recording.
 
     Parameters
     ----------
     file : Path
         A tlog, a table, or what can be read as one.
-    options : ReadOptions
-        Column map; its progress is called with how many more bytes were read.
+    progress : callable or None
+        Called with the number of further bytes read.
+    options : callable
+        Returns how other programs' files are read; called for these alone.
 
     Returns
     -------
@@ -43,26 +46,36 @@ def describe(file: Path, options: ReadOptions) -> FileInfo:
     OSError
         If it cannot be read.
     """
-    kind, size, advance = kind_of(file), file.stat().st_size, options.progress
+    kind, size = kind_of(file), file.stat().st_size
     if kind is FileKind.TLOG:
         tlog = TlogSummary()
-        for batch in read_batches(file, advance):
+        for batch in read_batches(file, progress):
             tlog.add(batch)
         found = tlog.result(size)
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found
-    table, reader = TableSummary(), TableReader()
     if kind in (FileKind.FOREIGN, FileKind.OTHER):
-        foreign = open_rows(file, options)
-        own = is_table(file)
-        zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
-        for block in foreign.blocks:
-            table.add(shifted(block, zero_us), foreign.header)
-        name = other_format(file) if kind is FileKind.OTHER else kind.value
-        header = foreign.header if own else None
-        remarks = tuple(foreign.remarks)
-        return replace(table.result(size), kind=name, header=header, remarks=remarks)
-    for block in read_blocks(file, reader, advance):
+        return _describe_foreign(file, kind, options())
+    table, reader = TableSummary(), TableReader()
+    for block in read_blocks(file, reader, progress):
         table.add(block, reader.header)
     return table.result(size)
+
+
+def _describe_foreign(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
+    # They import every stage, which a summary of a recording of our own does not need.
+    from gateway.flights.joined import shifted
+    from gateway.flights.reading import is_table, open_rows
+
+    foreign, table = open_rows(file, options), TableSummary()
+    own = is_table(file)
+    zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
+    for block in foreign.blocks:
+        table.add(shifted(block, zero_us), foreign.header)
+    return replace(
+        table.result(file.stat().st_size),
+        kind=other_format(file) if kind is FileKind.OTHER else kind.value,
+        header=foreign.header if own else None,
+        remarks=tuple(foreign.remarks),
+    )

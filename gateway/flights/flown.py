@@ -12,8 +12,9 @@ from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.edges.disk.tracker_csv import read_flight
 from gateway.flightlog.table.row import TableRow
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, open_rows
+from gateway.flights.reading import ReadOptions, aircraft_of, open_rows
 from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain, pressure_altitude_m
 from gateway.simulator.recorded import RecordedFlight

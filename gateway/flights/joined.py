@@ -15,7 +15,8 @@ from gateway.flightlog.table.table import (
     TableMark,
 )
 from gateway.flightlog.tlog.stamps import JUMP_US
-from gateway.flights.reading import FlightError, RecordedTable
+from gateway.flights.flight_terms import FlightError
+from gateway.flights.reading import RecordedTable
 from gateway.records import FusionState, NodeStatus
 
 Limits = tuple[Moment | None, Moment | None]

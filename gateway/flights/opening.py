@@ -12,7 +12,8 @@ from gateway.edges.disk.tlog_file import TlogFile
 from gateway.flightlog.answers import LogAnswers
 from gateway.flightlog.tlog.recorded_commands import FIRST_GROUND_STATION, is_station
 from gateway.flightlog.track import Source, Track
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions
+from gateway.flights.flight_terms import NO_RECORDING, FlightError
+from gateway.flights.reading import ReadOptions
 from gateway.flights.refusion import Refusion, end_of
 
 

@@ -9,13 +9,14 @@ from importlib import import_module
 from importlib.resources import files
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import (
     OTHER_FORMATS,
+    PARQUET,
     FileKind,
     Progress,
     kind_of,
@@ -38,6 +39,7 @@ from gateway.flightlog.table.table import (
     block_of,
 )
 from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.flight_terms import FlightError, Position, SettingsChoice
 from gateway.pipeline import PipelineSettings
 from gateway.records import FusionState, NodeStatus
 from gateway.replay import header_for, settings_of
@@ -46,18 +48,8 @@ from gateway.sensing.calibration import NodeCalibration
 TRACKER_LOG: Final = files("gateway.flights") / "tracker-log.toml"
 """The map for logs whose columns are time_s, ax, gx and so on."""
 
-Position = Literal["causal", "interpolated"]
-SettingsChoice = Literal["recorded", "current"]
-
 
 Line = TableRow | TableHeader | TableMark | FusionState | NodeStatus
-
-
-NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
-
-
-class FlightError(Exception):
-    """A file without the data that a command needs; the text says what and where."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +98,6 @@ Read = Callable[[Path, ReadOptions], RecordedTable]
 
 READERS: Final[dict[str, Read]] = {}
 """Of the formats in `OTHER_FORMATS`."""
-PARQUET: Final = "Parquet"
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
@@ -145,14 +136,14 @@ def import_format(module: str, name: str) -> Any:
         ) from error
 
 
-def _add_packaged(name: str, heads: tuple[bytes, ...], module: str) -> None:
+def _add_packaged(name: str, module: str) -> None:
     """Add a reader whose packages are imported with the first file of its format."""
 
     def read(path: Path, options: ReadOptions) -> RecordedTable:
         table: RecordedTable = import_format(module, name).read(path, options)
         return table
 
-    add_reader(name, lambda head: head.startswith(heads), read)
+    READERS[name] = read
 
 
 def is_table(path: Path) -> bool:
@@ -323,6 +314,6 @@ def _header_of_today(
     return msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
 
 
-_add_packaged("ULog", (b"ULog\x01\x12\x35",), "ulog_file")
-_add_packaged("DataFlash", (b"\xa3\x95", b"FMT,"), "dataflash_file")
-_add_packaged(PARQUET, (b"PAR1",), "parquet_file")
+_add_packaged("ULog", "ulog_file")
+_add_packaged("DataFlash", "dataflash_file")
+_add_packaged(PARQUET, "parquet_file")

@@ -16,13 +16,7 @@ from gateway.flightlog.table.table import TableBlock, TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import (
-    ReadOptions,
-    RecordedTable,
-    aircraft_of,
-    foreign_rows,
-    open_rows,
-)
+from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, foreign_rows, open_rows
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,

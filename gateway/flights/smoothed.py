@@ -15,7 +15,7 @@ from gateway.estimation.smoothing.smoother import smooth
 from gateway.flightlog.table.cells import has_group
 from gateway.flightlog.table.row import RAW, SI
 from gateway.flightlog.table.table import NO_ROWS, TableBlock
-from gateway.flights.reading import FlightError
+from gateway.flights.flight_terms import FlightError
 from gateway.records import BaroRaw, GpsFix, NavState
 from gateway.replay import calibrated_of, heard_of
 from gateway.sensing.chain import SensorChain

@@ -15,11 +15,10 @@ from gateway.flightlog.moment import place_in
 from gateway.flightlog.table.table import encode_block, encode_head
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.flights.joined import Limits, joined_tables, trimmed
 from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import (
-    NO_RECORDING,
-    FlightError,
     ReadOptions,
     RecordedTable,
     aircraft_of,

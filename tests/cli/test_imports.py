@@ -44,3 +44,9 @@ def test_the_gateway_imports_nothing_that_it_may_not_need() -> None:
         "gateway.simulator.simulator_settings",
         "gateway.simulator.timed_frame",
     }
+
+
+def test_a_summary_of_a_recording_needs_neither_settings_nor_stages() -> None:
+    found = imported_by("gateway.cli.app", "gateway.cli.recorded.info")
+    assert found & (NEVER | {"numba", "scipy"}) == set()
+    assert not {"gateway.config", "gateway.aircraft", "gateway.flights.reading"} & found

@@ -10,8 +10,9 @@ from gateway.config import GatewaySettings
 from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flightlog.tlog.tlog import encode_record
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.flown import open_flown
-from gateway.flights.reading import FlightError, ReadOptions
+from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
 from tests.flightlog.frames import START_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight, read

@@ -13,8 +13,9 @@ from gateway.flightlog.answers import VehicleAnswers
 from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head, encode_header
 from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.opening import PlayedFlight, lay_out, open_flights
-from gateway.flights.reading import FlightError, ReadOptions
+from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
 from gateway.replay import header_for
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog

@@ -36,16 +36,10 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.flightlog.table.cells import has_group
 from gateway.flightlog.table.row import NAV
 from gateway.flightlog.table.table import TableBlock
+from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import (
-    FlightError,
-    ReadOptions,
-    RecordedTable,
-    SettingsChoice,
-    aircraft_of,
-    open_rows,
-)
+from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, open_rows
 from gateway.flights.refusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import gather_samples, smooth_blocks, with_smoothed_estimator

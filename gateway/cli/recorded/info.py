@@ -1,8 +1,11 @@
 """`mavgate info` and `mavgate recover`: summarise a recording, and repair a damaged one."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
@@ -38,9 +41,12 @@ from gateway.flightlog.table.table import (
 )
 from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flights.describing import describe
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions
+from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.output import write_new
 from gateway.units import US_PER_S
+
+if TYPE_CHECKING:
+    from gateway.flights.reading import ReadOptions
 
 SHOWN: Final = 8
 """Gaps and damaged places that are listed one by one."""
@@ -65,20 +71,24 @@ def info(
 ) -> None:
     """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
     with refusing():
-        files = files_of([file], recordings_folder(config), "all")
+        # A file needs no settings, which would import every stage.
+        files = [file] if file.exists() else files_of([file], recordings_folder(config), "all")
     with progress_of(files) as advance, refusing():
-        options = ReadOptions(
-            pipeline_settings(read_settings(config)),
-            columns=read_column_map(columns),
-            progress=advance,
-        )
-        found = [(each, describe(each, options)) for each in files]
+        options = partial(_read_options, columns, config, advance)
+        found = [(each, describe(each, advance, options)) for each in files]
     for number, (each, info_of_file) in enumerate(found):
         if json:
             print(msgspec.json.encode(info_of_file).decode())
         else:
             print(end="\n" if number else "")
             _show(each, info_of_file)
+
+
+def _read_options(columns: Path | None, config: Path | None, progress: Progress) -> ReadOptions:
+    from gateway.flights.reading import ReadOptions
+
+    current = pipeline_settings(read_settings(config))
+    return ReadOptions(current, columns=read_column_map(columns), progress=progress)
 
 
 def recover(

@@ -50,8 +50,9 @@ from gateway.flightlog.playback import (
     PlayState,
     check_speed,
 )
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.opening import lay_out, open_flights
-from gateway.flights.reading import FlightError, ReadOptions
+from gateway.flights.reading import ReadOptions
 from gateway.player import (
     PlayerDaemon,
     PlayPlan,

@@ -21,15 +21,9 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import (
-    FlightError,
-    ReadOptions,
-    SettingsChoice,
-    aircraft_of,
-    is_table,
-    open_rows,
-)
+from gateway.flights.reading import ReadOptions, aircraft_of, is_table, open_rows
 
 FlightArgument = Annotated[
     Path | None,

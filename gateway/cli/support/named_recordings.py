@@ -1,14 +1,18 @@
 """Recordings by name, as `mavgate record list` shows them, wherever a file is accepted."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from gateway.cli.support.asking import ask, is_running
 from gateway.cli.support.settings_options import read_settings
-from gateway.config import GatewaySettings
 from gateway.edges.disk.recordings import RecordingError, find_recording
-from gateway.flights.reading import FlightError
+from gateway.flights.flight_terms import FlightError
+
+if TYPE_CHECKING:
+    from gateway.config import GatewaySettings
 
 Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""

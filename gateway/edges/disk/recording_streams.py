@@ -36,7 +36,16 @@ class FileKind(StrEnum):
     """A format in `OTHER_FORMATS`."""
 
 
-OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {}
+def _begins(*heads: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(heads)
+
+
+PARQUET: Final = "Parquet"
+OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
+    "ULog": _begins(b"ULog\x01\x12\x35"),
+    "DataFlash": _begins(b"\xa3\x95", b"FMT,"),
+    PARQUET: _begins(b"PAR1"),
+}
 """Whether a file that begins with these bytes is of a format, by the format's name."""
 
 

@@ -21,8 +21,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.compiled import compiled
-from gateway.compiled.entry_point import dispatched
+from gateway.compiled import address_of, array_at, compiled
+from gateway.compiled.entry_point import EntryPoint
 from gateway.wire.mavlink_messages import CRC_EXTRA
 
 ByteArray = NDArray[np.uint8]
@@ -43,6 +43,11 @@ _UNKNOWN: Final = -1
 _YES: Final = 1
 _NO: Final = 0
 _WAIT: Final = -1
+
+_FINAL, _STRICT, _IN_STEP = 1, 2, 4
+_BYTE: Final = np.dtype(np.uint8)
+_INT: Final = np.dtype(np.int64)
+_EXTRA: Final = np.dtype(np.int16)
 
 
 def crc_extra_table() -> ExtraArray:
@@ -131,7 +136,6 @@ def _judge(
     return size if checksum == _WAIT and (successor == _YES or in_step) else 0
 
 
-@dispatched
 def scan(
     data: ByteArray,
     final: bool,
@@ -169,6 +173,48 @@ def scan(
     in_step : bool
         To be handed to the next call.
     """
+    found = np.zeros(4, np.int64)
+    arrays = (extra, records, damage, found)
+    flags = final * _FINAL | strict * _STRICT | in_step * _IN_STEP
+    places = [address_of(array) for array in (data, *arrays)]
+    _scan_at(len(data), records.shape[1], flags, *places)
+    at, count, damaged, in_step_now = found.tolist()
+    return (at, count, damaged, bool(in_step_now))
+
+
+def scan_entry(
+    size: int,
+    room: int,
+    flags: int,
+    data_at: int,
+    extra_at: int,
+    records_at: int,
+    damage_at: int,
+    found_at: int,
+) -> None:
+    """Do `scan` on arrays by their addresses; writes its result as four numbers."""
+    data = array_at(data_at, (size,), _BYTE)
+    extra = array_at(extra_at, (_KNOWN_IDS,), _EXTRA)
+    records = array_at(records_at, (COLUMNS, room), _INT)
+    damage = array_at(damage_at, (2, room + 1), _INT)
+    found = array_at(found_at, (4,), _INT)
+    final, strict = (flags & _FINAL) != 0, (flags & _STRICT) != 0
+    at, count, damaged, in_step = _walk(
+        data, final, strict, (flags & _IN_STEP) != 0, extra, records, damage
+    )
+    found[0], found[1], found[2], found[3] = at, count, damaged, in_step
+
+
+@compiled
+def _walk(
+    data: ByteArray,
+    final: bool,
+    strict: bool,
+    in_step: bool,
+    extra: ExtraArray,
+    records: IntArray,
+    damage: IntArray,
+) -> tuple[int, int, int, bool]:
     at = count = damaged = 0
     bad_from = -1
     while at < data.size:
@@ -199,3 +245,6 @@ def scan(
         damage[0, damaged], damage[1, damaged] = bad_from, at
         damaged += 1
     return (at, count, damaged, in_step)
+
+
+_scan_at: Final = EntryPoint(scan_entry)

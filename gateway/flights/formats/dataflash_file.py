@@ -15,7 +15,8 @@ from pymavlink.DFReader import DFReader_binary, DFReader_text
 from gateway.edges.disk.recording_streams import GZIP, read_chunks
 from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
-from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.flights.flight_terms import FlightError
+from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.units import US_PER_S
 
 MAGIC: Final = b"\xa3\x95"

@@ -24,9 +24,10 @@ from gateway.flightlog.table.table import (
     encode_header,
     encode_line,
 )
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.formats.decoded import decoded
 from gateway.flights.formats.pieces import Pieces
-from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_blocks
+from gateway.flights.reading import ReadOptions, RecordedTable, table_of_blocks
 from gateway.flights.writing import FlightToWrite
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import origin_of

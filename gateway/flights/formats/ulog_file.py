@@ -12,7 +12,8 @@ from pyulog.exceptions import ULogException
 from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
 from gateway.flightlog.table.row import RowBuilder, TableRow
-from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.flights.flight_terms import FlightError
+from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
 
 MS_PER_S: Final = 1000.0
 SYSTEM_ID: Final = "MAV_SYS_ID"

@@ -18,9 +18,10 @@ from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.contest import Axis, SweepError, Trials, base_score, grid, make_contest
 from gateway.edges.disk.recordings import recording_name
 from gateway.flights.describing import describe
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import FlightError, ReadOptions, aircraft_of, open_rows
+from gateway.flights.reading import ReadOptions, aircraft_of, open_rows
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.replay import header_for
 from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
@@ -194,7 +195,7 @@ class InfoTask(_ReadingTask):
     def do(self, files: list[Path], name: str) -> Worked:  # noqa: ARG002
         """See `FlightTask`."""
         (file,) = files
-        found = describe(file, self.options)
+        found = describe(file, self.options.progress, lambda: self.options)
         zero_us = 0 if found.header is None else found.header.unix_us_at_zero
         first_us = found.first_us
         began = None if zero_us is None or first_us is None else zero_us + first_us

@@ -20,7 +20,8 @@ from gateway.edges.disk.recording_streams import (
     read_chunks,
 )
 from gateway.edges.disk.recordings import recording_name
-from gateway.flights.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
+from gateway.flights.flight_terms import NO_RECORDING, FlightError
+from gateway.flights.reading import ReadOptions, open_rows
 from gateway.season.executors import Executor, WorkFailed
 from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
 from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows

@@ -20,8 +20,8 @@ from gateway.config import GatewaySettings, load
 from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.glance import END_BYTES, glance
-from gateway.flights.reading import FlightError
 from gateway.player import PlayerDaemon
 from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 from tests.test_replay import fly, make_flight, read

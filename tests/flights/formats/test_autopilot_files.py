@@ -20,9 +20,10 @@ from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableReader
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.flown import open_flown
 from gateway.flights.opening import open_flights
-from gateway.flights.reading import FlightError, ReadOptions, RecordedTable, open_rows
+from gateway.flights.reading import ReadOptions, RecordedTable, open_rows
 from gateway.pipeline import PipelineSettings
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.flights.formats import flown
