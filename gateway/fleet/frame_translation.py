@@ -36,6 +36,8 @@ RATE_MARKS: Final = 6
 """Five seconds between the first and the last."""
 MAX_LOST: Final = 128
 """A greater step is a restart rather than a loss."""
+MAX_OVERTAKEN: Final = 32
+"""Texts and answers have a higher priority on the way: what they overtake comes late, but comes."""
 
 
 @dataclass(slots=True)
@@ -161,6 +163,9 @@ class FrameTranslation:
         traffic.heard_us = now_us
         sequence = sequence_of(frame)
         if (before := self._sequences.get(origin)) is not None:
+            if 0 < (before - sequence & SEQUENCE_MASK) <= MAX_OVERTAKEN:
+                traffic.lost = max(0, traffic.lost - 1)
+                return
             gap = sequence - before - 1 & SEQUENCE_MASK
             traffic.lost += gap if gap < MAX_LOST else 0
         self._sequences[origin] = sequence

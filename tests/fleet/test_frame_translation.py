@@ -232,13 +232,22 @@ def test_system_0_is_nobody() -> None:
     assert there.traffic == {}
 
 
-def test_loss_by_the_sequence_numbers() -> None:
+@pytest.mark.parametrize(
+    ("numbers", "lost"),
+    [
+        ((250, 251, 254, 255, 0, 3, 3), 4),
+        ((254, 1, 255, 0, 2, 3), 0),
+        ((10, 12, 11, 13, 200, 201), 0),
+    ],
+    ids=["gaps", "a text overtakes", "a restart"],
+)
+def test_loss_by_the_sequence_numbers(numbers: tuple[int, ...], lost: int) -> None:
     there = translation()
-    for number in (250, 251, 254, 255, 0, 3, 3):
+    for number in numbers:
         frame = bytearray(packed(attitude(), 1))
         frame[4] = number
         there.from_site(bytes(frame), number)
-    assert (there.traffic[1].frames, there.traffic[1].lost) == (7, 4)
+    assert (there.traffic[1].frames, there.traffic[1].lost) == (len(numbers), lost)
 
 
 @pytest.mark.parametrize("message_id", sorted(TARGET_OFFSETS))
