@@ -16,7 +16,8 @@ from gateway.flightlog.table.table import TableBlock, TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, foreign_rows, open_rows
+from gateway.flights.log_facts import aircraft_for
+from gateway.flights.reading import ReadOptions, RecordedTable, foreign_rows, is_table, open_rows
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,
@@ -52,8 +53,9 @@ class Refusion:
         self, files: Sequence[Path], options: ReadOptions, *, smooth: bool = False
     ) -> None:
         self._table = table = joined_tables([open_rows(file, options) for file in files])
-        self._aircraft, self._zero_us = aircraft_of(table, options), table.header.unix_us_at_zero
-        self._recorded = options.choice == "recorded"
+        self._aircraft = aircraft_for(files, table, options)
+        self._zero_us = table.header.unix_us_at_zero
+        self._recorded = options.choice == "recorded" and is_table(files[0])
         correct: Callable[[NavState], NavState] | None = None
         if smooth:
             self._aircraft = with_smoothed_estimator(self._aircraft)

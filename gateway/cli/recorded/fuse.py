@@ -1,10 +1,8 @@
 """`mavgate fuse`: run an estimator causally over a log, from CSV to CSV."""
 
-import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -28,10 +26,7 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
-from gateway.estimation.alignment.gps_latency import estimate_latency
 from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import ESTIMATORS
 from gateway.flightlog.table.cells import has_group
 from gateway.flightlog.table.row import NAV
@@ -39,16 +34,14 @@ from gateway.flightlog.table.table import TableBlock
 from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
+from gateway.flights.log_facts import aircraft_for
 from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, open_rows
 from gateway.flights.refusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
-from gateway.flights.smoothed import gather_samples, smooth_blocks, with_smoothed_estimator
+from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new
 from gateway.records import FusionState
 from gateway.replay import header_for
-
-_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
-HEAD_LINES: Final = 20
 
 
 def register(app: typer.Typer) -> None:
@@ -97,19 +90,18 @@ def fuse_log(
     inputs = [*files, columns, config]
     with progress_of(files) as advance, refusing():
         check_output(out, inputs, overwrite=force)
-        facts = _facts_of(files[0]) if kind_of(files[0]) is FileKind.FOREIGN else {}
         options = ReadOptions(
             current=pipeline_settings(current),
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,
         )
-        if kind_of(files[0]) is FileKind.FOREIGN and "gps_latency_s" not in facts and not config:
-            gps_latency_s = _found_latency_s(files[0], gps_latency_s, options)
         table = joined_tables([open_rows(part, options) for part in files])
-        aircraft = _adjusted(
-            aircraft_of(table, options), estimator, gps_latency_s, {} if config else facts
-        )
+        if config is None:
+            aircraft = aircraft_for(files, table, options, gps_latency_s)
+        else:
+            aircraft = aircraft_of(table, options)
+        aircraft = _adjusted(aircraft, estimator, gps_latency_s)
         try:
             if smooth:
                 aircraft = with_smoothed_estimator(aircraft)
@@ -127,25 +119,6 @@ def fuse_log(
     print_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
-
-
-def _found_latency_s(file: Path, given_s: float | None, options: ReadOptions) -> float:
-    """Estimate the latency if neither the log nor the user gives it, or assume the usual one."""
-    if given_s is not None:
-        return given_s
-    table = open_rows(file, replace(options, progress=None))
-    aircraft = aircraft_of(table, options)
-    found = estimate_latency(gather_samples(table.blocks, aircraft)[0])
-    latency_s = aircraft.estimation.reference.gps_latency_s if found is None else found.latency_s
-    how = (
-        f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
-        if found is None
-        else f"{latency_s:.3f} s +- {found.std_s:.3f} s is estimated from its manoeuvres"
-    )
-    console_of(stderr=True).print(
-        f"{file}: gives no GPS latency; {how}; --gps-latency sets it", markup=False
-    )
-    return latency_s
 
 
 def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
@@ -167,39 +140,13 @@ def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
         yield TableBlock(block.cells, kept)
 
 
-def _facts_of(path: Path) -> dict[str, float]:
-    """Read the `key=value` pairs in a foreign file's comments."""
-    facts: dict[str, float] = {}
-    head = next(read_chunks(path), b"").decode("utf-8-sig", errors="replace")
-    for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
-        for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
-            try:
-                facts[key] = float(value)
-            except ValueError as error:
-                raise FlightError(f"{path}: line {number}: {key}={value} is no number") from error
-    return facts
-
-
 def _adjusted(
-    aircraft: AircraftSettings,
-    estimator: str | None,
-    gps_latency_s: float | None,
-    facts: dict[str, float],
+    aircraft: AircraftSettings, estimator: str | None, gps_latency_s: float | None
 ) -> AircraftSettings:
     estimation = aircraft.estimation
-    reference = estimation.reference
-    if gps_latency_s is None:
-        gps_latency_s = facts.get("gps_latency_s", reference.gps_latency_s)
-    reference = msgspec.structs.replace(reference, gps_latency_s=gps_latency_s)
-    if "declination_deg" in facts:
-        reference = msgspec.structs.replace(
-            reference, declination="fixed", declination_deg=facts["declination_deg"]
-        )
-    estimation = msgspec.structs.replace(
-        estimation, estimator=estimator or estimation.estimator, reference=reference
-    )
-    try:
-        msgspec.convert(msgspec.to_builtins(reference), ReferenceSettings)
-    except msgspec.ValidationError as error:
-        raise FlightError(f"its # line has an invalid value: {error}") from error
+    if estimator is not None:
+        estimation = msgspec.structs.replace(estimation, estimator=estimator)
+    if gps_latency_s is not None:
+        reference = msgspec.structs.replace(estimation.reference, gps_latency_s=gps_latency_s)
+        estimation = msgspec.structs.replace(estimation, reference=reference)
     return msgspec.structs.replace(aircraft, estimation=estimation)

@@ -23,7 +23,8 @@ from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import ReadOptions, aircraft_of, is_table, open_rows
+from gateway.flights.log_facts import aircraft_for
+from gateway.flights.reading import ReadOptions, is_table, open_rows
 
 FlightArgument = Annotated[
     Path | None,
@@ -79,7 +80,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
     with progress_of(files) as advance, refusing():
         options = _read_options(loading, advance)
         table = joined_tables([open_rows(part, options) for part in parts])
-        aircraft = aircraft_of(table, options)
+        aircraft = aircraft_for(parts, table, options)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:

@@ -21,7 +21,8 @@ from gateway.flights.describing import describe
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import ReadOptions, aircraft_of, open_rows
+from gateway.flights.log_facts import aircraft_for
+from gateway.flights.reading import ReadOptions, open_rows
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.replay import header_for
 from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
@@ -217,7 +218,7 @@ class ReadFlight:
 def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
     table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_of(table, options)
+    aircraft = aircraft_for(files, table, options)
     fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
     flight = flight_of_blocks(
         table.blocks, aircraft.calibration, fusion, name=name, story="One of a season."

@@ -1,0 +1,58 @@
+"""What a log of another program tells of its GPS, the same for every command that fuses it."""
+
+import gzip
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gateway.cli.support.loading import Loading, load_flight
+from gateway.config import GatewaySettings
+from gateway.flights.log_facts import aircraft_for
+from gateway.flights.reading import ReadOptions, open_rows
+from gateway.flights.refusion import Refusion
+from gateway.pipeline import PipelineSettings
+from gateway.replay import settings_of
+from gateway.season.batch.flight_tasks import read_season_flight
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "take_off.csv.gz"
+SETTINGS = GatewaySettings().default_aircraft
+OPTIONS = ReadOptions(PipelineSettings(SETTINGS))
+
+
+@pytest.fixture
+def untold(tmp_path: Path) -> Path:
+    path = tmp_path / "log.csv"
+    path.write_text(gzip.decompress(GOLDEN.read_bytes()).decode().replace("gps_latency_s=0.16", ""))
+    return path
+
+
+def test_every_command_takes_the_latency_that_the_manoeuvres_tell(untold: Path) -> None:
+    table = open_rows(untold, OPTIONS)
+    latency_s = aircraft_for([untold], table, OPTIONS).estimation.reference.gps_latency_s
+    assert latency_s == pytest.approx(0.16, abs=0.02)
+    assert "gives no GPS latency; 0.1" in table.remarks[0]
+    assert "s is estimated from its manoeuvres" in table.remarks[0]
+    assert load_flight(untold, Loading(GatewaySettings())).latency_s == latency_s
+    assert read_season_flight([untold], OPTIONS, "log").flight.latency_s == latency_s
+    refusion = Refusion([untold], OPTIONS)
+    assert refusion.remarks == table.remarks
+    settings = settings_of(refusion.table().header)
+    assert settings.estimation.reference.gps_latency_s == latency_s
+
+
+def test_what_the_log_the_user_or_the_settings_tell_is_taken(untold: Path) -> None:
+    def latency_s(path: Path, options: ReadOptions, told_s: float | None = None) -> float:
+        table = open_rows(path, options)
+        found = aircraft_for([path], table, options, told_s).estimation.reference.gps_latency_s
+        assert table.remarks == []
+        return found
+
+    assert latency_s(GOLDEN, OPTIONS) == 0.16
+    assert latency_s(untold, OPTIONS, 0.3) == 0.15
+    reference = msgspec.structs.replace(SETTINGS.estimation.reference, gps_latency_s=0.2)
+    estimation = msgspec.structs.replace(SETTINGS.estimation, reference=reference)
+    set_s = PipelineSettings(msgspec.structs.replace(SETTINGS, estimation=estimation))
+    assert latency_s(untold, ReadOptions(set_s)) == 0.2
