@@ -5,8 +5,8 @@ A package names a function in its `pyproject.toml`:
     [project.entry-points."mavgate.extensions"]
     my-extension = "my_package:extend"
 
-It is called once, without arguments, when a `mavgate` command starts, and adds to the registries;
-docs/extend.md shows how.
+It is called once, without arguments, when a `mavgate` command starts that does more than ask a
+running gateway, and adds to the registries; docs/extend.md shows how.
 """
 
 import logging

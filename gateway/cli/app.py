@@ -9,7 +9,6 @@ import typer
 from gateway import __version__
 from gateway.cli.command_table import LazyGroup
 from gateway.edges.operator.log_limit import LogLimit
-from gateway.extensions import ExtensionError, load_extensions
 
 app = typer.Typer(
     name="mavgate",
@@ -51,8 +50,4 @@ def _options(
 
 def main() -> None:
     """Run the command line."""
-    try:
-        load_extensions()
-    except ExtensionError as error:
-        sys.exit(f"mavgate: {error}")
     app()

@@ -5,7 +5,10 @@ not cost that. Summaries and panels are here for the list, and again as the firs
 command's docstring in its file.
 """
 
+import gc
+import sys
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any, Final
 
@@ -127,9 +130,24 @@ def load_command(name: str) -> Any:
     part = typer.Typer(rich_markup_mode="rich")
     # With a callback it is a group, however few commands the file has.
     part.callback()(lambda: None)
+    if COMMANDS[name].panel != GATEWAY:
+        _load_extensions()
     import_module(f"gateway.cli.{COMMANDS[name].module}").register(part)
     group = typer.main.get_group(part)
+    gc.enable()
     return group.commands[name]
+
+
+@cache
+def _load_extensions() -> None:
+    """Load the extensions, or end the command; one that only asks a gateway does not need them."""
+    # Imported late, because the search for installed packages takes 20 ms.
+    from gateway.extensions import ExtensionError, load_extensions
+
+    try:
+        load_extensions()
+    except ExtensionError as error:
+        sys.exit(f"mavgate: {error}")
 
 
 class LazyGroup(TyperGroup):

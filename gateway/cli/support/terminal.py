@@ -1,11 +1,14 @@
 """Output of the commands: a terminal, or a file or program that must get whole lines."""
 
-from typing import Annotated, Final
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
 ENDLESS: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
@@ -16,6 +19,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 def console_of(*, stderr: bool = False) -> Console:
     """Open a console that leaves long lines whole."""
+    # Imported late, because a service prints nothing.
+    from rich.console import Console
+
     console = Console(stderr=stderr, highlight=False, soft_wrap=True)
     if not console.is_terminal:
         console.width = ENDLESS
@@ -27,6 +33,9 @@ def table_of(*columns: str, left: int = 1) -> Table:
 
     No frame and narrow padding: the table of clients fits a terminal of 80 columns.
     """
+    from rich import box
+    from rich.table import Table
+
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < left else "right", overflow="fold")
