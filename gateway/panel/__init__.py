@@ -1,1 +1,1 @@
-"""The panel: what the aircraft tell, as a page in a browser. A process of its own."""
+"""The panel: the aircraft's telemetry as a web page, served by a separate process."""

@@ -1,4 +1,4 @@
-"""Orders to the gateway over its control socket, without making the page wait."""
+"""Requests to the gateway over its control socket, without blocking the page."""
 
 import asyncio
 from pathlib import Path
@@ -10,28 +10,28 @@ from gateway.edges.operator.control_socket import request
 READING: Final = frozenset(
     {"status", "verbs", "clients.list", "record.status", "record.list", "play.status"}
 )
-"""What a viewer may ask: it changes nothing."""
+"""Verbs that a viewer may use: they change nothing."""
 
 
 class ControlClient:
-    """Asks a gateway (or a player) that runs.
+    """Send requests to a running gateway (or player).
 
     Parameters
     ----------
     path : Path or None
-        Its socket; None for the gateway that is found on this machine, at each request anew.
+        Its socket; None for the gateway on this machine, searched at each request.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
 
     async def ask(self, verb: str, **params: Any) -> Any:
-        """Ask, and return the answer as JSON has it.
+        """Send a request, and return the result, decoded from JSON.
 
         Raises
         ------
         ControlError
-            If nobody listens, or the request is refused.
+            If no gateway listens, or the request is refused.
         """
         return await asyncio.to_thread(self._ask, verb, params)
 

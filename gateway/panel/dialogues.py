@@ -1,7 +1,7 @@
-"""What the panel asks of aircraft in more than one message: parameters, their meaning, calibration.
+"""Exchanges with aircraft of more than one message: parameters, metadata, calibration.
 
-One for the whole panel, so that every open page sees the same, and a page that is loaded anew finds
-a calibration that runs.
+One for the whole panel, so that every open page sees the same, and a reloaded page finds a running
+calibration.
 """
 
 import asyncio
@@ -33,33 +33,33 @@ class Dialogue:
         self.parameters = ParameterClient(system_id)
         self.files = FileClient(system_id)
         self.metas: dict[str, ParameterMeta] = {}
-        """What the parameters mean, as far as the aircraft tells."""
+        """Metadata of the parameters, as far as the aircraft provides it."""
         self.calibration: CalibrationRun | None = None
-        """The newest one, be it over or not."""
+        """The newest one, running or finished."""
         self.before: dict[str, float] = {}
-        """All parameters as they were when it began."""
+        """All parameters at its start."""
 
     def load(self, now_us: int) -> list[Any]:
-        """Ask for the parameters and what they mean; returns what is to be sent."""
+        """Request the parameters and their metadata; return the messages to send."""
         self.files.refused.clear()
         found = self.parameters.load(now_us)
         return found if self.metas else found + self.files.read(GENERAL_PATHS[0], now_us)
 
     @property
     def unanswered(self) -> CalibrationStep | None:
-        """The step that was calibrated and neither stored nor undone yet."""
+        """The step that was calibrated but neither stored nor undone yet."""
         run = self.calibration
         return run.step if run is not None and run.state is RunState.DONE else None
 
     def calibrate(self, step: CalibrationStep, now_us: int) -> list[Any]:
-        """Begin a calibration; returns what is to be sent."""
+        """Start a calibration; return the messages to send."""
         if self.unanswered is None:
             self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
         self.calibration = CalibrationRun(self.parameters.system_id, step, now_us)
         return [*self.ask_for_samples(), self.calibration.start_message()]
 
     def ask_for_samples(self) -> list[Any]:
-        """Have the sensors told often enough to be drawn and fused; returns what is to be sent."""
+        """Request sensor rates high enough for drawing and fusing; return the messages to send."""
         return [
             mavlink.MAVLink_command_long_message(
                 self.parameters.system_id,
@@ -73,21 +73,21 @@ class Dialogue:
         ]
 
     def take(self, message: Any, now_us: int) -> list[Any]:
-        """Take in one message of the aircraft; returns what is to be sent."""
+        """Process one message of the aircraft; return the messages to send."""
         self.parameters.take(message, now_us)
         if self.calibration is not None:
             self.calibration.take(message, now_us)
         return self.files.take(message, now_us) + self._follow_files(now_us)
 
     def poll(self, now_us: int) -> list[Any]:
-        """Do what is due by time; returns what is to be sent."""
+        """Return the messages that are due by time."""
         if self.calibration is not None:
             self.calibration.poll(now_us)
         found = self.parameters.poll(now_us) + self.files.poll(now_us)
         return found + self._follow_files(now_us)
 
     def _follow_files(self, now_us: int) -> list[Any]:
-        """Go from the general metadata file to the parameters' own."""
+        """Read the general metadata file, then the parameters' one."""
         if self.metas or self.files.busy:
             return []
         files, found = self.files.files, list[Any]()
@@ -114,7 +114,7 @@ class Dialogues:
     Parameters
     ----------
     fleet : FleetPicture
-        Hands on what they say.
+        Passes on their messages.
     send : callable
         Sends one MAVLink message.
     clock : GatewayClock
@@ -132,11 +132,11 @@ class Dialogues:
         fleet.on_forget(self._forget)
 
     def start(self) -> None:
-        """Begin to ask again for what does not come; needs a running event loop."""
+        """Start repeating requests without an answer; needs a running event loop."""
         self._task = asyncio.get_running_loop().create_task(self._poll())
 
     def close(self) -> None:
-        """End that."""
+        """Stop repeating requests."""
         if self._task is not None:
             self._task.cancel()
 
@@ -145,25 +145,25 @@ class Dialogues:
         return self._all.setdefault(system_id, Dialogue(system_id))
 
     def load(self, system_id: int, *, anew: bool = False) -> None:
-        """Ask for an aircraft's parameters, unless they are known or being asked for."""
+        """Request an aircraft's parameters, unless they are known or being requested."""
         dialogue = self.of(system_id)
         if anew or dialogue.parameters.state in (ListState.UNKNOWN, ListState.FAILED):
             self._send_all(dialogue.load(self._clock()))
 
     def change(self, system_id: int, name: str, value: float) -> None:
-        """Set a parameter; raises ValueError for nonsense."""
+        """Set a parameter; raises ValueError for an invalid one."""
         self._send_all(self.of(system_id).parameters.change(name, value, self._clock()))
 
     def calibrate(self, system_id: int, step: CalibrationStep) -> None:
-        """Begin a calibration."""
+        """Start a calibration."""
         self._send_all(self.of(system_id).calibrate(step, self._clock()))
 
     def ask_for_samples(self, system_id: int) -> None:
-        """Have an aircraft's sensors told often enough to be fused."""
+        """Request an aircraft's sensor rates high enough for fusing."""
         self._send_all(self.of(system_id).ask_for_samples())
 
     def cancel(self, system_id: int) -> None:
-        """Break a calibration off."""
+        """Cancel a calibration."""
         run = self.of(system_id).calibration
         if run is not None:
             self._send(run.cancel_message())

@@ -1,6 +1,6 @@
-"""The last minutes fused once more by every estimator, with the tuning of this moment.
+"""The last minutes fused again by every estimator, with the present parameters.
 
-It runs in a process of its own: the page must go on meanwhile.
+It runs in a separate process, so that the page is not blocked.
 """
 
 import asyncio
@@ -35,18 +35,18 @@ from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.services.parameters.parameters import ParameterTable
 
 LEAST_S: Final = 20.0
-"""Shorter spans tell of settling alone."""
+"""Shorter spans show only the convergence."""
 LEAST_HZ: Final = 20.0
 SHOWN_HZ: Final = 5.0
 
 
 class ComparisonError(ValueError):
-    """There is not enough to fuse; the text says what is missing."""
+    """There is too little data to fuse; the text says what is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What one estimator makes of the last minutes."""
+    """One estimator's result for the last minutes."""
 
     name: str
     time_us: IntArray
@@ -67,12 +67,12 @@ def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estima
     frames : list of (int, bytes)
         Of one aircraft, with the time of each in µs.
     parameters : mapping of str to float
-        Its parameters; those of the estimators and filters are applied, others left aside.
+        Its parameters; those of the estimators and filters are applied, others ignored.
 
     Returns
     -------
     list of Estimate
-        One of each estimator, thinned to `SHOWN_HZ`.
+        One for each estimator, thinned to `SHOWN_HZ`.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estima
 
 
 def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
-    """Turn MAVLink parameters back into the settings of filters and estimators.
+    """Convert MAVLink parameters back to the settings of filters and estimators.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
         try:
             table.change(table.parameters[index], value)
         except ValueError:
-            # Another version's idea of the range; its default is as good a guess as any.
+            # Out of range, as from another version: use the default.
             continue
     sensing, estimation = table.sections["sensing"], table.sections["estimation"]
     assert isinstance(sensing, SensingSettings)
@@ -117,13 +117,13 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
 
 
 async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
-    """Do `compare` in a process of its own."""
+    """Run `compare` in a separate process."""
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     try:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(pool, compare, frames, dict(parameters))
     finally:
-        # The page does not stand still until the process has ended.
+        # The page is not blocked until the process has ended.
         pool.shutdown(wait=False)
 
 
@@ -160,7 +160,7 @@ def _estimate(name: str, flight: Flight, track: FlightTrack, zero_us: int) -> Es
 
 
 def _to_fixes_m(flight: Flight, track: FlightTrack) -> float:
-    """Compare each fix with where the estimator was when it was true, once it had settled."""
+    """Compare each fix with the estimate at the time of its validity, after convergence."""
     fixes = fixes_of(flight)
     if not len(fixes):
         return float("nan")

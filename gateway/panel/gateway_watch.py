@@ -1,4 +1,4 @@
-"""What the gateway tells over its control socket, asked once a second for all pages."""
+"""The gateway's status over its control socket, polled once a second for all pages."""
 
 import asyncio
 import logging
@@ -22,33 +22,33 @@ class GatewayWatch:
     Parameters
     ----------
     control : ControlClient
-        Asks it.
+        Sends the requests.
     fleet : FleetPicture
-        Whose marks the gateway knows exactly; MAVLink rounds them.
+        Gets the gateway's exact marks; MAVLink rounds them.
     """
 
     def __init__(self, control: ControlClient, fleet: FleetPicture) -> None:
         self.status: dict[str, Any] | None = None
-        """As the verb `status` answers; None while no gateway runs."""
+        """Result of the verb `status`; None while no gateway runs."""
         self.before: dict[str, Any] | None = None
-        """The answer before it, to tell rates."""
+        """The result before it, to compute rates."""
         self.recorder: dict[str, Any] | None = None
-        """As `record.status` answers."""
+        """Result of `record.status`."""
         self._control = control
         self._fleet = fleet
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Begin to ask; needs a running event loop."""
+        """Start polling; needs a running event loop."""
         self._task = asyncio.get_running_loop().create_task(self._watch())
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop polling."""
         if self._task is not None:
             self._task.cancel()
 
     async def refresh(self) -> None:
-        """Ask now."""
+        """Poll now."""
         try:
             status = await self._control.ask("status")
         except ControlError:
@@ -58,7 +58,7 @@ class GatewayWatch:
         for aircraft in status["aircraft"]:
             vehicle = self._fleet.vehicles.get(aircraft["vehicle_id"])
             if vehicle is not None:
-                vehicle.told_mark = _spot_of(aircraft["mark"])
+                vehicle.exact_mark = _spot_of(aircraft["mark"])
 
     async def _watch(self) -> None:
         while True:

@@ -1,4 +1,4 @@
-"""A table whose figures change in place: only cells that differ are sent to the browser."""
+"""A table that is updated in place: only changed cells are sent to the browser."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ class RowButton:
 
     icon: str
     title: str
-    """What it does."""
+    """Its tooltip."""
     act: Callable[[str], object]
-    """Given the key of its row."""
+    """Called with the key of its row."""
 
 
 class LiveTable:

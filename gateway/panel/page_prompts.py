@@ -1,4 +1,4 @@
-"""What a page does around an order: tells that it failed, and asks before what cannot be undone."""
+"""Prompts around a request: a notice if it failed, and a question before it is irreversible."""
 
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ FAILURES: Final = (
 
 @contextmanager
 def notify_failure(context: ViewContext) -> Iterator[None]:
-    """Tell on the page why an order was not carried out."""
+    """Show on the page why a request was not carried out."""
     try:
         yield
     except FAILURES as error:
@@ -31,16 +31,16 @@ def notify_failure(context: ViewContext) -> Iterator[None]:
 
 
 def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
-    """Ask, and do it on a yes.
+    """Ask for confirmation, and act on a yes.
 
     Parameters
     ----------
     question : str
-        What would happen.
+        The question.
     word : str
-        What the yes is called: the verb.
+        Label of the confirming button: the verb.
     act : callable
-        Does it.
+        Called on a yes.
     """
     with ui.dialog() as dialog, ui.card().classes("asks"):
         ui.label(question).classes("title")

@@ -1,4 +1,4 @@
-"""The panel's process: builds the parts, serves the page, ends them in order."""
+"""The panel's process: builds the parts, serves the page, shuts them down in order."""
 
 import asyncio
 import errno
@@ -47,12 +47,12 @@ from gateway.panel.view_context import WEB, PanelParts
 log = logging.getLogger(__name__)
 
 NICENESS: Final = 5
-"""The gateway goes before its picture."""
+"""The gateway has priority over the panel."""
 MAX_CONNECTIONS: Final = 256
 RECONNECT_S: Final = 30.0
-"""A browser that was away for less finds its page as it left it."""
+"""A browser that reconnects within this time keeps its page."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
-"""The style sheet of the map library that NiceGUI brings along."""
+"""The style sheet of NiceGUI's map library."""
 
 
 class PanelError(Exception):
@@ -81,9 +81,9 @@ def run_panel(
     control_socket : Path or None
         That of the gateway; None for the one that is found.
     on_link : callable
-        Given the page's address once it can be opened.
+        Called with the page's address once it can be opened.
     attached : bool
-        Whether to end when the standard input does: the gateway that started us was killed.
+        Whether to end when standard input closes, because the gateway that started us was killed.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def run_panel(
 def make_parts(
     settings: PanelSettings, recordings: Path, connect: str | None, control_socket: Path | None
 ) -> PanelParts:
-    """Build what all pages share; see `run_panel`."""
+    """Build the parts shared by all pages; see `run_panel`."""
     clock, fleet = GatewayClock(), FleetPicture()
     control = ControlClient(control_socket)
     uplink = Uplink(connect, fleet, control, clock)
@@ -144,7 +144,7 @@ def make_parts(
 
 
 def make_app(parts: PanelParts) -> FastAPI:
-    """Build the page and what it fetches."""
+    """Build the web application."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
     for router in RestDoor(parts.uplink).routers():
         app.include_router(router)
@@ -209,7 +209,7 @@ async def _serve(
 
 
 class _Server(uvicorn.Server):
-    """Leaves signals alone: raised anew at its end, they would end the process before its parts."""
+    """Server without signal handlers: re-raised signals would kill the process too soon."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -261,7 +261,7 @@ def _link(settings: PanelSettings, sock: socket.socket) -> str:
 
 
 def _version_of(folder: Path) -> str:
-    """Sum up what browsers may keep, so that they fetch it anew when it has changed."""
+    """Return a checksum of cacheable files, so that browsers fetch changed ones again."""
     digest = hashlib.sha256()
     for file in sorted(folder.iterdir()):
         digest.update(file.read_bytes())

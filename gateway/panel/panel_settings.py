@@ -10,7 +10,7 @@ LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 class MapStyle(Settings, frozen=True):
     """One style of the map."""
 
-    name: Annotated[str, setting("What the operator reads.", pattern=r"^[\w .-]{1,32}$")]
+    name: Annotated[str, setting("Name shown to the operator.", pattern=r"^[\w .-]{1,32}$")]
     url: Annotated[
         str,
         setting(
@@ -18,41 +18,41 @@ class MapStyle(Settings, frozen=True):
             "or the path of an MBTiles or PMTiles file.",
         ),
     ]
-    attribution: Annotated[str, setting("Whom to thank for them, as the owner asks.")] = ""
-    max_zoom: Annotated[int, setting("Greatest zoom that there is.", ge=1, le=24)] = 19
+    attribution: Annotated[str, setting("Attribution that the owner requires.")] = ""
+    max_zoom: Annotated[int, setting("Greatest available zoom.", ge=1, le=24)] = 19
 
 
 class PanelSettings(Settings, frozen=True):
-    """The page that shows the aircraft in a browser; a process of its own."""
+    """The web page that shows the aircraft; a separate process."""
 
     enabled: Annotated[bool, setting("Whether `mavgate run` starts it.")] = False
     address: Annotated[
         str,
         setting(
-            "Where it listens. Any address but this machine's own loopback needs a password, and "
+            "Address to listen on. Any address but loopback needs a password, and "
             "TLS or insecure = true."
         ),
     ] = "127.0.0.1"
-    port: Annotated[int, setting("Its port; 0 takes any that is free.", ge=0, le=65535)] = 14590
+    port: Annotated[int, setting("Its port; 0 for any free one.", ge=0, le=65535)] = 14590
     hosts: Annotated[
         tuple[str, ...],
         setting(
-            "Further names by which browsers reach it, without port. It refuses all others, so "
-            "that no foreign page can steer the gateway through the browser."
+            "Further host names of the panel, without port. All others are refused, so "
+            "that no foreign page can control the gateway through the browser."
         ),
     ] = ()
     password: Annotated[
         str,
         setting(
             "Hash of the operator's password, as `mavgate panel --hash-password` prints it. Empty: "
-            "none is asked, which only loopback allows.",
+            "no password, which only loopback allows.",
             pattern=r"^(scrypt\$.+)?$",
         ),
     ] = ""
     viewer_password: Annotated[
         str,
         setting(
-            "Hash of a second password, with which one may look and not touch.",
+            "Hash of a second password, for read-only access.",
             pattern=r"^(scrypt\$.+)?$",
         ),
     ] = ""
@@ -63,24 +63,28 @@ class PanelSettings(Settings, frozen=True):
     insecure: Annotated[
         bool,
         setting(
-            "Allow other addresses than loopback without TLS: all can read along, passwords too."
+            "Allow other addresses than loopback without TLS; then all traffic is readable."
         ),
     ] = False
     units: Annotated[
         Literal["metric", "imperial", "aviation"],
-        setting("Units at first; each browser may choose its own."),
+        setting("Default units; each browser may choose its own."),
     ] = "metric"
-    tiles_folder: Annotated[str, setting("Where map tiles are kept once they were seen.")] = (
-        "~/.cache/mavgate/tiles"
-    )
+    tiles_folder: Annotated[str, setting("Folder of cached map tiles.")] = "~/.cache/mavgate/tiles"
     tiles_limit_mb: Annotated[
-        int, setting("What they may take; beyond it the oldest go.", "MB", ge=0, le=1_000_000)
+        int,
+        setting(
+            "Size limit of the cached tiles; beyond it the oldest are deleted.",
+            "MB",
+            ge=0,
+            le=1_000_000,
+        ),
     ] = 500
     upload_limit_mb: Annotated[
-        int, setting("Largest recording that a browser may bring.", "MB", ge=1, le=100_000)
+        int, setting("Largest recording that a browser may upload.", "MB", ge=1, le=100_000)
     ] = 512
     map_styles: Annotated[
-        tuple[MapStyle, ...], setting("Styles of the map, the first one shown at first.")
+        tuple[MapStyle, ...], setting("Styles of the map; the first one is the default.")
     ] = (
         MapStyle(
             name="Street",
@@ -104,7 +108,7 @@ class PanelSettings(Settings, frozen=True):
     )
 
     def __post_init__(self) -> None:
-        """Refuse to stand open to others without a lock."""
+        """Refuse to be open to other machines without a password."""
         if self.address in LOOPBACK:
             return
         if not self.password:
@@ -112,5 +116,5 @@ class PanelSettings(Settings, frozen=True):
         if not (self.certificate or self.insecure):
             raise ValueError(
                 f"address {self.address!r} is not loopback: it needs a certificate, or "
-                "insecure = true if everybody may read along"
+                "insecure = true if anybody may read everything"
             )

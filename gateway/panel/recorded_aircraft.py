@@ -1,4 +1,4 @@
-"""What a recording holds, looked at before it is played: its aircraft, and how high they flew."""
+"""Aircraft of a recording and their heights, read before it is played."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -26,7 +26,7 @@ TWIN: Final = "re-fused"
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """The height over the time of a recording."""
+    """Height over time."""
 
     time_s: tuple[float, ...] = ()
     """Since its begin."""
@@ -38,11 +38,11 @@ class RecordedAircraft:
     """One aircraft of a recording."""
 
     recorded_id: int
-    """Its MAVLink system on that day."""
+    """Its recorded MAVLink system id."""
     origin: str
     """`RECORDED`, or `TWIN` for one that is fused again while it plays."""
     profile: Profile
-    """Empty where nothing tells a height."""
+    """Empty if no height was recorded."""
 
 
 def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
@@ -73,19 +73,19 @@ def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
 
 
 def free_ids(count: int, taken: Collection[int]) -> range:
-    """Find system ids in a row that nobody has, as high as there are.
+    """Find consecutive free system ids, the highest possible.
 
     Parameters
     ----------
     count : int
-        How many.
+        Number of ids.
     taken : collection of int
         Ids of others.
 
     Raises
     ------
     ValueError
-        If there are not so many.
+        If there are not enough.
     """
     for first in range(FIRST_GROUND_STATION - count, 0, -1):
         wanted = range(first, first + count)

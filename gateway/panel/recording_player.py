@@ -1,7 +1,7 @@
-"""A recording played beside the live aircraft: a `mavgate play` of the panel's own.
+"""A recording played beside the live aircraft, by a separate `mavgate play`.
 
-It is a process with a control socket of its own, sends its frames to a loopback port of the panel
-and to nobody else, and its aircraft get system ids that no live one has.
+It is a process with its own control socket, sends its frames only to a loopback port of the panel,
+and its aircraft get system ids that no live one has.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ READY_S: Final = 120.0
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
 LEAP_S: Final = 0.5
-"""So far back is no jitter of the player's clock, but the begin of another round."""
+"""A larger step back is not jitter of the player's clock, but a loop or a seek."""
 SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
@@ -44,16 +44,16 @@ class Playback:
     uplink : Uplink
         Takes its frames.
     fleet : FleetPicture
-        Where its aircraft appear.
+        Gets its aircraft.
     """
 
     def __init__(self, uplink: Uplink, fleet: FleetPicture) -> None:
         self.name = ""
         """Of the recording; empty while none is open."""
         self.aircraft: dict[int, RecordedAircraft] = {}
-        """What is played, by the system ids that it is played as."""
+        """The aircraft that are played, by their played system ids."""
         self.status: dict[str, Any] | None = None
-        """As `play.status` answers."""
+        """Result of `play.status`."""
         self._uplink = uplink
         self._fleet = fleet
         self._folder: tempfile.TemporaryDirectory[str] | None = None
@@ -67,16 +67,16 @@ class Playback:
         return any(one.origin == TWIN for one in self.aircraft.values())
 
     async def open(self, folder: Path, name: str, *, twin: bool) -> None:
-        """Open a recording, in place of the one that is open.
+        """Open a recording, instead of the present one.
 
         Parameters
         ----------
         folder : Path
             Of the recordings.
         name : str
-            Of one that is there.
+            Name of an existing one.
         twin : bool
-            Whether it is fused again too, and flies beside itself.
+            Whether to play a re-fused copy beside it too.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Playback:
         await self._start(played, firsts)
 
     def close(self) -> None:
-        """End the playback; its aircraft go."""
+        """End the playback and remove its aircraft."""
         if self._watching is not None and self._watching is not asyncio.current_task():
             self._watching.cancel()
         if self._child is not None and self._child.returncode is None:
@@ -115,7 +115,7 @@ class Playback:
         self.aircraft = {}
 
     async def order(self, verb: str, **params: Any) -> None:
-        """Give the player an order; see docs/control.md.
+        """Send the player a request; see docs/control.md.
 
         Raises
         ------
@@ -133,18 +133,18 @@ class Playback:
             self.status["position_s"] < before["position_s"] - LEAP_S
         )
         if verb == "seek" or went_back:
-            # The way to another moment was never flown.
+            # A seek must not be drawn as a path.
             for system_id in self.aircraft:
                 if vehicle := self._fleet.vehicles.get(system_id):
                     vehicle.begin_anew()
 
     async def toggle(self) -> None:
-        """Pause, or go on; raises as `order`."""
+        """Pause or resume; raises as `order`."""
         playing = (self.status or {}).get("state") == "playing"
         await self.order("play.pause" if playing else "play.resume")
 
     async def refresh(self) -> None:
-        """Ask the player where it is; a player that has ended is closed."""
+        """Poll the player's status; a player that has ended is closed."""
         if self._child is not None and self._child.returncode is not None:
             self.close()
         elif self._control is not None:
@@ -152,7 +152,7 @@ class Playback:
                 await self.order("play.status")
 
     def _number(self, flights: Sequence[Sequence[RecordedAircraft]]) -> list[int]:
-        """Give the aircraft system ids that nobody has; returns the first of each flight."""
+        """Give the aircraft free system ids; return the first of each flight."""
         firsts = []
         for flight in flights:
             ids = free_ids(len(flight), {*self._fleet.vehicles, *self.aircraft})
@@ -184,7 +184,7 @@ class Playback:
                 while not socket.exists() and self._child.returncode is None:
                     await asyncio.sleep(STEP_S)
         except TimeoutError:
-            log.warning("the player does not begin in %.0f s", READY_S)
+            log.warning("the player does not start in %.0f s", READY_S)
         if self._child.returncode is not None or not socket.exists():
             text = await self._complaint()
             self.close()
@@ -193,14 +193,14 @@ class Playback:
         self._watching = asyncio.create_task(self._watch())
 
     async def _watch(self) -> None:
-        """Follow the player until it has ended."""
+        """Wait until the player has ended."""
         while self._child is not None:
             await self.refresh()
             await asyncio.sleep(WATCH_S)
 
     async def _complaint(self) -> str:
-        """Read why the player ended."""
+        """Return why the player ended."""
         if self._child is None or self._child.stderr is None or self._child.returncode is None:
-            return "the player does not begin"
+            return "the player does not start"
         text = (await self._child.stderr.read()).decode(errors="replace").strip()
         return text.splitlines()[-1] if text else "the player ended"

@@ -1,6 +1,6 @@
-"""The page itself: its head with aircraft and state, its views, its keys.
+"""The page itself: its header with aircraft and state, its views, its keys.
 
-A view is one entry of `VIEWS`; see `view_context.py` for what its file must have.
+A view is one entry of `VIEWS`; see `view_context.py` for the interface of its file.
 """
 
 import math
@@ -40,7 +40,7 @@ class View:
     """Its part of the page's address, behind the hash."""
     title: str
     icon: str
-    """Name of a Material icon, which NiceGUI brings along."""
+    """Name of a Material icon, which NiceGUI includes."""
     build: Callable[[ViewContext], None]
 
 
@@ -63,11 +63,11 @@ def build_page(parts: PanelParts, role: Role, version: str) -> None:
     Parameters
     ----------
     parts : PanelParts
-        What all pages share.
+        Parts shared by all pages.
     role : Role
-        What its user may do.
+        Role of its user.
     version : str
-        Of the files that the browser keeps.
+        Version of the files that the browser caches.
     """
     context = ViewContext(parts, role, ShownUnits(parts.settings.units))
     ui.add_head_html(f'<link rel="stylesheet" href="/web/panel.css?{version}">')
@@ -90,7 +90,7 @@ class _Page:
         self._chips: list[tuple[str, str]] = []
 
     def build(self) -> None:
-        """Make everything; a view is made when it is shown first."""
+        """Build everything; a view is built when it is first shown."""
         with ui.element("div").classes("shell"):
             self._build_head()
             events_view.build_banner(self._context)
@@ -198,7 +198,7 @@ class _Page:
 
 
 def _mode_of(context: ViewContext) -> str:
-    """Return where what is shown comes from."""
+    """Return where the data comes from."""
     vehicle, status = context.vehicle, context.parts.watch.status
     if vehicle is not None and vehicle.origin != "live":
         return "recording"
@@ -208,7 +208,7 @@ def _mode_of(context: ViewContext) -> str:
 
 
 def _state_of(context: ViewContext) -> list[tuple[str, str]]:
-    """Sum up the selected aircraft: words and how grave they are."""
+    """Summarise the state of the selected aircraft: texts and their severity."""
     vehicle = context.vehicle
     if vehicle is None:
         return [("waiting for an aircraft", "warn")]

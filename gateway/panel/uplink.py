@@ -1,10 +1,10 @@
 """The panel's MAVLink connection: one more client of the gateway, or of any other vehicle.
 
-It stands on the hub, which knows every transport and opens again what breaks. With a URL it
-connects there. Without one it asks the gateway on this machine, over the control socket, for a
-listening port of the panel's own on loopback, and again whenever that falls silent: so a gateway
-that was started anew is found anew. A second hub takes the frames of a player that the panel
-starts: what is played reaches nobody but the panel, and orders to a played aircraft its player.
+It uses the hub, with its transports and reconnection. With a URL it connects there. Without one it
+asks the gateway on this machine, over the control socket, for a separate listening port on
+loopback, and again whenever that falls silent: so a restarted gateway is found again. A second hub
+receives the frames of a player that the panel starts: they reach only the panel, and commands to a
+played aircraft reach its player.
 """
 
 import asyncio
@@ -34,17 +34,18 @@ USER_COMPONENTS: Final = 75
 AUTOPILOT: Final = 1
 HEARTBEAT_S: Final = 1.0
 KNOCK_S: Final = 0.2
-"""Between heartbeats while nothing is heard: the first one may find no socket open yet."""
+"""Between heartbeats while nothing is received: the first one may come before the socket is
+open."""
 SILENT_US: Final = 3 * US_PER_S
 ACK_TIMEOUT_S: Final = 1.5
 ATTEMPTS: Final = 3
 MAX_SENDERS: Final = 64
-"""Programs that send through the panel under ids of their own."""
+"""Programs that send through the panel under their own ids."""
 
 LOCAL_PLACE: Final = "udp-listen:127.0.0.1:0"
 LOCAL_URL: Final = f"{LOCAL_PLACE}?name=panel"
 PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
-"""Where a player that the panel starts sends its frames."""
+"""Where the panel's player sends its frames."""
 
 
 class CommandFailedError(Exception):
@@ -57,11 +58,11 @@ class Uplink:
     Parameters
     ----------
     url : str or None
-        An endpoint as the settings write it; None for the gateway on this machine.
+        An endpoint as in the settings; None for the gateway on this machine.
     fleet : FleetPicture
-        Given every message.
+        Gets every message.
     control : ControlClient
-        Tells where the gateway on this machine listens.
+        Finds where the gateway on this machine listens.
     clock : GatewayClock
         The panel's clock.
     """
@@ -88,7 +89,7 @@ class Uplink:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Connect; needs a running event loop. What is not there yet is tried again."""
+        """Connect; needs a running event loop. Failed connections are retried."""
         self._hub.start()
         self._player_hub.start()
         self._task = asyncio.get_running_loop().create_task(self._keep_alive())
@@ -102,31 +103,31 @@ class Uplink:
 
     @property
     def playback_port(self) -> int:
-        """Loopback port that takes the frames of a player; 0 while it is not open."""
+        """Loopback port that receives the frames of a player; 0 while it is not open."""
         return next(iter(self._player_hub.listening_ports()), 0)
 
     @property
     def is_alive(self) -> bool:
-        """Whether anything was heard in the last seconds."""
+        """Whether anything was received in the last seconds."""
         return self._clock() - self._heard_us < SILENT_US
 
     def listen(self, listener: Callable[[Any], None]) -> None:
-        """Have every decoded message of anybody handed on."""
+        """Call a listener with every decoded message."""
         self._listeners.append(listener)
 
     def send(self, message: Any) -> None:
-        """Send one message; whoever it is for is in its own fields."""
+        """Send one message; its target is in its fields."""
         self._send(message, self._mav)
 
     def send_as(self, message: Any, system_id: int, component_id: int) -> int:
-        """Send one message for a program that has ids of its own.
+        """Send one message for a program with its own ids.
 
         Parameters
         ----------
         message : MAVLink_message
             As pymavlink makes it.
         system_id, component_id : int
-            Who sends; system 0 is the panel itself.
+            The sender; system 0 is the panel itself.
 
         Returns
         -------
@@ -136,7 +137,7 @@ class Uplink:
         return self._send(message, self._sender(system_id, component_id))
 
     async def command(self, system_id: int, number: int, *params: float) -> None:
-        """Have a command carried out, and wait until it is acknowledged.
+        """Send a command, and wait until it is acknowledged.
 
         Parameters
         ----------
@@ -150,7 +151,7 @@ class Uplink:
         Raises
         ------
         CommandFailedError
-            If it is refused, or nobody answers.
+            If it is refused or not answered.
         """
         filled = (*params, *(0.0,) * (7 - len(params)))
         message = mavlink.MAVLink_command_long_message(
@@ -161,7 +162,7 @@ class Uplink:
     async def command_at(
         self, system_id: int, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
     ) -> None:
-        """Have a command carried out that is about a place; raises as `command`."""
+        """Send a command with a position; raises as `command`."""
         message = mavlink.MAVLink_command_int_message(
             system_id,
             AUTOPILOT,
@@ -203,7 +204,7 @@ class Uplink:
         return len(frame)
 
     def _sender(self, system_id: int, component_id: int) -> Any:
-        """Return who numbers the frames of a program that sends through us."""
+        """Return the encoder of a program that sends through the panel."""
         if not system_id:
             return self._mav
         key = (system_id, component_id)
@@ -219,7 +220,7 @@ class Uplink:
             self._take(incoming.frame, played=played)
 
         def on_foreign(frame: bytes) -> None:
-            # A broadcast comes both to us and past us.
+            # A broadcast arrives both as ours and as foreign.
             if frame is not self._heard:
                 self._take(frame, played=played)
 
@@ -227,7 +228,7 @@ class Uplink:
 
     def _take(self, frame: bytes, *, played: bool) -> None:
         if (origin_of(frame)[0] in self._fleet.origins) is not played:
-            # Of two with the same number, the page knows the one that it has given it to.
+            # Of two with the same id, the page uses the one that it assigned.
             return
         try:
             message = self._mav.decode(bytearray(frame))
@@ -260,7 +261,7 @@ class Uplink:
             await asyncio.sleep(HEARTBEAT_S if self.is_alive else KNOCK_S)
 
     async def _find_gateway(self) -> None:
-        """Ask the gateway on this machine for a port of the panel's own, and speak to it."""
+        """Ask the gateway on this machine for a separate port, and connect to it."""
         try:
             port = await self._local_port()
         except ControlError as error:
@@ -287,7 +288,7 @@ class Uplink:
 
 
 def _trusting(url: str) -> str:
-    """Listen to whoever speaks there: the operator has named the place."""
+    """Trust the peers of a URL, because the operator has given it."""
     if "trusted=" in url:
         return url
     return f"{url}{'&' if '?' in url else '?'}trusted=yes"

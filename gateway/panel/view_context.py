@@ -1,13 +1,13 @@
-"""What every view of the page is given: the aircraft, a way to ask for things, units, the role.
+"""The context of every view: the aircraft, requests to the gateway, units, the role.
 
 A view is a file in `gateway/panel/views/` with a function `build(context: ViewContext) -> None`
-that makes its NiceGUI elements where it is called, inside the tab's panel; `shell.py` lists them.
-One `ViewContext` belongs to one open page (browser tab).
+that creates its NiceGUI elements, inside the tab's panel; `shell.py` lists them. One `ViewContext`
+belongs to one open page (browser tab).
 
-Two ways lead from the aircraft to the screen:
+There are two ways from the aircraft to the screen:
 
-*What moves* is drawn in the browser. The page opens one WebSocket (`feed.py`), over which the
-`Instant` of every aircraft comes up to 30 times a second, and hands it to `window.mavgate`:
+*Moving displays* are drawn in the browser. The page opens one WebSocket (`feed.py`), over which
+the `Instant` of every aircraft comes up to 30 times a second, and passes it to `window.mavgate`:
 
     const stop = mavgate.subscribe((state) => { ... });   // state: newest Instant, by its names
     mavgate.state          the selected aircraft's newest, or null
@@ -19,7 +19,7 @@ so a Vue component (a JavaScript file in `gateway/panel/web/`, a Python class be
 `class Horizon(Element, component=WEB / "horizon.js")`) subscribes in `mounted()`, stops in
 `unmounted()`, and draws in `requestAnimationFrame`; nothing of it passes through NiceGUI.
 
-*What stands still* (tables, texts, buttons) is NiceGUI: read `context.vehicle` in a callback of
+*Everything else* (tables, texts, buttons) is NiceGUI: read `context.vehicle` in a callback of
 `context.every(seconds, callback)`, which runs only while the view's tab is the one shown.
 
 Colours and sizes are the CSS variables of `web/panel.css` (`--ink`, `--paper`, `--accent`, `--sky`,
@@ -52,7 +52,7 @@ WEB: Final = Path(__file__).parent / "web"
 
 
 class Role(StrEnum):
-    """What a page's user may do."""
+    """Role of a page's user."""
 
     OPERATOR = "operator"
     VIEWER = "viewer"
@@ -64,7 +64,7 @@ class NotAllowedError(Exception):
 
 @dataclass(frozen=True)
 class PanelParts:
-    """What all pages share."""
+    """Parts shared by all pages."""
 
     settings: PanelSettings
     recordings: Path
@@ -77,13 +77,13 @@ class PanelParts:
     samples: SampleMemory
     dialogues: Dialogues
     watch: GatewayWatch
-    """What the gateway told over its control socket in the last second."""
+    """The gateway's status of the last second."""
     playback: Playback
     """The recording that is played."""
 
     @property
     def recordings_folder(self) -> Path:
-        """Where recordings are: the running gateway's folder, else that of the settings."""
+        """Folder of the recordings: the running gateway's, else that of the settings."""
         recorder = self.watch.recorder
         return self.recordings if recorder is None else Path(recorder["folder"])
 
@@ -110,17 +110,17 @@ class ViewContext:
 
     @property
     def vehicle(self) -> VehiclePicture | None:
-        """The selected aircraft; None before any was heard."""
+        """The selected aircraft; None before the first."""
         return None if self.system_id is None else self.fleet.vehicles.get(self.system_id)
 
     @property
     def now_us(self) -> int:
-        """The panel's clock, which all times of the pictures are on."""
+        """The panel's clock, which all times here refer to."""
         return self.parts.clock()
 
     @property
     def may_change(self) -> bool:
-        """Whether buttons that change something are of use here."""
+        """Whether the user may change things."""
         return self.role is Role.OPERATOR
 
     def send(self, message: Any) -> None:
@@ -129,7 +129,7 @@ class ViewContext:
         self.parts.uplink.send(message)
 
     async def command(self, number: int, *params: float) -> None:
-        """Have the selected aircraft carry out a MAV_CMD.
+        """Send a MAV_CMD to the selected aircraft.
 
         Raises
         ------
@@ -144,20 +144,20 @@ class ViewContext:
     async def command_at(
         self, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
     ) -> None:
-        """Have the selected aircraft carry out a MAV_CMD about a place; raises as `command`."""
+        """Send a MAV_CMD with a position to the selected aircraft; raises as `command`."""
         self.check_may_change()
         uplink = self.parts.uplink
         await uplink.command_at(self.system_id or 0, number, lat_deg, lon_deg, alt_amsl_m)
 
     async def ask(self, verb: str, **params: Any) -> Any:
-        """Ask the gateway over its control socket; see docs/control.md.
+        """Send a request to the gateway's control socket; see docs/control.md.
 
         Raises
         ------
         ControlError
             If there is none, or it refuses.
         NotAllowedError
-            For a viewer who asks for a change.
+            For a viewer who requests a change.
         """
         if verb not in READING:
             self.check_may_change()
@@ -166,10 +166,10 @@ class ViewContext:
     def check_may_change(self) -> None:
         """Raise NotAllowedError for a viewer: buttons may be hidden, requests can be forged."""
         if not self.may_change:
-            raise NotAllowedError("you are logged in as a viewer, who may look and not touch")
+            raise NotAllowedError("you are logged in as a viewer, with read-only access")
 
     def every(self, seconds: float, callback: Callable[[], Any]) -> None:
-        """Call something again and again while the view that is being built is shown."""
+        """Call a function periodically while the view that is being built is shown."""
         key = self._building
 
         def tick() -> Any:
@@ -179,7 +179,7 @@ class ViewContext:
         self._on_show.setdefault(key, []).append(callback)
 
     def on_select(self, callback: Callable[[], None]) -> None:
-        """Call something whenever another aircraft is selected."""
+        """Call a function whenever another aircraft is selected."""
         self._on_select.append(callback)
 
     def building(self, key: str) -> None:

@@ -149,7 +149,7 @@ def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
 
     def is_compared() -> bool:
         card.get_by_role("button", name="Compare").click()
-        told = card.get_by_text(re.compile("what the aircraft itself told|try again in a moment"))
+        told = card.get_by_text(re.compile("the aircraft's own estimate|try again in a moment"))
         expect(told).to_be_visible(timeout=START_LIMIT_MS)  # It may compile them first.
         return rows.count() > 0
 

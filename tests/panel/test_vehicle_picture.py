@@ -70,7 +70,7 @@ def test_mark_is_found_from_distance_and_bearing(vehicle: VehiclePicture) -> Non
     assert (now.mark_distance_m, now.mark_bearing_deg) == (1113.0, 90.0)
     assert now.mark is not None
     assert (now.mark.lat_deg, now.mark.lon_deg) == pytest.approx((0.0, -179.991), abs=1e-4)
-    vehicle.told_mark = Spot(1.0, 2.0, 3.0)
+    vehicle.exact_mark = Spot(1.0, 2.0, 3.0)
     assert vehicle.instant(0).mark == Spot(1.0, 2.0, 3.0)
 
 

@@ -1,1 +1,1 @@
-"""MAVLink as JSON, over HTTP and WebSocket, as mavlink2rest has it."""
+"""MAVLink as JSON, over HTTP and WebSocket, as in mavlink2rest."""

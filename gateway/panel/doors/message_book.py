@@ -1,4 +1,4 @@
-"""The newest message of each kind of everybody, and how often it comes."""
+"""The newest message of each kind from every sender, and its rate."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any, Final
 from gateway.panel.doors.message_json import to_json
 
 MAX_KINDS: Final = 8192
-"""Some fifty aircraft tell no more; forged ids must not fill the memory."""
+"""Enough for some fifty aircraft; forged ids must not fill the memory."""
 
 Key = tuple[int, int, str]
 """System, component and name of the message."""
@@ -37,12 +37,12 @@ class _Entry:
 
 
 class MessageBook:
-    """What came over MAVLink, as a tree.
+    """Received MAVLink messages, as a tree.
 
     Parameters
     ----------
     now_s : callable
-        The time of day, in s since the epoch: people read when a message came.
+        Civil time in s since the epoch, to show when a message came.
     """
 
     def __init__(self, now_s: Callable[[], float]) -> None:
@@ -53,7 +53,7 @@ class MessageBook:
         """Messages of kinds for which there was no room."""
 
     def take(self, message: Any, *, is_sent: bool = False) -> None:
-        """Take in one message: one that was heard, or one that was sent from here."""
+        """Take in one message, received or sent from here."""
         key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
         if not is_sent:
             self._heard.add(key[:2])
@@ -73,23 +73,23 @@ class MessageBook:
         return (system_id, component_id) in self._heard
 
     def look_up(self, path: str) -> Any:
-        """Return what stands at a place of the tree.
+        """Return the value at a path of the tree.
 
         Parameters
         ----------
         path : str
             As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all. A JSON
-            pointer without its first slash, so a slash at the end asks for a name that is empty.
+            pointer without its first slash, so a trailing slash means an empty name.
 
         Returns
         -------
         Any
-            As JSON has it.
+            A JSON value.
 
         Raises
         ------
         KeyError
-            If nothing stands there.
+            If the path does not exist.
         """
         parts = path.split("/") if path else []
         node: Any = self._tree(parts)

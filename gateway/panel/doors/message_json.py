@@ -1,17 +1,16 @@
-"""One MAVLink message as JSON and back, in the form that mavlink2rest gave it.
+"""One MAVLink message as JSON and back, in the format of mavlink2rest.
 
 | field of MAVLink       | JSON                                                    |
 | ---------------------- | ------------------------------------------------------- |
 | of an enum             | `{"type": "MAV_TYPE_FIXED_WING"}`                       |
 | of a bitmask           | `{"bits": 81}`                                          |
-| text (an array of char) | an array of characters, filled up with NUL              |
+| text (an array of char) | an array of characters, padded with NUL                 |
 | another array          | an array of numbers                                     |
 | called `type`          | is called `mavtype`; `type` is the name of the message  |
-| a number that is none  | `null`                                                  |
+| NaN or infinity        | `null`                                                  |
 
-What comes in may also name a bitmask's flags (`"A | B"`), give a bare number for an enum or a
-bitmask, and a plain text for an array of characters. A value that an enum does not know goes out as
-a number.
+Input may also name a bitmask's flags (`"A | B"`), give a bare number for an enum or a bitmask, and
+a plain text for an array of characters. A value unknown to its enum is written as a number.
 
 References
 ----------
@@ -37,7 +36,7 @@ INTEGERS: Final = {
 
 
 class BadMessageError(ValueError):
-    """What was given as a message is none; the text says why."""
+    """An invalid message; the text says why."""
 
 
 def to_json(message: Any) -> dict[str, Any]:
@@ -60,12 +59,12 @@ def to_json(message: Any) -> dict[str, Any]:
 
 
 def from_json(fields: Any) -> Any:
-    """Make a message of JSON.
+    """Build a message from JSON.
 
     Parameters
     ----------
     fields : dict
-        As `to_json` returns it; fields that a message got later (extensions) may be missing.
+        As `to_json` returns it; extension fields may be missing.
 
     Returns
     -------
@@ -75,7 +74,7 @@ def from_json(fields: Any) -> Any:
     Raises
     ------
     BadMessageError
-        If it is no such message; the text names the field.
+        If it is invalid; the text names the field.
     """
     if not isinstance(fields, dict):
         raise BadMessageError("a message is an object with its name under 'type'")
@@ -94,7 +93,7 @@ def from_json(fields: Any) -> Any:
 
 
 def template(name: str) -> dict[str, Any]:
-    """Return a message with nothing in it, to be filled in.
+    """Return an empty message, to be filled in.
 
     Raises
     ------
@@ -168,7 +167,7 @@ def _in(kind: Any, name: str, value: Any) -> Any:
 
 
 def _of_enum(kind: Any, name: str, value: Any) -> Any:
-    """Return the number that a word of an enum stands for; any other value as it is."""
+    """Return the number of an enum's name; any other value unchanged."""
     enum = kind.fieldenums_by_name.get(name)
     if enum is None:
         return value
@@ -205,7 +204,7 @@ def _bounded(value: Any, form: str) -> int | float:
 
 
 def _length(kind: Any, name: str) -> int:
-    """Return how many elements an array has; 0 of what is none."""
+    """Return how many elements an array has; 0 for other types."""
     length: int = kind.array_lengths[kind.ordered_fieldnames.index(name)]
     return length
 

@@ -1,4 +1,4 @@
-"""Messages as they come, to all who follow them; each is written once for all.
+"""Messages as they arrive, to all followers; each is encoded once for all.
 
 A follower that reads too slowly loses its own oldest messages.
 """
@@ -17,7 +17,7 @@ MAX_WAITING: Final = 1000
 
 
 class Follower:
-    """One who follows some kinds of message.
+    """A client that follows some kinds of message.
 
     Parameters
     ----------
@@ -32,13 +32,13 @@ class Follower:
         self._news = asyncio.Event()
 
     def push(self, text: str | bytes) -> None:
-        """Let a text wait, or bytes; the oldest makes room."""
+        """Queue a text or bytes; the oldest makes room."""
         self.dropped += len(self._waiting) == MAX_WAITING
         self._waiting.append(text)
         self._news.set()
 
     async def next(self) -> str | bytes:
-        """Return what is to be sent next."""
+        """Return the next item to send."""
         while not self._waiting:
             self._news.clear()
             await self._news.wait()
@@ -46,7 +46,7 @@ class Follower:
 
 
 class MessageStream:
-    """Hands messages on."""
+    """Pass messages to followers."""
 
     def __init__(self) -> None:
         self._followers: list[Follower] = []
@@ -62,7 +62,7 @@ class MessageStream:
             self._followers.remove(follower)
 
     def take(self, message: Any) -> None:
-        """Hand one decoded message on."""
+        """Pass on one decoded message."""
         followers = [each for each in self._followers if message.msgname in each.names]
         if not followers:
             return
@@ -72,7 +72,7 @@ class MessageStream:
 
 
 def with_header(message: Any) -> dict[str, Any]:
-    """Return a message with who sent it, as JSON has it."""
+    """Return a message with its sender, as JSON."""
     header = {
         "system_id": message.get_srcSystem(),
         "component_id": message.get_srcComponent(),
@@ -82,5 +82,5 @@ def with_header(message: Any) -> dict[str, Any]:
 
 
 def pretty(value: Any) -> str:
-    """Write JSON for people too; scripts count on the line breaks."""
+    """Write indented JSON; scripts rely on the line breaks."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)

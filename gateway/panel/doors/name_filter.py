@@ -1,8 +1,8 @@
-"""Which messages a regular expression of a stranger's names.
+"""Message names that match a client's regular expression.
 
-Python's engine tries every way in which repetitions can share a text, which for some expressions
-takes longer than anybody lives, and nothing else of the process runs meanwhile. So a process of
-its own tries the names, once an expression, and is ended when it takes too long.
+Python's engine backtracks, which takes exponential time for some expressions and blocks the whole
+process. So a separate process tries the names, once per expression, and is killed when it takes
+too long.
 """
 
 import asyncio
@@ -14,7 +14,7 @@ from typing import Final
 
 MAX_PATTERN: Final = 1000
 LIMIT_S: Final = 3.0
-"""The start of the process and, of any expression that people write, a thousandth of that."""
+"""For the start of the process; an ordinary expression takes a thousandth of that."""
 EVERYTHING: Final = ".*"
 AT_ONCE: Final = 2
 
@@ -36,7 +36,7 @@ class NameFilters:
     Parameters
     ----------
     names : iterable of str
-        All that there are.
+        All names.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -50,13 +50,13 @@ class NameFilters:
         Raises
         ------
         ValueError
-            If it is none, or takes too long; the text says which.
+            If it is invalid, or takes too long; the text says which.
         """
         if pattern == EVERYTHING:
             return self._names
         if len(pattern) > MAX_PATTERN:
             raise ValueError(f"filter: it has more than {MAX_PATTERN} letters")
-        # Shielded: one who leaves meanwhile must not take the answer from the others.
+        # Shielded: a client that leaves meanwhile must not cancel the answer to the others.
         return await asyncio.shield(self._known(pattern))
 
     def _remember(self, pattern: str) -> "asyncio.Task[frozenset[str]]":

@@ -1,6 +1,6 @@
 """MAVLink for scripts and pages: REST and JSON over WebSocket, compatible with mavlink2rest.
 
-All paths are there with `/v1` before them and without. Nobody who may only look may send.
+All paths exist with and without `/v1` in front. Viewers may not send.
 
 References
 ----------
@@ -28,18 +28,18 @@ from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, Role
 
 API_VERSION: Final = 0
-"""Of the answers' form, as mavlink2rest counts it."""
+"""Version of the answers' format, as in mavlink2rest."""
 DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
 MAX_ID: Final = 255
 NOTHING: Final = "None"
-"""What stands where nothing does."""
+"""Answer for a path without a value."""
 NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
 NOT_ALLOWED: Final = "whoever may only look may not send; log in as the operator"
 WS_INVALID: Final = 1007
 
 
 class RestDoor:
-    """Answers requests out of what an uplink hears, and sends through it.
+    """Answer requests from an uplink's received messages, and send through it.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class RestDoor:
         uplink.listen(self._take)
 
     def routers(self) -> list[APIRouter]:
-        """Return what is to be included in an application."""
+        """Return the routers to include in an application."""
         service = APIRouter(tags=["service"])
         service.add_api_route("/info", self.info)
         service.add_api_route("/v1/info", self.info, include_in_schema=False)
@@ -63,7 +63,7 @@ class RestDoor:
         return [service, self._router("/v1", shown=True), self._router("", shown=False)]
 
     async def info(self) -> Response:
-        """Return which program this is."""
+        """Return name and version of the program."""
         service = {
             "name": "mavgate",
             "version": __version__,
@@ -95,7 +95,7 @@ class RestDoor:
     async def write(self, request: Request) -> Response:
         """Send a message, given as `{"header": {...}, "message": {"type": "COMMAND_LONG", ...}}`.
 
-        Its header tells who sends: a system and component of one's own, 255 and 0 for a script's.
+        Its header names the sender: the client's own system and component, such as 255 and 0.
         The text is JSON or JSON5.
         """
         if request.scope[ROLE] is not Role.OPERATOR:
@@ -109,7 +109,7 @@ class RestDoor:
         return Response("Ok.", media_type="application/json")
 
     async def follow(self, socket: WebSocket) -> None:
-        """Send messages as they come, of names that a regular expression finds; take others."""
+        """Send messages with names that match a regular expression; accept messages to send."""
         await socket.accept()
         if self._filters is None:
             self._filters = NameFilters(CLASSES)
@@ -162,13 +162,13 @@ class RestDoor:
             return f"Could not convert input message. {error}"
 
     def _send(self, given: Any) -> int:
-        """Send a message and return its size; raises BadMessageError if it is none."""
+        """Send a message and return its size; raises BadMessageError if it is invalid."""
         if not isinstance(given, dict):
             raise BadMessageError("it is an object with 'header' and 'message'")
         message = from_json(given.get("message"))
         system_id, component_id = _sender(given.get("header"))
         if self._book.has_heard(system_id, component_id):
-            # Who is heard cannot be sent for: the gateway takes that for a loop.
+            # Ids of a known system must not be used: the gateway would take that for a loop.
             system_id = component_id = 0
         size = self._uplink.send_as(message, system_id, component_id)
         self._book.take(message, is_sent=True)
@@ -200,7 +200,7 @@ def _read_json(text: str) -> Any:
 
 
 def _read_json5(text: str) -> Any:
-    """Read JSON5, of which JSON is a part that nearly everybody keeps to."""
+    """Read JSON5; plain JSON, the usual case, is tried first."""
     with suppress(BadMessageError):
         return _read_json(text)
     import pyjson5

@@ -1,4 +1,4 @@
-"""The estimators compared on the last minutes: curves over each other, and figures."""
+"""The estimators compared on the last minutes: overlaid curves, and figures."""
 
 import math
 from typing import Final
@@ -18,11 +18,11 @@ QUANTITIES: Final = {
     "yaw_deg": ("Heading", "deg", "ATTITUDE.yaw", math.degrees(1.0)),
     "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
 }
-"""Title, unit, and the field that was flown with its factor, by field of `Estimate`."""
+"""Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
 
 
 class ComparisonCard:
-    """A card, built where it is made.
+    """A card, built at the current place of the page.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ class ComparisonCard:
                 self._button = ui.button("Compare", icon="compare", on_click=self._compare)
                 self._button.props("no-caps unelevated dense")
             self._story = ui.label(
-                "Fuses what the sensors told in the last three minutes with every estimator, each "
-                "with the parameters of this moment."
+                "Fuses the sensor data of the last three minutes with every estimator, each "
+                "with the present parameters."
             ).classes("soft")
             self._chart = StripChart().classes("strip")
             self._chart.set_visibility(False)
@@ -68,7 +68,7 @@ class ComparisonCard:
         finally:
             self._button.enable()
         seconds = np.ptp(self._estimates[0].time_us) / 1e6
-        self._story.set_text(f"The last {seconds:.0f} s, and what the aircraft itself told.")
+        self._story.set_text(f"The last {seconds:.0f} s, and the aircraft's own estimate.")
         self._chart.set_visibility(True)
         self._draw()
 
@@ -98,7 +98,7 @@ class ComparisonCard:
             for e in self._estimates
         )
         self._table.set_content(
-            '<table class="residuals"><tr><th>Estimator</th><th>from what was flown, RMS</th>'
+            '<table class="residuals"><tr><th>Estimator</th><th>from that in flight, RMS</th>'
             f"<th>from the GPS fixes, RMS</th></tr>{rows}</table>"
         )
 

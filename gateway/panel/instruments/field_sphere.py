@@ -1,4 +1,4 @@
-"""The magnetometer's samples as a cloud on the sphere, with what was not seen yet."""
+"""The magnetometer's samples as a cloud on the sphere, and directions not covered yet."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from gateway.panel.view_context import WEB
 
 
 class FieldSphere(Element, component=WEB / "field_sphere.js"):
-    """A sphere that can be turned by hand and by the arrow keys."""
+    """A sphere that can be turned by mouse and by arrow keys."""
 
     def __init__(self) -> None:
         super().__init__()

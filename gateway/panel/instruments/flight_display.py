@@ -8,7 +8,7 @@ from gateway.panel.view_context import WEB
 class FlightDisplay(Element, component=WEB / "flight_display.js"):
     """Horizon, roll arc, pitch ladder, heading ribbon, speed and altitude tapes, climb.
 
-    It draws what the page's own feed brings to the browser (`window.mavgate`), in the page's units;
-    nothing of it passes through Python. Between two moments the attitude turns on by the body's
-    rates. Give it a size by style or classes; anything from 160 x 120 pixels on can be read.
+    It draws the data of the page's feed (`window.mavgate`) in the browser, in the page's units,
+    without Python. Between two updates the attitude is extrapolated by the body rates. Set its
+    size by style or classes; it is legible from 160 x 120 pixels on.
     """

@@ -9,7 +9,7 @@ from gateway.panel.view_context import ViewContext
 
 
 class LiveChart:
-    """One chart of any fields of the selected aircraft, built where it is made.
+    """One chart of any fields of the selected aircraft, built at the current place of the page.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class LiveChart:
         self.reload()
 
     def reload(self) -> None:
-        """Send everything that is known, as after another aircraft was selected."""
+        """Send all data, as after another aircraft was selected."""
         if not self._is_ready:
             return
         self._sent_us = {}
@@ -42,18 +42,18 @@ class LiveChart:
         self.element.set_fields(named, self._news(), unix_time_us() / 1000)
 
     def refresh(self) -> None:
-        """Send what came since."""
+        """Send the new data."""
         if not (self._is_ready and self.fields):
             return
         history, system_id = self._context.parts.history, self._context.system_id or 0
         if any(name not in self._sent_us and history.unit(system_id, name) for name in self.fields):
-            # A message that came for the first time only now tells its unit with it.
+            # The unit is known only since the first message of its kind came.
             self.reload()
             return
         self.element.append(self._news(), unix_time_us() / 1000)
 
     async def table(self) -> str:
-        """Return what is seen as CSV."""
+        """Return the visible data as CSV."""
         begin_ms, end_ms = await self.element.span_ms()
         zero_us = self._zero_unix_us()
         history, system_id = self._context.parts.history, self._context.system_id or 0

@@ -11,7 +11,7 @@ from gateway.panel.view_context import NotAllowedError, ViewContext
 
 
 class ParameterRow:
-    """A row, built where it is made.
+    """A row, built at the current place of the page.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ class ParameterRow:
     dialogue : Dialogue
         With the aircraft.
     meta : ParameterMeta
-        What the parameter means.
+        Metadata of the parameter.
     """
 
     def __init__(self, context: ViewContext, dialogue: Dialogue, meta: ParameterMeta) -> None:
@@ -38,7 +38,7 @@ class ParameterRow:
             self._field = self._build_field()
 
     def refresh(self, dialogue: Dialogue) -> None:
-        """Show what the aircraft says now."""
+        """Show the aircraft's present value."""
         name, parameters = self._meta.name, dialogue.parameters
         value, trouble = parameters.entries[name].value, parameters.refused.get(name, "")
         pending = name in parameters.pending
@@ -67,7 +67,7 @@ class ParameterRow:
         else:
             field = ui.number(value=self._value, suffix=meta.unit, format="%.7g")
             field.props(f"{label} step=any hide-bottom-space")
-            # Only what was finished is sent: not each digit on the way to it.
+            # Only a finished value is sent, not each typed digit.
             field.on("keydown.enter", lambda: self._set(field.value))
             field.on("blur", lambda: self._set(field.value))
         field.set_enabled(may)

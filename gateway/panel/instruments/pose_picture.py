@@ -1,4 +1,4 @@
-"""How to lay the aircraft down, as a picture: one solid model in any attitude, drawn as SVG."""
+"""Pictures of how to lay the aircraft down: a solid model in any attitude, as SVG."""
 
 import math
 from typing import Final
@@ -37,7 +37,7 @@ NAMES: Final = {
 
 _BODY: Final = ((1.5, 0, 0), (0.5, 0.24, -0.1), (0.5, -0.24, -0.1), (0.5, 0, 0.28), (-1.2, 0, 0))
 _FACES: Final = (
-    # The hull, its nose marked by a face of its own.
+    # The hull, its nose marked by a separate face.
     ((_BODY[0], _BODY[1], _BODY[2]), "accent"),
     ((_BODY[0], _BODY[3], _BODY[1]), "accent"),
     ((_BODY[0], _BODY[2], _BODY[3]), "accent"),
@@ -65,7 +65,7 @@ def pose_svg(side: str) -> str:
     Returns
     -------
     str
-        An SVG element, its colours those of the page.
+        An SVG element in the page's colours.
     """
     roll_deg, pitch_deg = ATTITUDES[side]
     q_nb = from_euler(math.radians(roll_deg), math.radians(pitch_deg), 0.0)
@@ -83,7 +83,7 @@ def pose_svg(side: str) -> str:
 
 
 def _to_eye(place_n: Vec3) -> tuple[float, float, float]:
-    """Look from the front right and above: right, down, towards the eye."""
+    """Project from the front right and above: right, down, towards the eye."""
     turn, down = math.radians(-145.0), math.radians(24.0)
     x = place_n[0] * math.cos(turn) - place_n[1] * math.sin(turn)
     y = place_n[0] * math.sin(turn) + place_n[1] * math.cos(turn)

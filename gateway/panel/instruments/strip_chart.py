@@ -1,4 +1,4 @@
-"""Several fields over the last minutes, on one chart that the browser moves along."""
+"""Several fields over the last minutes, on one chart that scrolls in the browser."""
 
 import math
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ Points = tuple[IntArray, FloatArray]
 
 
 class StripChart(ui.echart, component=WEB / "strip_chart.js"):
-    """A chart that follows the present until it is paused; wheel and drag pause and zoom it.
+    """A chart that follows the time until it is paused; wheel and drag pause and zoom it.
 
-    It emits `ready` once it can be given fields, and `paused` when the operator's hand paused it.
+    It emits `ready` once fields can be set, and `paused` when the operator paused it.
     """
 
     def __init__(self) -> None:
         super().__init__({})
-        # The browser lays the chart out by itself.
+        # The browser draws the chart by itself.
         self._update_method = None
 
     def set_fields(
@@ -33,37 +33,37 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
         fields : sequence of (str, str)
             Their names and units; each unit gets its own axis.
         points : sequence of (ndarray, ndarray)
-            What is known of each already: times in ms since 1970, values.
+            Existing data of each: times in ms since 1970, values.
         now_ms : float
-            The present on the same clock.
+            The present time on the same clock.
         """
         named = [{"name": name, "unit": unit} for name, unit in fields]
         self.run_method("set_fields", named, [_plain(p) for p in points], now_ms)
 
     def append(self, points: Sequence[Points], now_ms: float) -> None:
-        """Add what came since, field by field."""
+        """Add new data, field by field."""
         self.run_method("append", [_plain(p) for p in points], now_ms)
 
     def pause(self, *, paused: bool) -> None:
-        """Stand still, or follow the present again."""
+        """Pause, or follow the time again."""
         self.run_method("pause", paused)
 
     def set_window(self, seconds: int) -> None:
-        """Show so much of the past."""
+        """Set how much of the past is shown."""
         self.run_method("set_window", seconds)
 
     async def span_ms(self) -> tuple[float, float]:
-        """Return begin and end of what is seen, in ms since 1970."""
+        """Return the visible span, in ms since 1970."""
         begin, end = await self.run_method("range")
         return float(begin), float(end)
 
     async def picture(self) -> str:
-        """Return what is seen as a data URL of a PNG."""
+        """Return the chart as a data URL of a PNG."""
         return str(await self.run_method("picture"))
 
 
 def _plain(points: Points) -> tuple[list[int], list[float | None]]:
-    """Make it JSON, which knows no NaN; seven digits are all that a 32-bit float has."""
+    """Convert to JSON, which has no NaN; a 32-bit float has seven digits."""
     time_ms, values = points
     return time_ms.tolist(), [
         float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()

@@ -1,1 +1,1 @@
-"""What the panel serves beside its page, and who may reach any of it."""
+"""Data that the panel serves besides its page, and access control."""

@@ -1,7 +1,7 @@
-"""The page's telemetry: the newest `Instant` of every aircraft, over a WebSocket of its own.
+"""The page's telemetry: the newest `Instant` of every aircraft, over a separate WebSocket.
 
-The browser grants frames, and each one costs a grant: so a slow browser, or one on a slow network,
-gets fewer frames and never old ones, and nothing can queue up here.
+Flow control by credits: the browser grants frames, and each one uses a grant. So a slow browser or
+network gets fewer frames but never old ones, and nothing queues up here.
 """
 
 import asyncio
@@ -16,21 +16,21 @@ from gateway.panel.state.fleet_picture import FleetPicture
 
 PATH: Final = "/telemetry"
 INTERVAL_S: Final = 0.033
-"""Up to 30 frames a second, a little more than sources send: at just their rate the two would beat,
-and a state would wait a whole interval. The browser draws between them."""
+"""Up to 30 frames a second, a little more than sources send: at the same rate the two would beat,
+and a state could wait a whole interval. The browser interpolates."""
 IDLE_S: Final = 0.5
-"""Without news the page is told so at this pace: ages go on."""
+"""Interval of frames without new data, so that ages are updated."""
 GRANTS: Final = 2
-"""Frames that may be on their way at once."""
+"""Frames that may be in transit at once."""
 
 
 class TelemetryFeed:
-    """Serves all open pages.
+    """Serve all open pages.
 
     Parameters
     ----------
     fleet : FleetPicture
-        What is told.
+        The aircraft.
     clock : GatewayClock
         The panel's clock.
     """
@@ -69,7 +69,7 @@ class TelemetryFeed:
             leave()
 
     def _frame(self) -> bytes:
-        """Encode this moment once for all browsers."""
+        """Encode the present state, once for all browsers."""
         now_us = self._clock()
         version, made_us, frame = self._made
         if version != self._fleet.version or now_us - made_us > INTERVAL_S * 1e6:

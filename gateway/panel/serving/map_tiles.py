@@ -1,7 +1,7 @@
-"""Tiles of the map: from a file, or from the network and then kept on disk.
+"""Tiles of the map: from a file, or from the network with a cache on disk.
 
-Browsers ask this panel and nobody else, so that a field without a network shows what was seen
-before, and no page of ours tells a map's owner who looks at it.
+Browsers load tiles only from this panel, so that cached tiles work without a network, and the
+map's owner does not see the users.
 """
 
 import asyncio
@@ -26,13 +26,13 @@ from gateway.panel.panel_settings import MapStyle, PanelSettings
 log = logging.getLogger(__name__)
 
 FRESH_S: Final = 30 * 86_400
-"""Streets change; an older tile is fetched anew, and shown all the same if that fails."""
+"""An older tile is fetched again, and still used if that fails."""
 MAX_TILE: Final = 1 << 20
 TIMEOUT_S: Final = 6.0
 AT_ONCE: Final = 4
-"""Requests to one owner, who asks that visitors be modest."""
+"""Parallel requests to one server, as tile servers' policies ask."""
 TIDY_EVERY: Final = 200
-"""Tiles fetched between two looks at the folder's size."""
+"""Tiles fetched between two checks of the folder's size."""
 MAX_ZOOM: Final = 24
 BROWSER_S: Final = 3600
 SIGNATURES: Final = (
@@ -65,7 +65,7 @@ class MapTiles:
         self._client: httpx.AsyncClient | None = None
 
     def serve(self, app: FastAPI) -> None:
-        """Serve `/tiles/STYLE/Z/X/Y`; nothing where there is no tile, and the grid shows."""
+        """Serve `/tiles/STYLE/Z/X/Y`; without a tile the page shows the grid."""
 
         @app.get("/tiles/{style}/{z}/{x}/{y}")
         async def _tile(style: int, z: int, x: int, y: int) -> Response:
@@ -77,7 +77,7 @@ class MapTiles:
             return Response(data, media_type=kind, headers=headers)
 
     async def tile(self, style: int, z: int, x: int, y: int) -> bytes | None:
-        """Get one tile; None where there is none, or it cannot be had.
+        """Return one tile; None if there is none, or it cannot be fetched.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class MapTiles:
 
 
 def tidy(folder: Path, limit: int) -> None:
-    """Delete the oldest files below a folder until the rest takes at most so many bytes."""
+    """Delete the oldest files below a folder until the rest is within a limit in bytes."""
     files = []
     for file in folder.rglob("*"):
         if file.is_file():

@@ -1,8 +1,8 @@
-"""Who may reach the page at all: hosts, origins, logins, and how much may be sent here.
+"""Access control of the page: hosts, origins, logins, and size limits.
 
-Any page that the operator's browser has open may send requests to this one. What tells them apart
-are two headers that no page can forge: `Host`, which must be a name of ours (else somebody's name
-was made to point here), and `Origin`, which must be this very page.
+Any page that the operator's browser has open may send requests to this one. Two headers that no
+page can forge distinguish them: `Host`, which must be a name of ours (against DNS rebinding), and
+`Origin`, which must be this page.
 """
 
 import asyncio
@@ -22,10 +22,10 @@ from gateway.panel.serving.page_lock import PageLock
 
 COOKIE: Final = "mavgate_panel"
 ROLE: Final = "mavgate.role"
-"""Key of the scope under which the page finds what its user may do."""
+"""Key of the scope with the user's role."""
 MAX_BODY: Final = 1 << 20
 UPLOAD: Final = "/recordings/"
-"""Paths below it may take a whole recording."""
+"""Paths below it accept a whole recording."""
 WS_POLICY_VIOLATION: Final = 1008
 
 HEADERS: Final = {
@@ -45,16 +45,16 @@ LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
 
 
 class _TooLargeError(Exception):
-    """More was sent than may be."""
+    """A request that is too large."""
 
 
 class PageGuard:
-    """Stands before the whole page.
+    """ASGI middleware in front of the whole page.
 
     Parameters
     ----------
     app : ASGI application
-        What is guarded.
+        The application to protect.
     settings : PanelSettings
         Names, passwords and limits.
     lock : PageLock
@@ -70,7 +70,7 @@ class PageGuard:
         self._upload_limit = settings.upload_limit_mb * 1_000_000
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, or refuse it."""
+        """Pass a request on, or refuse it."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
@@ -90,7 +90,7 @@ class PageGuard:
             await _refuse(scope, receive, send, HTTPStatus.UNAUTHORIZED, "log in first")
 
     def _refusal(self, headers: Headers) -> str:
-        """Tell why a request is none of this page's; empty if it is."""
+        """Return why a request is not from this page; empty if it is."""
         host = headers.get("host", "")
         if not self._is_ours(host):
             return f"this panel is not called {host!r}; settings: panel.hosts"
@@ -108,7 +108,7 @@ class PageGuard:
         name = urlsplit(f"//{host}").hostname or ""
         if name in self._names:
             return True
-        # A number cannot be made to point elsewhere, as a name can.
+        # An IP address cannot be rebound, as a name can.
         return not self._is_local and _is_number(name)
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -30,7 +30,7 @@ def hash_password(password: str) -> str:
 
 
 def matches(password: str, hashed: str) -> bool:
-    """Return whether a password is the one that was hashed; a broken hash matches none."""
+    """Return whether a password matches a hash; an invalid hash matches none."""
     try:
         kind, cost, salt, digest = hashed.split("$")
         derived = _derive(password, base64.b64decode(salt), int(cost))
@@ -41,12 +41,12 @@ def matches(password: str, hashed: str) -> bool:
 
 @dataclass(slots=True)
 class PageLock:
-    """Who is logged in, and who has guessed too often.
+    """Sessions, and addresses with too many wrong passwords.
 
     Parameters
     ----------
     operator_hash, viewer_hash : str
-        Of the settings; without the first nothing is locked.
+        From the settings; without the first no password is needed.
     """
 
     operator_hash: str
@@ -56,24 +56,24 @@ class PageLock:
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody needs a password."""
+        """Whether no password is needed."""
         return not self.operator_hash
 
     def role_of(self, token: str) -> Role | None:
-        """Return what the holder of a session may do; None if there is no such session."""
+        """Return the role of a session; None if there is no such session."""
         if self.is_open:
             return Role.OPERATOR
         role, until_s = self._sessions.get(token, (None, 0.0))
         return role if time.monotonic() < until_s else None
 
     def may_try(self, peer: str) -> bool:
-        """Return whether an address has not guessed wrong too often."""
+        """Return whether an address may try another password."""
         now_s = time.monotonic()
         failures = self._failures.get(peer, ())
         return sum(now_s - then_s < FAILURE_WINDOW_S for then_s in failures) < MAX_FAILURES
 
     def check(self, password: str) -> Role | None:
-        """Return what a password opens. It takes its time: not on the event loop."""
+        """Return the role of a password. Slow: do not call it on the event loop."""
         if matches(password, self.operator_hash):
             return Role.OPERATOR
         return Role.VIEWER if matches(password, self.viewer_hash) else None
@@ -85,7 +85,7 @@ class PageLock:
         self._failures.setdefault(peer, deque(maxlen=MAX_FAILURES)).append(time.monotonic())
 
     def open_session(self, role: Role) -> str:
-        """Begin a session and return its token."""
+        """Open a session and return its token."""
         if len(self._sessions) >= MAX_SESSIONS:
             self._sessions.pop(next(iter(self._sessions)))
         token = secrets.token_urlsafe(32)

@@ -1,4 +1,4 @@
-"""The path of an aircraft so far, for a page that was opened late."""
+"""The path of an aircraft so far, for a page that was opened later."""
 
 from typing import Any, Final
 

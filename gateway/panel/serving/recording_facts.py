@@ -1,4 +1,4 @@
-"""What the catalogue knows of the recordings, for the page: read when it changed, searched."""
+"""The catalogue of recordings for the page: reloaded when it changed, and searched."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Final
 from gateway.season.hangar.hangar_file import HANGAR_NAME, HangarError, Row, find_flights
 
 OPERATORS: Final = frozenset("<>=")
-"""What makes a search a condition."""
+"""Characters that make a search a condition."""
 
 
 class RecordingFacts:
@@ -21,14 +21,14 @@ class RecordingFacts:
         """Why a search found nothing."""
 
     def look(self, folder: Path, search: str = "") -> None:
-        """Read what changed since the last look; it takes some tens of ms for thousands.
+        """Reload the catalogue if it changed, and search; some tens of ms for thousands of rows.
 
         Parameters
         ----------
         folder : Path
             Of the recordings.
         search : str
-            A part of a name, or a condition as `mavgate hangar list --where` takes it.
+            A part of a name, or a condition as for `mavgate hangar list --where`.
         """
         stamp = _stamp(folder)
         if self._asked == (folder, stamp, search):
@@ -46,27 +46,27 @@ class RecordingFacts:
             self.trouble, self._found = str(error), frozenset()
 
     def of(self, name: str) -> Row | None:
-        """Return what is known of a recording."""
+        """Return the row of a recording."""
         return self._rows.get(name)
 
     def shows(self, name: str, search: str) -> bool:
-        """Return whether a recording is among what was searched for."""
+        """Return whether a recording matches the search."""
         if self._found is not None:
             return name in self._found
         return search.casefold() in name.casefold()
 
 
 def _stamp(folder: Path) -> tuple[int, int] | None:
-    """Return what changes with the catalogue; None if there is none."""
+    """Return a stamp that changes with the catalogue; None if there is none."""
     try:
-        told = (folder / HANGAR_NAME).stat()
+        found = (folder / HANGAR_NAME).stat()
     except OSError:
         return None
-    return told.st_mtime_ns, told.st_size
+    return found.st_mtime_ns, found.st_size
 
 
 def _by_name(rows: Sequence[Row]) -> dict[str, Row]:
-    """Take a row a recording: of its longest file, which a table tells most of."""
+    """Choose one row per recording: of its longest file, preferably a table."""
     found: dict[str, Row] = {}
     for row in rows:
         before = found.get(row["name"])

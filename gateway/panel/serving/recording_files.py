@@ -1,8 +1,8 @@
-"""Recordings to the browser and from it: downloads as one archive, uploads checked.
+"""Download of recordings as one archive, and checked uploads.
 
-Names of files never come from the browser unchecked: a recording is found among those that are
-there, and an upload gets a name that follows the rules of recordings. What is sent is written to a
-file of its own, looked at, and only then becomes a recording.
+File names from the browser are always checked: a recording must be one of the existing ones, and
+an upload gets a name that follows the rules of recordings. An upload is written to a temporary
+file, checked, and only then becomes a recording.
 """
 
 import os
@@ -30,7 +30,7 @@ from gateway.panel.view_context import PanelParts, Role
 LOOKED_AT: Final = 1 << 20
 FILE_RIGHTS: Final = 0o644
 KINDS: Final[dict[FileKind | None, str]] = {FileKind.TLOG: "_01.tlog", FileKind.TABLE: "_01_v1.csv"}
-"""What can be brought, and how its file is called behind the recording's name."""
+"""Kinds that can be uploaded, and the ending of their files."""
 
 
 def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
@@ -41,7 +41,7 @@ def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
     app : FastAPI
         The page's.
     parts : PanelParts
-        Knows their folder.
+        With their folder.
     """
 
     @app.get(UPLOAD + "{name}")
@@ -60,7 +60,7 @@ def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
     @app.put(UPLOAD + "{name}")
     async def _upload(name: str, request: Request) -> Response:
         if request.scope[ROLE] is not Role.OPERATOR:
-            return PlainTextResponse("a viewer may look and not touch", HTTPStatus.FORBIDDEN)
+            return PlainTextResponse("viewers have read-only access", HTTPStatus.FORBIDDEN)
         try:
             folder = parts.recordings_folder
             check_free(folder, name)
@@ -74,7 +74,7 @@ def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
 
 
 async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
-    """Write an upload beside the recordings, and let it become one if it is one.
+    """Write an upload beside the recordings, and rename it if it is a recording.
 
     Raises
     ------
@@ -93,7 +93,7 @@ async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
             allowed = " and ".join(str(kind) for kind in KINDS)
             raise ValueError(f"this is no recording: {allowed} are taken")
         target = folder / f"{name}{suffix}"
-        # What came in between is never overwritten.
+        # A file that was created meanwhile is never overwritten.
         target.touch(exist_ok=False)
         fresh.chmod(FILE_RIGHTS)
         fresh.replace(target)
@@ -104,7 +104,7 @@ async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
 
 
 def _kind(path: Path) -> FileKind | None:
-    """Return what an upload is by what its begin holds; None if it is no recording."""
+    """Return the kind of an upload by its first bytes; None if it is no recording."""
     kind = kind_of(path)
     with path.open("rb") as file:
         head = file.read(LOOKED_AT)

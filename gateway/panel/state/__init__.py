@@ -1,1 +1,1 @@
-"""What came over MAVLink, by aircraft. Pure: time is an argument, nothing here knows a browser."""
+"""State of the aircraft from MAVLink. Pure: time is an argument, without a browser."""

@@ -1,7 +1,7 @@
-"""What an operator must not miss: states that last, as opposed to texts that pass by.
+"""Alerts: lasting problems that an operator must not miss, unlike passing texts.
 
-Each is read anew from what came over MAVLink, so that an alert goes as soon as its cause has gone,
-and works with any vehicle; of a gateway, the nodes and the recorder are told by its texts.
+Each is derived from the present MAVLink state, so that an alert ends as soon as its cause has
+gone, and works with any vehicle; alerts about a gateway's nodes and recorder come from its texts.
 """
 
 import re
@@ -18,7 +18,7 @@ from gateway.units import US_PER_S
 SILENT_S: Final = 5.0
 FIX_OLD_US: Final = 5 * US_PER_S
 SHOUT_US: Final = 20 * US_PER_S
-"""How long a grave text of any vehicle stands as an alert of its own."""
+"""How long a severe text of any vehicle is shown as an alert."""
 
 SENSORS: Final = {
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO: "gyroscope",
@@ -38,7 +38,7 @@ _RECORDING_WELL: Final = re.compile(r"^Recording (?!stopped:).+$")
 
 
 class AlertLevel(IntEnum):
-    """How grave it is."""
+    """Severity of an alert."""
 
     WARNING = 0
     CRITICAL = 1
@@ -46,22 +46,22 @@ class AlertLevel(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """One thing that is wrong now."""
+    """One present problem."""
 
     key: str
-    """The same as long as it is the same thing."""
+    """Constant as long as it is the same problem."""
     level: AlertLevel
     title: str
     detail: str = ""
 
 
 def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
-    """Return what is wrong with one aircraft now, the gravest first.
+    """Return the present problems of one aircraft, the most severe first.
 
     Parameters
     ----------
     vehicle : VehiclePicture
-        What came of it.
+        Its state.
     now_us : int
         The panel's clock.
 
@@ -72,14 +72,14 @@ def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
     silent_s = vehicle.silent_s(now_us)
     if silent_s > SILENT_S:
         since = f"no heartbeat for {silent_s:.0f} s" if silent_s < 1e6 else "no heartbeat yet"
-        # All else would only tell what was wrong when it was last heard.
+        # Everything else would be outdated.
         return [Alert("silent", AlertLevel.CRITICAL, "Aircraft silent", since)]
     found = [*_gps(vehicle, now_us), *_sensors(vehicle), *_texts(vehicle, now_us)]
     return sorted(found, key=lambda alert: -alert.level)
 
 
 def _gps(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
-    """Tell of a GPS that had a fix and has none; one that never had is still searching."""
+    """Return an alert for a GPS that lost its fix; one that never had one is still searching."""
     if not vehicle.fixes:
         return []
     newest = vehicle.newest["GPS_RAW_INT"]
@@ -117,7 +117,7 @@ def _texts(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
 
 
 def _fold(standing: dict[str, Alert], text: TimedText) -> None:
-    """Let one text begin or end an alert."""
+    """Start or end an alert by one text."""
     if match := _SILENT.match(text.text):
         what = match["what"]
         key = f"node {what}"
@@ -129,7 +129,7 @@ def _fold(standing: dict[str, Alert], text: TimedText) -> None:
             "receiver", AlertLevel.CRITICAL, "Receiver lost", match["what"]
         )
     elif _RECEIVER_BACK.match(text.text):
-        # Also what a gateway says that was started anew, which knows of no silent node.
+        # Also the text of a restarted gateway, which knows of no silent node.
         for key in [key for key in standing if key.startswith(("receiver", "node "))]:
             del standing[key]
     elif match := _RECORDING_FAILED.match(text.text):

@@ -19,15 +19,15 @@ def fields_csv(
     series : mapping of str to (ndarray, ndarray)
         By name: times in µs on the panel's clock, growing, and values.
     units : mapping of str to str
-        By name; put behind the name in the head.
+        By name; appended to the name in the header.
     zero_unix_us : int
         Civil time of the clock's zero.
 
     Returns
     -------
     str
-        A row for each time at which any of them came, its first column seconds since 1970; empty
-        where a field did not come, or is not a number.
+        A row for each time with any value, its first column seconds since 1970; empty where a
+        field has no value, or NaN.
     """
     heads = [f"{name} ({units[name]})" if units.get(name) else name for name in series]
     lines = [",".join(["time_unix_s", *heads])]

@@ -13,9 +13,9 @@ IntArray = NDArray[np.int64]
 
 SPAN_US: Final = 300 * US_PER_S
 MAX_RATE_HZ: Final = 50
-"""What comes faster is thinned out: no strip chart of minutes has more columns than that."""
+"""Faster messages are thinned out: no strip chart of minutes has more columns."""
 LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
-"""Shorter than the interval, so that jitter thins nothing out at the very rate."""
+"""Shorter than the interval, so that jitter does not thin out messages at that rate."""
 MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
 FIRST_ROWS: Final = 256
 MAX_KINDS: Final = 200
@@ -25,13 +25,13 @@ MAX_ARRAY: Final = 32
 
 
 class FieldHistory:
-    """What was told, as columns over time, by aircraft and message."""
+    """Received fields as columns over time, by aircraft and message."""
 
     def __init__(self) -> None:
         self._vehicles: dict[int, dict[str, _Columns]] = {}
 
     def take(self, system_id: int, message: Any, now_us: int) -> None:
-        """Keep one message.
+        """Store one message.
 
         Parameters
         ----------
@@ -52,16 +52,16 @@ class FieldHistory:
         columns.add(message, now_us)
 
     def forget(self, system_id: int) -> None:
-        """Let go what an aircraft told."""
+        """Delete the data of an aircraft."""
         self._vehicles.pop(system_id, None)
 
     def fields(self, system_id: int) -> dict[str, tuple[str, ...]]:
-        """Return which fields each message of an aircraft has, in alphabetical order."""
+        """Return the fields of each message of an aircraft, in alphabetical order."""
         kinds = self._vehicles.get(system_id, {})
         return {kind: kinds[kind].names for kind in sorted(kinds) if kinds[kind].names}
 
     def unit(self, system_id: int, name: str) -> str:
-        """Tell a field's unit as MAVLink writes it; empty if it has none or is not known."""
+        """Return a field's unit as MAVLink writes it; empty if it has none or is unknown."""
         kind, _, field = name.partition(".")
         columns = self._vehicles.get(system_id, {}).get(kind)
         return "" if columns is None else columns.unit(field)
@@ -78,7 +78,7 @@ class FieldHistory:
         name : str
             Message and field, such as `ATTITUDE.roll` or `BATTERY_STATUS[0].voltages[1]`.
         after_us, until_us : int, optional
-            Only what came later than the one, and not later than the other.
+            Only values after the one, and not after the other.
 
         Returns
         -------
@@ -158,7 +158,7 @@ _Reader = tuple[str, str, Callable[[Any], float]]
 
 
 def _readers_of(message: Any) -> list[_Reader]:
-    """Return the numbers in a message: their names, the field they are of, how to read them."""
+    """Return the numbers in a message: their names, their fields, how to read them."""
     found: list[_Reader] = []
     for field in message.fieldnames:
         value = getattr(message, field)
@@ -188,7 +188,7 @@ def _kind_of(message: Any) -> str:
 
 
 def thin_out(time_us: IntArray, values: FloatArray, columns: int) -> tuple[IntArray, FloatArray]:
-    """Keep what a chart of so many columns shows: the least and the greatest of each.
+    """Keep the least and the greatest value of each column of a chart.
 
     Parameters
     ----------

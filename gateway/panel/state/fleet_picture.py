@@ -1,4 +1,4 @@
-"""All aircraft that were heard, and who listens to their messages."""
+"""All known aircraft, and the listeners to their messages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,39 +7,39 @@ from typing import Any, Final
 from gateway.panel.state.vehicle_picture import VehiclePicture
 
 AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1: what a camera of the same system says is not of its flight."""
+"""MAV_COMP_ID_AUTOPILOT1: messages of a camera of the same system are ignored."""
 FIRST_GROUND_STATION: Final = 250
 MAX_VEHICLES: Final = 32
 """More are forged; each may take some MB."""
 
 Listener = Callable[[int, Any, int], None]
-"""Given system id, decoded message and time in µs on the panel's clock."""
+"""Called with system id, decoded message and time in µs on the panel's clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where an aircraft is from that is not live."""
+    """Origin of an aircraft that is not live."""
 
     word: str
     """`recorded` or `re-fused`."""
     recorded_id: int
-    """Its system on the day that it flew."""
+    """Its recorded system id."""
 
 
 class FleetPicture:
-    """What came over MAVLink, by system id."""
+    """State from MAVLink, by system id."""
 
     def __init__(self) -> None:
         self.vehicles: dict[int, VehiclePicture] = {}
         self.origins: dict[int, Origin] = {}
-        """Of aircraft that are not live but played, by the system ids that they are played as."""
+        """Of played aircraft, by their played system ids."""
         self.version = 0
-        """Counts the messages, so that a reader knows whether there is anything new."""
+        """Counts the messages, so that a reader knows whether there is new data."""
         self._listeners: list[Listener] = []
         self._on_forget: list[Callable[[int], None]] = []
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Have every message of every aircraft handed on, until the returned function is called."""
+        """Call a listener with every message, until the returned function is called."""
         self._listeners.append(listener)
 
         def leave() -> None:
@@ -49,11 +49,11 @@ class FleetPicture:
         return leave
 
     def on_forget(self, callback: Callable[[int], None]) -> None:
-        """Have somebody told the system id of every aircraft that is let go."""
+        """Call a function with the system id of every aircraft that is forgotten."""
         self._on_forget.append(callback)
 
     def forget(self, system_id: int) -> None:
-        """Let an aircraft go."""
+        """Forget an aircraft."""
         self.vehicles.pop(system_id, None)
         self.origins.pop(system_id, None)
         self.version += 1
@@ -61,13 +61,12 @@ class FleetPicture:
             callback(system_id)
 
     def take(self, message: Any, now_us: int) -> None:
-        """Take in one decoded message of anybody.
+        """Take in one decoded message of any sender.
 
         Parameters
         ----------
         message : MAVLink_message
-            As pymavlink decodes it; those of ground stations and of other components are left
-            aside.
+            As pymavlink decodes it; those of ground stations and of other components are ignored.
         now_us : int
             The panel's clock.
         """

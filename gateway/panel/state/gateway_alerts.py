@@ -1,6 +1,6 @@
-"""What the gateway's own status tells that an operator must not miss.
+"""Alerts from the gateway's own status.
 
-It holds for what was wrong before the panel was opened too, of which no text comes any more.
+They include problems from before the panel was opened, of which no text comes any more.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,27 +13,27 @@ from gateway.vehicle.telemetry.health import node_role
 NODE_SILENT_US: Final = 3 * US_PER_S
 BLOCKED: Final = "blocked"
 OWN_KEYS: Final = ("node ", "receiver", "recording")
-"""Begins of the keys of what is told here, and by texts where there is no status."""
+"""Key prefixes of the alerts made here, which come from texts if there is no status."""
 
 
 def with_status(
     alerts: Iterable[Alert], status: Mapping[str, Any] | None, vehicle_id: int
 ) -> list[Alert]:
-    """Put what the gateway tells of its link and recorder in place of what its texts told.
+    """Replace alerts from the gateway's texts by those from its status of link and recorder.
 
     Parameters
     ----------
     alerts : iterable of Alert
         As `alerts_of` finds them for one aircraft.
     status : mapping or None
-        As the control verb `status` answers; None where no gateway can be asked.
+        Result of the control verb `status`; None without a gateway.
     vehicle_id : int
         The aircraft.
 
     Returns
     -------
     list of Alert
-        The gravest first.
+        The most severe first.
     """
     if status is None:
         return list(alerts)
@@ -51,7 +51,7 @@ def with_status(
 
 def _link(report: Mapping[str, Any], vehicle_id: int, roles: Mapping[int, str]) -> list[Alert]:
     if not report["connected"]:
-        # Without it every node is silent; that need not be said.
+        # Without it every node is silent; that needs no alert.
         return [Alert("receiver", AlertLevel.CRITICAL, "Receiver lost", report["port"])]
     found = []
     for link in report["nodes"]:

@@ -1,4 +1,4 @@
-"""One moment of one aircraft, in SI units: what the browser draws, 30 times a second."""
+"""State of one aircraft at one moment, in SI units, for the browser to draw."""
 
 import msgspec
 
@@ -6,7 +6,7 @@ from gateway.records import NAN
 
 
 class Spot(msgspec.Struct, frozen=True):
-    """A place on earth; NaN where its height is not known."""
+    """A position; its height is NaN if unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -14,10 +14,9 @@ class Spot(msgspec.Struct, frozen=True):
 
 
 class Instant(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of an aircraft at one moment.
+    """State of an aircraft at one moment.
 
-    Everything is the newest that came over MAVLink, whoever sent it; NaN (null in the browser) is
-    not known.
+    Everything is the newest from MAVLink, of any sender; NaN (null in the browser) means unknown.
     """
 
     system_id: int
@@ -28,7 +27,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     origin: str
     """`live`, `recorded` or `re-fused`."""
     generation: int
-    """How often its path began anew."""
+    """How often its path was restarted."""
     silent_s: float
     """Since the newest heartbeat."""
     q_nb: tuple[float, float, float, float]

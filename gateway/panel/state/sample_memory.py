@@ -1,4 +1,4 @@
-"""The frames of the last minutes that an estimator is fed with, by aircraft."""
+"""The sensor frames of the last minutes for the estimators, by aircraft."""
 
 from collections import deque
 from typing import Any, Final
@@ -9,7 +9,7 @@ from gateway.units import US_PER_S
 
 SPAN_US: Final = 180 * US_PER_S
 MAX_FRAMES: Final = 40_000
-"""Three minutes of 200 a second; a vehicle that tells its samples faster is remembered shorter."""
+"""Three minutes at 200 a second; less at a higher rate."""
 
 SENSOR_MESSAGES: Final = frozenset(
     {
@@ -26,13 +26,13 @@ TimedFrames = list[tuple[int, bytes]]
 
 
 class SampleMemory:
-    """What the sensors of each aircraft told."""
+    """Sensor frames of each aircraft."""
 
     def __init__(self) -> None:
         self._frames: dict[int, deque[tuple[int, bytes]]] = {}
 
     def take(self, system_id: int, message: Any, now_us: int) -> None:
-        """Keep a message, if it is a sensor's."""
+        """Store a message, if it is a sensor's."""
         if message.get_msgId() not in SENSOR_MESSAGES:
             return
         frames = self._frames.setdefault(system_id, deque(maxlen=MAX_FRAMES))
@@ -41,9 +41,9 @@ class SampleMemory:
             frames.popleft()
 
     def forget(self, system_id: int) -> None:
-        """Let go what an aircraft told."""
+        """Delete the frames of an aircraft."""
         self._frames.pop(system_id, None)
 
     def frames(self, system_id: int) -> TimedFrames:
-        """Return what is kept of an aircraft, the oldest first."""
+        """Return the frames of an aircraft, the oldest first."""
         return list(self._frames.get(system_id, ()))

@@ -1,4 +1,4 @@
-"""Units that people read; everything behind the page is SI."""
+"""Displayed units; everything behind the page is SI."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ FT: Final = 0.3048
 KT: Final = 1852 / 3600
 MPH: Final = 1609.344 / 3600
 FAR_M: Final = 1000.0
-"""Beyond it a distance is told in kilometres, miles or nautical miles."""
+"""Beyond it a distance is shown in kilometres, miles or nautical miles."""
 UNKNOWN: Final = "—"
 
 FACTORS: Final[dict[UnitSystem, dict[str, tuple[float, str]]]] = {
@@ -28,7 +28,7 @@ FACTORS: Final[dict[UnitSystem, dict[str, tuple[float, str]]]] = {
         "length": (FT, "ft"), "distance": (1852.0, "NM"),
     },
 }  # fmt: skip
-"""By how much SI is divided, and what the result is called."""
+"""Divisor of the SI value, and the unit's name."""
 
 
 @dataclass(slots=True)
@@ -38,17 +38,17 @@ class ShownUnits:
     system: UnitSystem = "metric"
 
     def text(self, quantity: str, value: float, digits: int = 1) -> str:
-        """Write a value of SI with its unit.
+        """Format an SI value with its unit.
 
         Parameters
         ----------
         quantity : str
-            `speed`, `altitude`, `climb`, `length`, or `distance`, which is told as a length while
+            `speed`, `altitude`, `climb`, `length`, or `distance`, which is shown as a length while
             it is short.
         value : float
             In m or m/s; NaN is a dash.
         digits : int
-            Behind the point.
+            After the decimal point.
 
         Returns
         -------

@@ -8,7 +8,7 @@ CHUNK: Final = 50
 """Letters of one message; a shorter one, or one with a zero, ends its text."""
 MAX_TEXTS: Final = 500
 MAX_LETTERS: Final = 2_000
-"""No text of people is longer; a sender that never ends one is cut there."""
+"""Longer texts are cut there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,7 @@ class TimedText:
     """One text."""
 
     number: int
-    """Counts up from 1, so that a page knows what is new to it."""
+    """Counts up from 1, so that a page knows which are new."""
     time_us: int
     """On the panel's clock."""
     severity: int
@@ -31,7 +31,7 @@ class StatusTexts:
         self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
         self._count = 0
         self._open: tuple[int, int] | None = None
-        """Id and next chunk of the text that the newest entry is not yet all of."""
+        """Id and next chunk of the newest entry, while it is incomplete."""
 
     def take(self, message: Any, now_us: int) -> None:
         """Take one STATUSTEXT; the chunks of a long one go into the same entry."""

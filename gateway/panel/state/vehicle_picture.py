@@ -1,4 +1,4 @@
-"""What one aircraft told over MAVLink: the newest of each message, its path, its texts."""
+"""State of one aircraft from MAVLink: the newest of each message, its path, its texts."""
 
 import math
 from collections import deque
@@ -21,10 +21,10 @@ CM: Final = 1e2
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 
 MAX_TRACK: Final = 20_000
-"""Points of a path: more than an hour at 5 Hz; the oldest go."""
+"""Points of a path: more than an hour at 5 Hz; the oldest are dropped."""
 TRACK_INTERVAL_US: Final = 200_000
 ATTITUDE_FRESH_US: Final = US_PER_S
-"""The quaternion is taken before the angles unless it is older than this."""
+"""The quaternion is preferred to the angles unless it is older than this."""
 
 PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
 COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
@@ -43,7 +43,7 @@ class PathPoint:
 
 
 class VehiclePicture:
-    """Everything that the page knows of one system.
+    """Everything known about one system.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class VehiclePicture:
     origin : str
         `live`, `recorded` or `re-fused`.
     number : int, optional
-        What people call it by, where that is not its system id.
+        Its displayed number, if it is not the system id.
     """
 
     def __init__(self, system_id: int, origin: str = "live", number: int | None = None) -> None:
@@ -60,7 +60,7 @@ class VehiclePicture:
         self.origin = origin
         self.number = system_id if number is None else number
         self.generation = 0
-        """How often the path began anew."""
+        """How often the path was restarted."""
         self.newest: dict[str, Any] = {}
         """The newest message of its autopilot by name, as pymavlink decodes it."""
         self.heard_us: dict[str, int] = {}
@@ -71,8 +71,8 @@ class VehiclePicture:
         """GPS fixes."""
         self.texts = StatusTexts()
         """STATUSTEXT, the newest last."""
-        self.told_mark: Spot | None = None
-        """The mark as the gateway's control socket tells it, exact where MAVLink is rounded."""
+        self.exact_mark: Spot | None = None
+        """The mark from the gateway's control socket, exact where MAVLink is rounded."""
         self._moved_us = 0
         self._takers: dict[str, Callable[[Any, int], None]] = {
             "STATUSTEXT": self.texts.take,
@@ -100,13 +100,13 @@ class VehiclePicture:
 
     @property
     def title(self) -> str:
-        """What people call it."""
+        """Displayed name."""
         kind = "Aircraft" if self.model == "none" else self.model.capitalize()
         name = f"{kind} {self.number}"
         return name if self.origin == "live" else f"{name}, {self.origin}"
 
     def begin_anew(self) -> None:
-        """Begin the path anew, as after a leap through a recording."""
+        """Restart the path, as after a seek in a recording."""
         self.track.clear()
         self.fixes.clear()
         self.generation += 1
@@ -118,7 +118,7 @@ class VehiclePicture:
 
     @property
     def model(self) -> str:
-        """What it looks like: `plane`, `copter`, `heli`, `rover`, `boat`, `balloon`, `none`."""
+        """Its 3D model: `plane`, `copter`, `heli`, `rover`, `boat`, `balloon`, `none`."""
         heartbeat = self.newest.get("HEARTBEAT")
         kind = -1 if heartbeat is None else heartbeat.type
         if kind in PLANES:
@@ -127,14 +127,14 @@ class VehiclePicture:
 
     @property
     def home(self) -> Spot | None:
-        """Home, if it was told."""
+        """Home, if known."""
         message = self.newest.get("HOME_POSITION")
         if message is None:
             return None
         return Spot(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
 
     def instant(self, now_us: int) -> Instant:
-        """Put together what is known at this moment."""
+        """Return the present state."""
         get, roll_pitch_yaw, q_nb, rates = self.newest.get, *self._attitude()
         place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
         heartbeat, fix, status = get("HEARTBEAT"), get("GPS_RAW_INT"), get("SYS_STATUS")
@@ -192,23 +192,23 @@ class VehiclePicture:
         return euler, from_euler(*euler), _rates(angles)
 
     def _pos_std_m(self) -> float:
-        """Return the position's standard deviation: the estimator's, or what the GPS claims."""
+        """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
         estimator, fix = self.newest.get("ESTIMATOR_STATUS"), self.newest.get("GPS_RAW_INT")
         if estimator and math.isfinite(estimator.pos_horiz_accuracy):
             return float(estimator.pos_horiz_accuracy)
         return fix.h_acc / MM if fix and fix.h_acc else NAN
 
     def _mark(self) -> tuple[Spot | None, float, float]:
-        """Return the mark, and the way to it as the aircraft itself measures it."""
+        """Return the mark, and the distance and bearing reported by the aircraft."""
         way, place = (
             self.newest.get("NAV_CONTROLLER_OUTPUT"),
             self.newest.get("GLOBAL_POSITION_INT"),
         )
         if way is None or place is None or not way.wp_dist:
-            return self.told_mark, NAN, NAN
+            return self.exact_mark, NAN, NAN
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
-        if self.told_mark is not None:
-            return self.told_mark, distance_m, bearing_deg
+        if self.exact_mark is not None:
+            return self.exact_mark, distance_m, bearing_deg
         lat_deg, lon_deg = vincenty.vreckon(
             place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
         )

@@ -1,1 +1,1 @@
-"""The page's views, one a file; each builds itself from a `ViewContext`."""
+"""The page's views, one per file; each builds itself from a `ViewContext`."""

@@ -54,7 +54,7 @@ class _CalibrationView:
         self._context = context
         self._step = CalibrationStep.GYRO
         self._drawn: object = None
-        self._told: dict[CalibrationStep, tuple[str, str]] = {}
+        self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
 
     def build(self) -> None:
         with ui.element("div").classes("calibration"):
@@ -70,26 +70,26 @@ class _CalibrationView:
         return None if system_id is None else self._context.parts.dialogues.of(system_id)
 
     def _run(self) -> CalibrationRun | None:
-        """Return the newest calibration, if it is of the step that is shown."""
+        """Return the newest calibration, if it is of the shown step."""
         dialogue = self._dialogue
         run = None if dialogue is None else dialogue.calibration
         return run if run is not None and run.step is self._step else None
 
     def _on_select(self) -> None:
-        self._told.clear()
+        self._outcomes.clear()
         self._drawn = None
         self._refresh()
 
     def _refresh(self) -> None:
-        """Draw anew what changed in kind; only move what changed in number."""
+        """Rebuild elements whose structure changed; otherwise only update their values."""
         if self._context.system_id is not None:
             self._context.parts.dialogues.load(self._context.system_id)
         run, dialogue = self._run(), self._dialogue
         if run is not None and run.state.is_over:
             done = run.state is RunState.DONE
-            self._told[run.step] = ("done", "good") if done else ("failed", "bad")
+            self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
         ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
-        state = (self._step, run, run and run.state, ready, dict(self._told))
+        state = (self._step, run, run and run.state, ready, dict(self._outcomes))
         if state != self._drawn:
             self._drawn = state
             self._build_steps()
@@ -101,7 +101,7 @@ class _CalibrationView:
         self._steps.clear()
         with self._steps:
             for step, (title, icon, short) in TITLES.items():
-                told, look = self._told.get(step, ("", ""))
+                outcome, look = self._outcomes.get(step, ("", ""))
                 card = (
                     ui.element("button").classes("card step").on("click", partial(self._show, step))
                 )
@@ -110,7 +110,7 @@ class _CalibrationView:
                 with card:
                     ui.icon(icon)
                     ui.html(f"<b>{title}</b>", sanitize=False)
-                    ui.label(told).classes(f"state {look}")
+                    ui.label(outcome).classes(f"state {look}")
                     ui.label(short).classes("soft")
 
     def _show(self, step: CalibrationStep) -> None:
@@ -151,7 +151,7 @@ class _CalibrationView:
         if run.state is RunState.FAILED:
             return f"Not calibrated: {run.trouble}. Nothing has changed; try again."
         if run.state is RunState.CHECKING:
-            return "Done. Measuring what is left; leave it as it is for a moment."
+            return "Done. Measuring the remaining error; leave it as it is for a moment."
         if run.state is RunState.DONE:
             return "Calibrated, and in use until the gateway ends. Keep it for good?"
         return WHAT_TO_DO[self._step]
@@ -251,7 +251,7 @@ class _CalibrationView:
             return
         other = context.parts.dialogues.of(system_id).unanswered
         if other not in (None, self._step):
-            # Storing this one would store that one too.
+            # Storing this one would store the other too.
             ui.notify(f"{TITLES[other][0]}: store it or undo it first", type="warning")
             return
         context.parts.dialogues.calibrate(system_id, self._step)
@@ -262,7 +262,7 @@ class _CalibrationView:
         self._context.parts.dialogues.cancel(self._context.system_id or 0)
 
     async def _store(self) -> None:
-        """Write it to the vehicle's storage: this button is the yes."""
+        """Store it in the vehicle: this button is the confirmation."""
         try:
             await self._context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE)
         except CommandFailedError as error:
@@ -275,15 +275,15 @@ class _CalibrationView:
         self._context.check_may_change()
         for name, (old, _) in self._changes().items():
             self._context.parts.dialogues.change(self._context.system_id or 0, name, old)
-        self._told.pop(self._step, None)
+        self._outcomes.pop(self._step, None)
         ui.notify(f"{TITLES[self._step][0]}: as it was before", type="info")
-        self._end(told=False)
+        self._end(stored=False)
 
-    def _end(self, *, told: bool = True) -> None:
+    def _end(self, *, stored: bool = True) -> None:
         if self._dialogue is not None:
             self._dialogue.calibration = None
-        if told:
-            self._told[self._step] = ("stored", "good")
+        if stored:
+            self._outcomes[self._step] = ("stored", "good")
         self._refresh()
 
 

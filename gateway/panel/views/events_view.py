@@ -1,4 +1,4 @@
-"""View 8: what the aircraft says in words, with time and severity; and the page's banners."""
+"""View 8: the aircraft's texts with time and severity; and the page's banners."""
 
 import html
 from datetime import datetime
@@ -21,7 +21,7 @@ SEVERITIES: Final = (
 SHOWN: Final = {7: "everything", 5: "notice and graver", 4: "warning and graver", 2: "critical"}
 LOOKS: Final = ("bad", "bad", "bad", "bad", "warn", "info", "info", "soft")
 ICONS: Final = {"bad": "error", "warn": "warning", "info": "info", "soft": "bug_report"}
-"""Each kind has a sign of its own, for colour alone tells nothing to many."""
+"""Each kind has its own icon, because colour alone is not accessible to everybody."""
 
 
 def build(context: ViewContext) -> None:
@@ -30,7 +30,7 @@ def build(context: ViewContext) -> None:
 
 
 def build_banner(context: ViewContext) -> None:
-    """Build the banners of what must not be missed; shown above every view."""
+    """Build the banners of alerts; shown above every view."""
     shown: list[Alert] = []
     place = ui.element("div").classes("banners").props('role=alert aria-live="assertive"')
 
@@ -98,7 +98,7 @@ class _EventsView:
             return
         self._drawn = state
         rows = "".join(_row(text, self._when(text)) for text in texts)
-        empty = "" if rows else '<p class="empty">Nothing was said yet.</p>'
+        empty = "" if rows else '<p class="empty">No texts yet.</p>'
         self._table.set_content(
             '<table><thead><tr><th scope="col">Time</th><th scope="col">Severity</th>'
             f'<th scope="col">Text</th></tr></thead><tbody>{rows}</tbody></table>{empty}'

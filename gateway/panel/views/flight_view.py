@@ -10,7 +10,7 @@ from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.views.map_view import FlightMap
 
 THREE: Final = ui.scene
-"""The 3D library is that of NiceGUI's own scene, whose import makes it known to the page."""
+"""The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""
 
 
 class FlightScene(Element, component=WEB / "flight_scene.js"):

@@ -15,7 +15,7 @@ SILENT_US: Final = 2 * US_PER_S
 UNKNOWN: Final = "—"
 LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
-"""Percent of payloads: above it the estimators live on their memory."""
+"""Percent of payloads: above it the estimators mostly extrapolate."""
 
 Record = Mapping[str, Any]
 

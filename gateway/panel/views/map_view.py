@@ -16,7 +16,7 @@ from gateway.panel.state.instant import Spot
 from gateway.panel.view_context import WEB, ViewContext
 
 LEAFLET: Final = ui.leaflet
-"""The map library is that of NiceGUI's own map, whose import makes it known to the page."""
+"""The map library is that of NiceGUI's own map, whose import registers it with the page."""
 
 
 class FlightMap(Element, component=WEB / "flight_map.js"):
@@ -27,7 +27,7 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
     context : ViewContext
         The page.
     full : bool
-        With its buttons and its clicks, or a small one beside other things.
+        With buttons and clicks, or a small one.
     """
 
     def __init__(self, context: ViewContext, *, full: bool) -> None:
@@ -49,7 +49,7 @@ def build(context: ViewContext) -> None:
 
 
 def _ask(context: ViewContext, event: GenericEventArguments) -> None:
-    """Ask what to do with the place that was clicked."""
+    """Ask what to do at the clicked position."""
     spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
     with ui.dialog() as dialog, ui.card().classes("asks"):
         ui.label(f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}").classes("figure title")
@@ -75,7 +75,7 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
 
 
 def _ground_m(context: ViewContext) -> float:
-    """Take home's height for that of the place: nothing here knows the terrain."""
+    """Return home's height as that of the ground: there is no terrain data."""
     vehicle = context.vehicle
     if vehicle is None:
         return math.nan
@@ -88,7 +88,7 @@ async def _mark(context: ViewContext, spot: Spot) -> None:
         mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
     )
     if context.vehicle is not None:
-        context.vehicle.told_mark = spot
+        context.vehicle.exact_mark = spot
     ui.notify("Marked", type="positive")
 
 
@@ -102,6 +102,6 @@ async def _set_home(context: ViewContext, spot: Spot) -> None:
 async def _clear(context: ViewContext) -> None:
     await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
     if context.vehicle is not None:
-        context.vehicle.told_mark = None
+        context.vehicle.exact_mark = None
         context.vehicle.newest.pop("NAV_CONTROLLER_OUTPUT", None)
     ui.notify("Mark cleared", type="positive")

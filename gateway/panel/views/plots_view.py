@@ -16,7 +16,7 @@ FIRST: Final = (
     ("ATTITUDE.roll", "ATTITUDE.pitch"),
     ("VFR_HUD.alt", "VFR_HUD.climb"),
 )
-"""What is shown before anything is chosen: what every vehicle tells."""
+"""Default fields, which every vehicle sends."""
 
 
 def build(context: ViewContext) -> None:
@@ -25,7 +25,7 @@ def build(context: ViewContext) -> None:
 
 
 class _PlotsView:
-    """The strips, and what they have in common."""
+    """The strips and their common controls."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -55,12 +55,12 @@ class _PlotsView:
         strip.card.delete()
 
     def on_hand(self) -> None:
-        """One chart was paused by hand: the others stand still with it."""
+        """Pause all charts when the user pauses one."""
         self._set_paused(paused=True)
 
     def _add(self, fields: tuple[str, ...]) -> None:
         if len(self._strips) >= MAX_STRIPS:
-            ui.notify(f"{MAX_STRIPS} charts are as many as can be looked at", type="warning")
+            ui.notify(f"{MAX_STRIPS} charts are the most", type="warning")
             return
         with self._column:
             strip = _Strip(self, self._context, fields)
@@ -93,7 +93,7 @@ class _PlotsView:
             strip.chart.refresh()
 
     def _offer(self) -> None:
-        """Offer the fields that have come by now."""
+        """Offer the fields received so far."""
         fields = self._context.parts.history.fields(self._context.system_id or 0)
         names = [f"{kind}.{field}" for kind, inner in fields.items() for field in inner]
         if names != self._names:

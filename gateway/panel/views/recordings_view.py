@@ -29,11 +29,11 @@ STATES: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle"
 
 
 class TimeSlider(Element, component=WEB / "time_slider.js"):
-    """A slider through a recording; emits `seek` with seconds since its begin."""
+    """A slider through a recording; emits `seek` with seconds since its start."""
 
 
 class UploadButton(Element, component=WEB / "upload_button.js"):
-    """Brings a file; emits `told` with how that went."""
+    """Upload a file; emits `uploaded` with the result."""
 
 
 class RecordingsView:
@@ -62,7 +62,7 @@ class RecordingsView:
                     if context.may_change:
                         upload = UploadButton()
                         upload.props(f":limit={context.parts.settings.upload_limit_mb * 1_000_000}")
-                        upload.on("told", self._on_upload)
+                        upload.on("uploaded", self._on_upload)
                 self._trouble = ui.label().classes("soft")
                 self._table = LiveTable(
                     ("Name", "Last written (UTC)", "Size", "Files", "s", "km", "m up", "Loss"),
@@ -129,7 +129,7 @@ class RecordingsView:
             self._detail.set_text(_detail_of(recorder))
         facts, search = self._facts, (self._search.value or "").strip()
         folder = self._context.parts.recordings_folder
-        # Asking the catalogue of thousands takes longer than a page may stand still.
+        # Querying a catalogue of thousands would block the page too long.
         await asyncio.to_thread(facts.look, folder, search)
         self._trouble.set_text(facts.trouble)
         self._trouble.set_visibility(bool(facts.trouble))
@@ -240,7 +240,7 @@ def build(context: ViewContext) -> None:
 
 
 def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
-    """Return the heights of all that is played, those of the chosen aircraft first."""
+    """Return the heights of all played aircraft, those of the selected one first."""
     order = sorted(playback.aircraft, key=lambda key: (key != system_id, key))
     return [playback.aircraft[key].profile for key in order]
 
@@ -266,7 +266,7 @@ def _row(recording: Any, facts: Row | None) -> Cells:
 
 
 def _facts_cells(facts: Row | None) -> Cells:
-    """Tell what the catalogue knows; blank where it knows nothing."""
+    """Return the catalogue's cells; blank where unknown."""
     if facts is None:
         return (("", ""),) * 4
     if facts["error"] is not None:

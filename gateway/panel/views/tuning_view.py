@@ -1,4 +1,4 @@
-"""View 6: every parameter with what it means, changed live, its effect in plots beside it."""
+"""View 6: every parameter with its meaning, changed live, with its effect in plots beside it."""
 
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from gateway.panel.view_context import ViewContext
 
 REFRESH_S: Final = 0.25
 MAX_ROWS: Final = 120
-"""As many as are still found by the eye; the search narrows the rest down."""
+"""More would be confusing; the search finds the others."""
 ALL: Final = "all groups"
 STORE: Final = 1.0
 """PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
@@ -31,7 +31,7 @@ EFFECTS: Final = {
     "field": ("HIGHRES_IMU.xmag", "HIGHRES_IMU.ymag", "HIGHRES_IMU.zmag"),
     "accuracy": ("ESTIMATOR_STATUS.pos_horiz_accuracy", "ESTIMATOR_STATUS.pos_vert_accuracy"),
 }
-"""What a change may show in, by the words of the choice."""
+"""Plots in which a change may show, by the label of the choice."""
 
 
 def build(context: ViewContext) -> None:
@@ -40,7 +40,7 @@ def build(context: ViewContext) -> None:
 
 
 class _TuningView:
-    """The parameters on the left, what they do on the right."""
+    """The parameters on the left, their effect on the right."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -116,7 +116,7 @@ class _TuningView:
             row.refresh(dialogue)
 
     def _draw(self, _: Any = None) -> None:
-        """Build the rows that are wanted."""
+        """Build the visible rows."""
         dialogue = self._dialogue
         self._list.clear()
         self._rows = {}
@@ -136,7 +136,7 @@ class _TuningView:
                 ui.label(f"{len(names) - MAX_ROWS} more; search for them").classes("empty")
             if not names:
                 known = dialogue.parameters.entries
-                text = "No parameter is called or described so." if known else "No parameters yet."
+                text = "No parameter matches." if known else "No parameters yet."
                 ui.label(text).classes("empty")
 
     def _wanted(self, dialogue: Dialogue) -> list[str]:
@@ -178,7 +178,7 @@ def _state_of(dialogue: Dialogue) -> str:
         case ListState.LOADING:
             return f"reading {len(parameters.entries)} of {parameters.count or '…'}"
         case ListState.FAILED:
-            return f"{len(parameters.entries)} parameters; the aircraft tells no more"
+            return f"{len(parameters.entries)} parameters; the aircraft sends no more"
         case ListState.COMPLETE:
             return f"{len(parameters.entries)} parameters"
         case _:

@@ -244,9 +244,9 @@ export default {
       this.circle = radius === null ? "" : mavgate.show("length", radius).join(" ");
       this.way = "";
       if (state.mark) {
-        const told = state.mark_distance_m !== null;
-        const distance = told ? state.mark_distance_m : this.map.distance(here, at(state.mark));
-        const bearing = told ? state.mark_bearing_deg : bearing_deg(here, at(state.mark));
+        const reported = state.mark_distance_m !== null;
+        const distance = reported ? state.mark_distance_m : this.map.distance(here, at(state.mark));
+        const bearing = reported ? state.mark_bearing_deg : bearing_deg(here, at(state.mark));
         this.way = `mark ${mavgate.show("distance", distance, 2).join(" ")}, ${Math.round(bearing) % 360}°`;
       }
       this.place = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;

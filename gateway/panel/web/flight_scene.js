@@ -1,13 +1,13 @@
 // The aircraft in 3D from two viewpoints: one world, drawn twice.
 //
-// World: metres, x east, y north, z up; its origin is home, or the first place that was told.
+// World: metres, x east, y north, z up; its origin is home, or the first reported position.
 // Aircraft models stand in x forward, y left, z up.
 import { THREE } from "nicegui-scene";
 
 const EARTH_M = 6378137;
 const TAIL = 6000; // points of a path
 const STEP_M = 1.5; // between them
-const AHEAD_S = 0.25; // no pose is foretold further
+const AHEAD_S = 0.25; // poses are extrapolated no further
 const FRAME_MS = 30;
 const SLOWEST_MS = 400;
 const LATE_MS = 45; // between two turns of the browser's own
@@ -19,8 +19,8 @@ const rad = Math.PI / 180;
 // Whether the machine's processor draws, which has instruments to draw and perhaps a gateway to run.
 function in_software() {
   const gl = document.createElement("canvas").getContext("webgl");
-  const told = gl?.getExtension("WEBGL_debug_renderer_info");
-  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  const extension = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = extension ? gl.getParameter(extension.UNMASKED_RENDERER_WEBGL) : "";
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|software/i.test(name);
 }

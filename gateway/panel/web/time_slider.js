@@ -11,15 +11,15 @@ export default {
   props: { curves: Array, duration: Number, position: Number, playing: Boolean, speed: Number },
   data: () => ({ held: null, shown: 0 }),
   mounted() {
-    this.told_ms = performance.now();
+    this.updated_ms = performance.now();
     this.size = new ResizeObserver(() => this.draw());
     this.size.observe(this.$el);
     for (const name of ["curves", "duration"]) this.$watch(name, () => this.draw());
-    this.$watch("position", () => (this.told_ms = performance.now()));
+    this.$watch("position", () => (this.updated_ms = performance.now()));
     const turn = () => {
       this.handle = requestAnimationFrame(turn);
       if (!this.$el.offsetParent) return;
-      const ahead = this.playing ? ((performance.now() - this.told_ms) / 1000) * this.speed : 0;
+      const ahead = this.playing ? ((performance.now() - this.updated_ms) / 1000) * this.speed : 0;
       const now = this.held ?? Math.min(this.position + Math.min(ahead, this.speed), this.duration);
       if (Math.abs(now - this.shown) < this.duration / 4000) return;
       this.shown = now;

@@ -11,7 +11,7 @@ export default {
       event.target.value = "";
       if (!file) return;
       if (file.size > this.limit) {
-        this.$emit("told", { ok: false, text: `${file.name} is too large: at most ${Math.round(this.limit / 1e6)} MB` });
+        this.$emit("uploaded", { ok: false, text: `${file.name} is too large: at most ${Math.round(this.limit / 1e6)} MB` });
         return;
       }
       const name = file.name.replace(/(_\d{2,})?(_v\d+)?\.(tlog|csv)$/i, "");
@@ -20,7 +20,7 @@ export default {
       request.onloadend = () => {
         this.word = "Upload…";
         const ok = request.status === 201;
-        this.$emit("told", { ok, text: ok ? `${name} is here` : request.responseText || "the upload broke off" });
+        this.$emit("uploaded", { ok, text: ok ? `${name} was uploaded` : request.responseText || "the upload was interrupted" });
       };
       request.open("PUT", `/recordings/${encodeURIComponent(name)}`);
       request.send(file);

@@ -1,1 +1,1 @@
-"""What is asked of an aircraft in more than one message: parameters, files, calibrations."""
+"""Exchanges with an aircraft of more than one message: parameters, files, calibrations."""

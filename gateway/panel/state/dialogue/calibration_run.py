@@ -1,9 +1,9 @@
-"""One calibration as the page follows it: what the vehicle says, and what its samples tell.
+"""One calibration as the page follows it, from the vehicle's texts and samples.
 
-The vehicle itself calibrates (MAV_CMD_PREFLIGHT_CALIBRATION); it says how far it is by COMMAND_ACK
-and by the `[cal]` texts that QGroundControl reads, so this works with PX4 as well. What is drawn
-and the residuals come from the samples that it sends meanwhile: those before it accepted tell the
-error that it began with, those behind what is left.
+The vehicle itself calibrates (MAV_CMD_PREFLIGHT_CALIBRATION); it reports its progress by
+COMMAND_ACK and by the `[cal]` texts that QGroundControl reads, so this works with PX4 as well. The
+drawing and the residuals come from the samples that it sends meanwhile: those before its
+acceptance show the initial error, those after it the remaining one.
 """
 
 import math
@@ -27,17 +27,17 @@ FloatArray = NDArray[np.float64]
 UT_PER_GAUSS: Final = 100.0
 MILLI: Final = 1e-3
 NO_ANSWER_US: Final = 4 * US_PER_S
-"""After the last word of a vehicle that never answered the command."""
+"""After the last message of a vehicle that never answered the command."""
 GIVEN_UP_US: Final = 200 * US_PER_S
 AFTER_US: Final = 2 * US_PER_S
-"""How long the samples behind the calibration are watched."""
+"""How long the samples after the calibration are evaluated."""
 WINDOW: Final = 25
-"""Samples, half a second at the rate that is asked for, that a position is read from."""
+"""Samples for a position: half a second at the requested rate."""
 MAX_SAMPLES: Final = 3000
 MIN_FIT: Final = 30
 
 SIDES: Final = ("down", "up", "left", "right", "front", "back")
-"""Which side of the aircraft lies below, in the words of the `[cal]` texts; down is level."""
+"""Which side of the aircraft lies below, as in the `[cal]` texts; down is level."""
 _POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
 """By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
 SIDE_SHARE: Final = 0.85
@@ -51,7 +51,7 @@ _CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
 
 
 class CalibrationStep(StrEnum):
-    """What can be calibrated, in the order in which it is best done."""
+    """The calibrations, in the recommended order."""
 
     GYRO = "gyro"
     ACCEL = "accel"
@@ -69,24 +69,24 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
 
 
 class RunState(StrEnum):
-    """Where a calibration is."""
+    """State of a calibration."""
 
     ASKED = "asked"
     RUNNING = "running"
     CHECKING = "checking"
-    """Done, and what it left is being measured."""
+    """Done, and the remaining error is being measured."""
     DONE = "done"
     FAILED = "failed"
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more will happen."""
+        """Whether it has ended."""
         return self in (RunState.DONE, RunState.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """One number that tells how good a sensor is, before and after."""
+    """One measure of a sensor's quality, before and after."""
 
     name: str
     unit: str
@@ -112,7 +112,7 @@ class CalibrationRun:
     system_id : int
         Whose.
     step : CalibrationStep
-        Of what.
+        What to calibrate.
     now_us : int
         The panel's clock.
     """
@@ -122,7 +122,7 @@ class CalibrationRun:
         self.step = step
         self.state = RunState.ASKED
         self.progress = 0
-        """In percent, as the vehicle says."""
+        """In percent, as reported by the vehicle."""
         self.trouble = ""
         """Why it failed."""
         self.sides_done: list[str] = []
@@ -134,11 +134,11 @@ class CalibrationRun:
         self._done_us = 0
 
     def start_message(self) -> Any:
-        """Return the command that begins it."""
+        """Return the command that starts it."""
         return _command(self.system_id, PARAMS[self.step])
 
     def cancel_message(self) -> Any:
-        """Return the command that breaks it off: all zero."""
+        """Return the command that cancels it: all zero."""
         return _command(self.system_id, ())
 
     def take(self, message: Any, now_us: int) -> None:
@@ -154,7 +154,7 @@ class CalibrationRun:
                 self._take_sample(_milli(message))
 
     def poll(self, now_us: int) -> None:
-        """Notice what has not come."""
+        """Notice missing answers."""
         if self.state is RunState.ASKED and now_us - self._heard_us > NO_ANSWER_US:
             self._fail("the aircraft does not answer")
         elif self.state is RunState.RUNNING and now_us - self._began_us > GIVEN_UP_US:
@@ -168,14 +168,14 @@ class CalibrationRun:
         return np.array(self._before.mag).reshape(-1, 3)
 
     def sphere(self) -> tuple[_Vector, float]:
-        """Tell centre and radius of the magnetic field's sphere, uT, as far as they are known."""
+        """Return centre and radius of the magnetic field's sphere, uT, as far as known."""
         points = self.field_points
         if not len(points):
             return (0.0, 0.0, 0.0), NAN
         if len(points) >= MIN_FIT:
             centre, radius = fit_sphere(points)
             spread = float(np.ptp(points, axis=0).max())
-            # A small patch fits to a sphere of any size; till then the middle is as good.
+            # A small patch fits a sphere of any size; until then use the mean.
             if math.isfinite(radius) and radius < spread:
                 return centre, radius
         x, y, z = (points.min(axis=0) + points.max(axis=0)).tolist()
@@ -190,7 +190,7 @@ class CalibrationRun:
         return seen_cells(self.field_points - centre)
 
     def residuals(self) -> list[Residual]:
-        """Return what was wrong before and what is left, as far as it is known."""
+        """Return the errors before and after, as far as known."""
         match self.step:
             case CalibrationStep.GYRO:
                 return [Residual("Rate at rest", "deg/s", *self._each(_rate_degps))]
@@ -210,7 +210,7 @@ class CalibrationRun:
             if message.progress <= 100:
                 self.progress = max(self.progress, message.progress)
         elif message.result == mavlink.MAV_RESULT_ACCEPTED:
-            # PX4 accepts at once and tells the rest by texts; the gateway accepts what is done.
+            # PX4 accepts at once and reports the rest by texts; the gateway accepts at the end.
             if self.state is RunState.RUNNING:
                 self._finish(now_us)
             else:
@@ -221,7 +221,7 @@ class CalibrationRun:
 
     def _take_text(self, text: str, now_us: int) -> None:
         if match := _FAILED.match(text):
-            # The acknowledgement, which does not tell why, comes before it.
+            # The acknowledgement, which gives no reason, comes before it.
             self.state, self.trouble = RunState.FAILED, match[1]
         if self.state.is_over:
             return
@@ -264,7 +264,7 @@ class CalibrationRun:
             self._note_side()
 
     def _note_side(self) -> None:
-        """Notice which side lies below, and what gravity reads there."""
+        """Note which side lies below, and the gravity measured there."""
         recent = np.array(self._before.accel[-WINDOW:])
         mean = recent.mean(axis=0)
         axis = int(np.abs(mean).argmax())

@@ -1,4 +1,4 @@
-"""The asking side of MAVLink FTP, for reading one small file after the other.
+"""Client of MAVLink FTP, for reading one small file after the other.
 
 References
 ----------
@@ -17,7 +17,7 @@ from gateway.vehicle.services.ftp import ACK, MAX_DATA, NAK, FtpError, Opcode, P
 RETRY_US: Final = US_PER_S // 2
 MAX_ATTEMPTS: Final = 6
 MAX_FILE: Final = 4_000_000
-"""Metadata of the largest autopilots has two; a vehicle that sends more is not believed."""
+"""Metadata of the largest autopilots has two; more is refused."""
 AUTOPILOT: Final = 1
 
 
@@ -30,7 +30,7 @@ class _Reading:
 
 
 class FileClient:
-    """Reads files of one vehicle; what was read or refused is kept in `files` and `refused`.
+    """Read files of one vehicle; results are in `files` and `refused`.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class FileClient:
         self.system_id = system_id
         self.files: dict[str, bytes] = {}
         self.refused: set[str] = set()
-        """Files that there are not, or that could not be read."""
+        """Files that do not exist, or could not be read."""
         self._wanted: list[str] = []
         self._reading: _Reading | None = None
         self._sequence = 0
@@ -56,12 +56,12 @@ class FileClient:
         return self._reading is not None
 
     def read(self, path: str, now_us: int) -> list[Any]:
-        """Begin to read a file, or line it up; returns what is to be sent."""
+        """Start reading a file, or queue it; return the messages to send."""
         self._wanted.append(path)
         return [] if self.busy else self._next(now_us)
 
     def take(self, message: Any, now_us: int) -> list[Any]:
-        """Take in one message of the vehicle; returns what is to be sent."""
+        """Process one message of the vehicle; return the messages to send."""
         if message.get_type() != "FILE_TRANSFER_PROTOCOL" or self._asked is None:
             return []
         packet = decode_packet(bytes(message.payload))
@@ -75,7 +75,7 @@ class FileClient:
         return self._end(now_us, read=ended) if packet.opcode == NAK else []
 
     def poll(self, now_us: int) -> list[Any]:
-        """Ask again, or give up; returns what is to be sent."""
+        """Repeat a request, or give up; return the messages to send."""
         if self._asked is None or now_us < self._due_us:
             return []
         if self._attempts >= MAX_ATTEMPTS:
@@ -111,7 +111,7 @@ class FileClient:
                 self.refused.add(reading.path)
             if reading.session is not None:
                 found += self._ask(Opcode.TERMINATE_SESSION, reading.session, 0, b"", now_us)
-                # Whether it was heard does not matter: the server makes room by itself.
+                # Whether it arrived does not matter: the server makes room by itself.
                 self._asked = None
         return found + self._next(now_us)
 

@@ -1,8 +1,8 @@
-"""The asking side of the parameter protocol: the whole list, and one change at a time.
+"""Client of the parameter protocol: the whole list, and single changes.
 
-Theory of operation. PARAM_REQUEST_LIST makes the vehicle send everything; what is still missing
-when nothing came for a while is asked for one by one. A change is sent until the vehicle answers:
-PARAM_VALUE with the new value is a yes; PARAM_ERROR, or the old value, is a no.
+Theory of operation. PARAM_REQUEST_LIST makes the vehicle send everything; parameters still missing
+after a pause are requested one by one. A change is sent until the vehicle answers: PARAM_VALUE
+with the new value is a yes; PARAM_ERROR, or the old value, is a no.
 """
 
 import math
@@ -24,7 +24,7 @@ MAX_PARAMETERS: Final = 5000
 """Large autopilots have some 1500; more are forged."""
 AUTOPILOT: Final = 1
 NO_INDEX: Final = 65535
-"""Of a parameter that was sent unasked."""
+"""Index of a parameter that was not requested."""
 
 ERRORS: Final = {
     mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",
@@ -35,7 +35,7 @@ ERRORS: Final = {
 
 
 class ListState(StrEnum):
-    """How far the list is."""
+    """Progress of the list."""
 
     UNKNOWN = "unknown"
     LOADING = "loading"
@@ -45,7 +45,7 @@ class ListState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ParameterEntry:
-    """One parameter as the vehicle told it."""
+    """One parameter as the vehicle sent it."""
 
     name: str
     value: float
@@ -74,12 +74,12 @@ class ParameterClient:
         self.system_id = system_id
         self.state = ListState.UNKNOWN
         self.count = 0
-        """How many the vehicle says that it has."""
+        """Number of parameters, as reported by the vehicle."""
         self.entries: dict[str, ParameterEntry] = {}
         self.refused: dict[str, str] = {}
-        """Why the last change of a parameter did not come about, until it is changed again."""
+        """Why the last change of a parameter failed, until it is changed again."""
         self.bytewise = False
-        """Whether integers travel as their bytes (PX4) and not as numbers (ArduPilot)."""
+        """Whether integers are encoded byte-wise (PX4) and not as numbers (ArduPilot)."""
         self._indices: set[int] = set()
         self._changes: dict[str, _Change] = {}
         self._attempts = 0
@@ -87,17 +87,17 @@ class ParameterClient:
 
     @property
     def pending(self) -> frozenset[str]:
-        """Names of what was changed and is not confirmed yet."""
+        """Names of changed parameters that are not confirmed yet."""
         return frozenset(self._changes)
 
     def load(self, now_us: int) -> list[Any]:
-        """Ask for all of them; returns what is to be sent."""
+        """Request all of them; return the messages to send."""
         self.state, self._attempts = ListState.LOADING, 0
         self._due_us = now_us + QUIET_US
         return [mavlink.MAVLink_param_request_list_message(self.system_id, AUTOPILOT)]
 
     def change(self, name: str, value: float, now_us: int) -> list[Any]:
-        """Set one; returns what is to be sent.
+        """Set one; return the messages to send.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class ParameterClient:
         return [self._set_message(entry, value)]
 
     def take(self, message: Any, now_us: int) -> None:
-        """Take in one message of the vehicle; all but those about parameters are left aside."""
+        """Process one message of the vehicle; only those about parameters matter."""
         match message.get_type():
             case "PARAM_VALUE":
                 self._take_value(message, now_us)
@@ -129,7 +129,7 @@ class ParameterClient:
                 self.bytewise |= message.autopilot == mavlink.MAV_AUTOPILOT_PX4
 
     def poll(self, now_us: int) -> list[Any]:
-        """Ask again for what did not come; returns what is to be sent."""
+        """Repeat requests without an answer; return the messages to send."""
         return self._poll_list(now_us) + self._poll_changes(now_us)
 
     def _take_value(self, message: Any, now_us: int) -> None:
@@ -138,7 +138,7 @@ class ParameterClient:
             return
         value = self._decoded(message.param_value, kind)
         known = self.entries.get(name)
-        # 65535 is the index of one that was sent unasked.
+        # 65535 is the index of one that was not requested.
         index = (
             message.param_index if message.param_index != 65535 or known is None else known.index
         )
@@ -186,7 +186,7 @@ class ParameterClient:
     def _decoded(self, value: float, kind: int) -> float:
         if self.bytewise:
             return decode_value(value, kind)
-        # The zero takes off the sign that a rotation's zero may have.
+        # Adding zero removes the sign of a negative zero.
         return float(str(np.float32(value))) + 0.0
 
     def _set_message(self, entry: ParameterEntry, value: float) -> Any:

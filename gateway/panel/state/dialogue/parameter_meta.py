@@ -1,4 +1,4 @@
-"""What parameters mean: the component metadata of a vehicle, read leniently.
+"""Meaning of parameters: the component metadata of a vehicle, read leniently.
 
 References
 ----------
@@ -15,14 +15,14 @@ import msgspec
 from gateway.records import NAN
 
 GENERAL_PATHS: Final = ("/general.json", "/etc/extras/component_general.json.xz")
-"""Where vehicles keep the file that names the others, if they do not say."""
+"""Default paths of the general metadata file."""
 TYPE_PARAMETER: Final = 1
 MAX_PLAIN: Final = 16_000_000
-"""A metadata file unpacked; larger ones are bombs."""
+"""Limit of an unpacked metadata file, against decompression bombs."""
 
 
 class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
-    """What the vehicle's authors say of one parameter."""
+    """Metadata of one parameter."""
 
     name: str
     group: str = ""
@@ -39,7 +39,7 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parameter_path(general: bytes) -> str | None:
-    """Return the path of the parameters' file, as a general metadata file has it.
+    """Return the path of the parameters' file in a general metadata file.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def parameter_path(general: bytes) -> str | None:
     Returns
     -------
     str or None
-        On the vehicle itself; None if there is none, or it is elsewhere.
+        On the vehicle; None if there is none, or it is elsewhere.
     """
     for kind in _items(_parsed(general), "metadataTypes"):
         uri = str(kind.get("uri", ""))
@@ -69,7 +69,7 @@ def parse_parameters(content: bytes) -> dict[str, ParameterMeta]:
     Returns
     -------
     dict of str to ParameterMeta
-        By name; what cannot be read is left out.
+        By name; unreadable entries are left out.
     """
     found = (_meta_of(item) for item in _items(_parsed(content), "parameters"))
     return {meta.name: meta for meta in found if meta is not None}

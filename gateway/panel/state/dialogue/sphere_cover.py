@@ -1,7 +1,7 @@
-"""Which directions of a sphere were seen: the cells of a geodesic grid.
+"""Coverage of a sphere by directions: the cells of a geodesic grid.
 
-The grid is an icosahedron whose triangles were cut in four: 80 cells of nearly one size, the same
-grid as other autopilots show while a compass is calibrated.
+The grid is an icosahedron whose triangles were divided in four: 80 cells of nearly equal size, the
+same grid as in other compass calibrations.
 """
 
 import math
@@ -47,12 +47,12 @@ _MIDDLES: Final = np.array([_unit(cell.sum(axis=0)) for cell in CELLS])
 
 
 def seen_cells(vectors: FloatArray) -> list[bool]:
-    """Return which cells the vectors point into, taken from the origin.
+    """Return which cells the vectors from the origin point into.
 
     Parameters
     ----------
     vectors : ndarray, shape (n, 3)
-        Any length but zero; rows that are not finite are left out.
+        Any length but zero; rows that are not finite are ignored.
 
     Returns
     -------
