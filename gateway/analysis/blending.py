@@ -1,8 +1,8 @@
 """Table I of the paper: how alpha and beta change the error of the position.
 
-The paper measures its fused track against interpolated GPS, the very fixes that it was fused from.
-That favours whoever copies the GPS; so fixes that the filter never saw judge it here too, and the
-reference where there is one.
+The paper measures its fused track against interpolated GPS, the same fixes that it was fused from.
+That favours a filter that copies the GPS; so here it is also measured against withheld fixes, and
+the reference if there is one.
 """
 
 import itertools
@@ -48,7 +48,7 @@ PAPER_TABLE: Final = pd.DataFrame(
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """What the tracks of one flight are scored against."""
+    """The data against which the tracks of one flight are scored."""
 
     fused: Flight
     """The flight with only the fixes that are fused."""
@@ -57,11 +57,11 @@ class Judge:
     held_flight: Flight
     """The flight with only the fixes that are not fused."""
     held: Fixes
-    """Those, as arrays; perhaps none."""
+    """The same as arrays; may be empty."""
 
 
 def make_judge(flight: Flight, keep: BoolArray) -> Judge:
-    """Part the fixes of a flight.
+    """Split the fixes of a flight.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def make_judge(flight: Flight, keep: BoolArray) -> Judge:
 
 
 def judge_of(fused: Flight, held: Flight) -> Judge:
-    """Judge by a flight with the fixes that are fused, and one with those that are not."""
+    """Build a judge from a flight with the fused fixes, and one with the withheld ones."""
     return Judge(fused, interpolate(fixes_of(fused), fused.time_us), held, fixes_of(held))
 
 
@@ -95,8 +95,8 @@ def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
     dict of str to float
         `north_m` and `east_m`, mean error against interpolated GPS as in the paper;
         `interpolated_m`, its horizontal root mean square; `held_m`, the same against the fixes
-        that were not fused; `reference_m`, the same against the reference. NaN where there is
-        nothing to compare with.
+        that were not fused; `reference_m`, the same against the reference. NaN without data to
+        compare with.
     """
     flight = judge.fused
     scored = flight.scored
@@ -127,11 +127,11 @@ def blend_table(
     ----------
     flight : Flight
     fusion : FusionSettings
-        The paper's estimator is taken, whatever is chosen there.
+        The paper's estimator is used, whatever is selected there.
     sensed : Sensed
         The flight's filtered samples.
     interval_s : float
-        GPS is thinned to one fix in so many seconds; 0 for all.
+        GPS is thinned to one fix in this many seconds; 0 for all.
     weights : sequence of float
         Values of alpha and of beta.
 

@@ -1,4 +1,4 @@
-"""One flight fused with every estimator: what all sections of a report start from."""
+"""One flight fused with every estimator, the input of all sections of a report."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -22,24 +22,24 @@ ESTIMATORS: Final[tuple[str, ...]] = tuple(
 """Every estimator has a section of settings of its own name."""
 
 SMOOTHED: Final = "smoothed"
-"""Name of the track that knows the whole flight at each of its instants."""
+"""Name of the smoothed track, which uses the whole flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A flight, the settings it is fused with, and what came out."""
+    """A flight, the settings it is fused with, and the results."""
 
     flight: Flight
     fusion: FusionSettings
     sensed: Sensed
     tracks: dict[str, FlightTrack]
-    """By estimator, and `SMOOTHED` where that was asked for."""
+    """By estimator, and `SMOOTHED` if requested."""
     frame: LocalFrame | None
     """Metres about the first fix; None in a flight without GPS."""
 
     @property
     def chosen(self) -> str:
-        """The estimator that the settings name."""
+        """The estimator selected in the settings."""
         return self.fusion.estimation.estimator
 
     @property
@@ -49,7 +49,7 @@ class Case:
 
     @property
     def truth_name(self) -> str:
-        """What the reference is called in a legend."""
+        """Name of the reference in a legend."""
         reference = self.flight.reference
         return "truth" if reference is not None and reference.is_exact else "reference"
 
@@ -69,9 +69,9 @@ def make_case(
     ----------
     flight : Flight
     fusion : FusionSettings, optional
-        In place of the flight's own.
+        Instead of the flight's own.
     smooth : bool
-        Add a track that is smoothed from both ends, where the clock allows.
+        Add a track that is smoothed from both ends, if the clock never goes back.
 
     Returns
     -------

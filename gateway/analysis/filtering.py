@@ -62,13 +62,13 @@ def apply(kind: Kind, settings: SensingSettings, rate_hz: float, x: FloatArray) 
 
 
 def compare(settings: SensingSettings, rate_hz: float) -> pd.DataFrame:
-    """Put the filters' properties side by side.
+    """Compare the filters' properties in a table.
 
     Returns
     -------
     DataFrame
-        One row a filter: ripple of the pass band, gain at the cutoff and at three times the
-        cutoff, group delay at 0 Hz and its maximum, overshoot of a step, time a sample.
+        One row per filter: ripple of the pass band, gain at the cutoff and at three times the
+        cutoff, group delay at 0 Hz and its maximum, overshoot of a step, time per sample.
     """
     return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
 
@@ -77,7 +77,7 @@ def _properties(kind: Kind, settings: SensingSettings, rate_hz: float) -> dict[s
     found = response(kind, settings, rate_hz)
     cutoff = settings.accel_cutoff_hz
     passed = found.gain_db[found.frequency_hz <= cutoff]
-    # The Butterworth gain falls steadily: only what rises again is ripple.
+    # The Butterworth gain falls monotonically: only a later rise is ripple.
     ripple_db = float(np.max(np.maximum.accumulate(passed[::-1])[::-1] - passed[0]))
     steps = np.ones((round(STEP_S * rate_hz), 3))
     steps[0] = 0.0

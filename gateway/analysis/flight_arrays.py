@@ -1,7 +1,7 @@
-"""One flight as the analysis sees it: calibrated samples as arrays, and what is known to be true.
+"""One flight for the analysis: calibrated samples as arrays, and the truth if known.
 
-Whatever a flight comes from, here it is the same: arrays on the gateway clock, one row per IMU
-sample, and the GPS fixes as the records that an estimator takes.
+Flights of all sources have the same form: arrays on the gateway clock, one row per IMU sample, and
+the GPS fixes as the records that an estimator takes.
 """
 
 from collections.abc import Iterable
@@ -42,11 +42,11 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 SETTLING_US: Final = 5_000_000
-"""After the first fix; what comes before says nothing about a flight."""
+"""After the first fix; earlier samples are not scored."""
 
 
 class FusionSettings(Settings, frozen=True):
-    """All settings that change what a flight is fused to."""
+    """All settings that affect the fusion of a flight."""
 
     sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
@@ -66,7 +66,7 @@ class FlightTrack:
     """Shape (N, 3), NED."""
 
     def where_valid(self, flags: IntArray) -> "FlightTrack":
-        """Make unknown what the estimator itself does not vouch for.
+        """Set to NaN what the estimator does not flag as valid.
 
         An attitude counts as known without a heading only if there never is one.
         """
@@ -91,11 +91,11 @@ class FlightTrack:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What an estimate is judged by, at the times of the IMU samples."""
+    """The reference of an estimate, at the times of the IMU samples."""
 
     track: FlightTrack
     is_exact: bool
-    """Whether it is the truth itself and not another estimate."""
+    """Whether it is the exact truth and not another estimate."""
     story: str
     """One sentence: where it comes from."""
 
@@ -115,7 +115,7 @@ class Flight:
     """Shape (N, 3), specific force, calibrated."""
     gyro_b_radps: FloatArray
     mag_b_ut: FloatArray
-    """Shape (N, 3), calibrated, NaN unless sampled anew."""
+    """Shape (N, 3), calibrated, NaN unless newly sampled."""
     flags: IntArray
     """`ImuFlags`."""
     baro_time_us: IntArray
@@ -123,13 +123,13 @@ class Flight:
     """Height in the standard atmosphere."""
     fixes: tuple[GpsFix, ...]
     scored: BoolArray
-    """Shape (N,), which samples count where an error is told."""
+    """Shape (N,), which samples count for errors."""
     mag_uncalibrated_b_ut: FloatArray | None = None
     node_time_us: IntArray | None = None
     """When the node sampled, on its own clock."""
     reference: Reference | None = None
     recorded: FlightTrack | None = None
-    """What was fused in flight."""
+    """The states fused in flight."""
 
     @property
     def time_s(self) -> FloatArray:
@@ -152,11 +152,11 @@ class Flight:
         return self.fusion.estimation.reference.gps_latency_s
 
     def seconds(self, time_us: IntArray) -> FloatArray:
-        """Turn gateway times into seconds since the first sample."""
+        """Convert gateway times to seconds since the first sample."""
         return np.asarray((time_us - self.time_us[0]) / US_PER_S, np.float64)
 
     def with_fixes(self, fixes: Iterable[GpsFix]) -> "Flight":
-        """Give the same flight with other fixes."""
+        """Return the same flight with other fixes."""
         return replace(self, fixes=tuple(fixes))
 
 
@@ -178,7 +178,7 @@ class Fixes:
 
 
 def fixes_of(flight: Flight) -> Fixes:
-    """Lay out the fixes that an estimator would use."""
+    """Return the fixes that an estimator would use."""
     reference = flight.fusion.estimation.reference
     used = [fix for fix in flight.fixes if is_usable(fix, reference)]
     arrival = np.array([fix.time_us for fix in used], np.int64)
@@ -201,22 +201,22 @@ class LocalFrame:
     alt_m: float
 
     def north_m(self, lat_deg: FloatArray) -> FloatArray:
-        """Turn latitudes into metres north."""
+        """Convert latitudes to metres north."""
         meridian, _ = radii_m(self.lat_deg, self.alt_m)
         return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
 
     def east_m(self, lon_deg: FloatArray) -> FloatArray:
-        """Turn longitudes into metres east, the shortest way round."""
+        """Convert longitudes to metres east, the shortest way round."""
         _, parallel = radii_m(self.lat_deg, self.alt_m)
         return np.asarray(np.radians((lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0) * parallel)
 
     def place(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
-        """Turn places into metres, shape (N, 2): north and east."""
+        """Convert positions to metres, shape (N, 2): north and east."""
         return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
 
 
 def local_frame(flight: Flight) -> LocalFrame | None:
-    """Lay the origin at the first usable fix; None without one."""
+    """Return a frame with its origin at the first usable fix; None without one."""
     fixes = fixes_of(flight)
     if not len(fixes):
         return None
@@ -288,7 +288,7 @@ def flight_of_samples(
     story: str,
     fusion: FusionSettings,
 ) -> Flight:
-    """Lay calibrated samples out as a flight.
+    """Convert calibrated samples to a flight.
 
     Raises
     ------
@@ -323,7 +323,7 @@ def settled(time_us: IntArray, fixes: Iterable[GpsFix], reference: ReferenceSett
 
 
 def track_of_states(states: list[NavState]) -> FlightTrack:
-    """Lay navigation states out as arrays, only what they vouch for."""
+    """Convert navigation states to arrays, only their valid values."""
     flags = np.array([int(s.flags) for s in states], np.int64)
     track = FlightTrack(
         time_us=np.array([s.time_us for s in states], np.int64),

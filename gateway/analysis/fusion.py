@@ -1,4 +1,4 @@
-"""A flight fused again, with any settings: the same code as live, over arrays where it can."""
+"""A flight fused again, with any settings: the same code as live, on arrays where possible."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ from gateway.sensing.imu_log import ImuLog
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
-    """A flight's samples behind the gateway's filters."""
+    """A flight's samples after the gateway's filters."""
 
     log: ImuLog
     table: FloatArray
@@ -65,7 +65,7 @@ def sense(flight: Flight, settings: SensingSettings) -> Sensed:
 
 
 def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> FlightTrack:
-    """Fuse a flight with the estimator that the settings name.
+    """Fuse a flight with the estimator selected in the settings.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None)
     settings : FusionSettings
         Filters and estimator.
     sensed : Sensed, optional
-        What `sense` gave for the same filters, to save doing it again.
+        Result of `sense` for the same filters, to avoid computing it again.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None)
 
 
 def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> FloatArray:
-    """Fuse a flight into all that the estimator tells.
+    """Fuse a flight, and return all outputs of the estimator.
 
     Returns
     -------

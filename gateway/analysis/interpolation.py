@@ -1,4 +1,4 @@
-"""GPS between its fixes, and fixes left out: what the position filter is judged by."""
+"""Interpolated GPS and withheld fixes, with which the position filter is compared."""
 
 from typing import Final
 
@@ -22,7 +22,7 @@ MAX_GAP_S: Final = 2.0
 
 
 def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -> FlightTrack:
-    """Draw straight lines between the fixes, as of the times at which they were valid.
+    """Interpolate linearly between the fixes, at the times at which they were valid.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
     Returns
     -------
     FlightTrack
-        Places and velocities; NaN before the first fix, after the last and in long gaps. The
-        attitude is not known.
+        Positions and velocities; NaN before the first fix, after the last and in long gaps. The
+        attitude is NaN.
     """
     size = len(time_us)
     if len(fixes) < 2:
@@ -63,7 +63,7 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
 
 
 def thin(flight: Flight, interval_s: float) -> BoolArray:
-    """Choose fixes at least so far apart; those that are not usable are all kept.
+    """Choose fixes at least an interval apart; unusable ones are all kept.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def withhold(flight: Flight, every: int) -> BoolArray:
 
 
 def split(flight: Flight, keep: BoolArray) -> tuple[Flight, Flight]:
-    """Part a flight by its fixes: those that are fused, and those that judge."""
+    """Split a flight by its fixes: those to fuse, and those to compare with."""
     fused: list[GpsFix] = []
     held: list[GpsFix] = []
     for fix, kept in zip(flight.fixes, keep.tolist(), strict=True):
@@ -111,7 +111,7 @@ def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     Returns
     -------
     ndarray, shape (M, 2)
-        Metres north and east; NaN where the track knows no place.
+        Metres north and east; NaN where the track has no position.
     """
     if not len(fixes):
         return np.empty((0, 2))

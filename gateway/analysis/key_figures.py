@@ -1,4 +1,4 @@
-"""One flight in a few numbers, so that two can stand side by side."""
+"""Key figures of one flight, to compare two."""
 
 from typing import Final
 
@@ -14,11 +14,11 @@ from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
 
 HOLD_OUT: Final = 5
-"""Every so many-th fix is withheld to judge by."""
+"""Every n-th fix is withheld for comparison."""
 
 
 def summarise(case: Case) -> dict[str, float]:
-    """Sum a flight up.
+    """Summarise a flight.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def summarise(case: Case) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        By what it is, unit included; NaN where it cannot be told.
+        By name with unit; NaN if unknown.
     """
     flight, track = case.flight, case.track
     fixes = fixes_of(flight)
@@ -84,7 +84,7 @@ def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, o
 
 
 def _distance_m(case: Case) -> float:
-    """Way over ground, by the fused speed."""
+    """Distance over ground, from the fused speed."""
     speed = np.hypot(case.track.vel_n_mps[:, 0], case.track.vel_n_mps[:, 1])
     dt_s = np.diff(case.flight.time_s, append=case.flight.time_s[-1])
     return float(np.nansum(speed * dt_s))

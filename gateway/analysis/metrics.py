@@ -104,7 +104,7 @@ def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
 
 
 def errors_over_time(track: FlightTrack, reference: FlightTrack) -> dict[str, FloatArray]:
-    """Compute every error at every sample, in the units that their names tell."""
+    """Compute every error at every sample, in the units of their names."""
     turned = rotation_error(track.q_nb, reference.q_nb)
     angles = np.degrees(wrap_pi(euler_rad(track.q_nb) - euler_rad(reference.q_nb)))
     place = position_error_m(track, reference)

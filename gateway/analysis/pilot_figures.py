@@ -1,4 +1,4 @@
-"""What a pilot wants to know of a flight: when, how far, how high, how fast, and what was lost."""
+"""A flight in figures for pilots: when, how far, how high, how fast, and what was lost."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,29 +12,29 @@ AIRBORNE_MPS: Final = 3.0
 """Faster than a person carries the aircraft about."""
 AIRBORNE_M: Final = 3.0
 HELD_S: Final = 2.0
-"""So long must it fly, or stand, before it counts."""
+"""Least time in the air, or on the ground, to count."""
 OUTAGE_S: Final = 1.0
 """A longer silence of the GPS is an outage."""
 LINK_LOSS_S: Final = 0.5
 """A longer silence of the IMU is a loss of the link."""
 LONGEST_STEP_M: Final = 200.0
-"""Between two samples; more is a jump of the position, not a way that was flown."""
+"""Between two samples; more is a jump of the position, not a flown distance."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlightEvent:
-    """Something that happened at one moment."""
+    """An event at one moment."""
 
     time_s: float
     """Since the first sample."""
     kind: str
-    """A word for its mark on the timeline: flight, gps or link."""
+    """Kind of its mark on the timeline: flight, gps or link."""
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class PilotFigures:
-    """One flight as a pilot tells it; NaN where it cannot be told."""
+    """One flight in figures; NaN if unknown."""
 
     began_unix_s: float
     airborne_s: float
@@ -56,7 +56,7 @@ class PilotFigures:
 
 
 def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> PilotFigures:
-    """Sum up one flight.
+    """Summarise one flight.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> Pilo
 
 
 def _began_unix_s(flight: Flight) -> float:
-    """Return the civil time of the first sample, as the first fix that knows it tells."""
+    """Return the civil time of the first sample, from the first fix that has it."""
     for fix in flight.fixes:
         if fix.utc_us is not None:
             return float(fix.utc_us - fix.time_us + flight.time_us[0]) / US_PER_S
@@ -113,7 +113,7 @@ def _greatest(values: FloatArray) -> float:
 
 
 def _smoothed(values: FloatArray, count: int) -> FloatArray:
-    """Average over so many samples, unknown ones left out."""
+    """Average over a number of samples, ignoring unknown ones."""
     known = np.isfinite(values)
     window = np.ones(max(count, 1))
     total = np.convolve(np.where(known, values, 0.0), window, "same")
@@ -122,7 +122,7 @@ def _smoothed(values: FloatArray, count: int) -> FloatArray:
 
 
 def _held(seconds: FloatArray, state: np.ndarray) -> np.ndarray:
-    """Drop what lasts less than `HELD_S`, first the pauses and then the hops."""
+    """Drop intervals shorter than `HELD_S`, first the pauses and then the hops."""
     found = np.asarray(state, bool).copy()
     for wanted in (False, True):
         edges = np.flatnonzero(np.diff(found)) + 1
@@ -142,7 +142,7 @@ def _distance_m(place: FloatArray, airborne: np.ndarray) -> float:
 def _gaps(
     times_s: FloatArray, duration_s: float, longest_s: float
 ) -> tuple[tuple[float, float], ...]:
-    """Find the silences between the first of some times and the end of the flight."""
+    """Find the gaps between the first of some times and the end of the flight."""
     if not len(times_s):
         return ()
     ends = np.append(times_s[1:], duration_s)

@@ -1,4 +1,4 @@
-"""Processes that begin as copies of this one, with all that it has computed and compiled."""
+"""Forked processes, which share all that this one has computed and compiled."""
 
 import multiprocessing
 import os
@@ -21,12 +21,12 @@ def cores() -> int:
 
 @contextmanager
 def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[Pool]:
-    """Open a pool of copies.
+    """Open a pool of forked processes.
 
     Parameters
     ----------
     count : int
-        How many.
+        Number of processes.
     begin : callable
         Called first in each of them.
     *arguments : object
@@ -48,9 +48,9 @@ def run_copies(
     arguments: Iterable[Any],
     while_waiting: Callable[[], None] = lambda: None,
 ) -> None:
-    """Do a work in one process an argument, and wait; one that is killed is not waited for.
+    """Call a function in one process per argument, and wait; a killed one is not waited for.
 
-    Unlike those of a pool, they end by themselves where this process is killed. `while_waiting` is
+    Unlike those of a pool, they end by themselves if this process is killed. `while_waiting` is
     called some times a second.
     """
     processes = [multiprocessing.Process(target=work, args=(a,), daemon=True) for a in arguments]
@@ -64,7 +64,7 @@ def run_copies(
 
 
 def begin_copy(work: Callable[[Any], None], argument: Any) -> None:
-    """Do a work in a process that nobody waits for; it ends with this one at the latest."""
+    """Call a function in a background process, which ends with this one at the latest."""
     process = multiprocessing.Process(target=work, args=(argument,), daemon=True)
     with no_warning_of_threads():
         process.start()
@@ -72,7 +72,7 @@ def begin_copy(work: Callable[[Any], None], argument: Any) -> None:
 
 @contextmanager
 def no_warning_of_threads() -> Iterator[None]:
-    """Let processes fork: the threads that Python warns of, the linear algebra's, are idle."""
+    """Silence Python's warning about forking with threads: those of linear algebra are idle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         yield

@@ -56,9 +56,9 @@ def simulated_flight(
     settings : SimulatorSettings, optional
         The simulator's; its GPS latency becomes that of the fusion.
     fusion : FusionSettings, optional
-        Everything else that the fusion needs.
+        All other settings of the fusion.
     duration_s : float
-        How much of it.
+        Length to fly.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def simulated_flight(
 
 
 def _received(settings: SimulatorSettings, duration_s: float) -> Iterator[RawRecord]:
-    """Let the nodes' payloads go by radio and serial line, with losses and jitter, as live."""
+    """Send the nodes' payloads by radio and serial line, with losses and jitter, as live."""
     link = Link()
     for frame in simulate(settings).frames(duration_s):
         yield from link.feed(frame.data, round(frame.time_s * US_PER_S))
@@ -120,7 +120,7 @@ def flight_of_blocks(
     name: str,
     story: str,
 ) -> Flight:
-    """Take a flight out of a recording.
+    """Build a flight from a recording.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
     blocks : iterable of TableBlock
         On the clock of the flight, in the order of time.
     name : str
-        What the reference is called.
+        Name of the reference.
 
     Returns
     -------
@@ -265,14 +265,14 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
 
 
 def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
-    """Take the rows of a track that are nearest to given times.
+    """Return the rows of a track that are nearest to given times.
 
     Parameters
     ----------
     track : FlightTrack
         In the order of time.
     time_us : ndarray, shape (N,)
-        Where it has no row within `NEAR_US`, nothing is known.
+        Without a row within `NEAR_US`, the result is NaN.
 
     Returns
     -------

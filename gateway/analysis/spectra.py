@@ -72,7 +72,7 @@ def allan_deviation(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArr
 
 
 def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: float) -> slice:
-    """Find the longest stretch in which the sensors feel nothing but their noise.
+    """Find the longest stretch in which the sensors measure only noise.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: fl
         return slice(0, 0)
     begins, ends = edges[::2], edges[1::2]
     best = int(np.argmax(ends - begins))
-    # The last window may already hold the gentle beginning of a motion.
+    # The last window may already hold the slow start of a motion.
     return slice(int(begins[best]), int(ends[best]))
 
 

@@ -62,9 +62,7 @@ class PanelSettings(Settings, frozen=True):
     certificate_key: Annotated[str, setting("PEM file of its private key.")] = ""
     insecure: Annotated[
         bool,
-        setting(
-            "Allow other addresses than loopback without TLS; then all traffic is readable."
-        ),
+        setting("Allow other addresses than loopback without TLS; then all traffic is readable."),
     ] = False
     units: Annotated[
         Literal["metric", "imperial", "aviation"],

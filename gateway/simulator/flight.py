@@ -1,8 +1,8 @@
 """Simulated aircraft: exact truth and the sensors' samples beside it, for scoring.
 
 `fly` gives a whole flight as arrays; `SimulatedFlight.records` gives the same samples as the raw
-records that come out of the wire, without clocks and losses between. The samplers of a
-`SimulatedAircraft`, asked second by second, feed the simulated nodes with the very same numbers.
+records that the wire stage returns, without clock errors and losses. The samplers of a
+`SimulatedAircraft`, called second by second, feed the simulated nodes with the very same numbers.
 """
 
 import heapq
@@ -49,7 +49,7 @@ NEIGHBOUR_DEG: Final = 0.0006
 
 
 class SimulatedAircraft:
-    """One aircraft with its sensors, for as long as it is asked.
+    """One aircraft with its sensors, for an unlimited time.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class SimulatedFlight:
     gps: GpsSamples
 
     def records(self) -> Iterator[SampleRecord]:
-        """Give the samples as raw records in the order of time.
+        """Yield the samples as raw records in the order of time.
 
         The gateway clock is true time here; node clocks are as the nodes have them. A record's time
         is that of sampling, for a fix that of its arrival.
@@ -174,7 +174,7 @@ def fly(
     index : int
         Which of the aircraft; 0 is the first.
     duration_s : float
-        How long; the flight repeats after `FLIGHT_S`.
+        Duration; the flight repeats after `FLIGHT_S`.
 
     Returns
     -------

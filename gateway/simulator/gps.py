@@ -1,4 +1,4 @@
-"""The u-blox M8N: five fixes a second, late, wandering, and sometimes none."""
+"""The u-blox M8N: five fixes a second, with latency, drift and dropouts."""
 
 import math
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ V_ACC_M: Final = 1.8
 SPEED_ACC_MPS: Final = 0.12
 PDOP: Final = 1.4
 BLIND: Final = 99.99
-"""What the receiver reports of a fix that it does not have."""
+"""The DOP that the receiver reports without a fix."""
 SETTLING_S: Final = 3.0
 """Accuracies come back to their usual values this fast after an outage."""
 SETTLING_FACTOR: Final = 4.0
@@ -43,11 +43,11 @@ LEAP_US: Final = 18_000_000
 WEEK_MS: Final = 604_800_000
 EARLIEST_UNIX_US: Final = 946_684_800_000_000
 LATEST_UNIX_US: Final = EARLIEST_UNIX_US + 255 * 365 * 86_400_000_000
-"""What the node's byte for the year, from 2000 on, can tell."""
+"""The last year that the node's byte, from 2000 on, can hold."""
 
 
 def gps_start(unix_us: int) -> int:
-    """Return the UTC that the GPS tells at a start; it knows nothing of a PC clock never set."""
+    """Return the UTC of the GPS at the start, limited to its range."""
     return min(max(unix_us, EARLIEST_UNIX_US), LATEST_UNIX_US)
 
 
@@ -82,7 +82,7 @@ class GpsSamples:
 
 
 class GpsSampler:
-    """Let the receiver run along a trajectory.
+    """Run the receiver along a trajectory.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class GpsSampler:
         self._sky = Wander(sky, 1.0, WANDER_S, interval_s)
 
     def take(self, until_s: float) -> GpsSamples:
-        """Run on to a time.
+        """Run up to a time.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The two radio nodes of an aircraft: samples in, payloads out, each at its moment."""
+"""The two radio nodes of an aircraft: samples in, payloads out, each at its time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -37,8 +37,8 @@ STARTING_US: Final = 600_000
 IMU_AHEAD: Final = 40
 IMU_AHEAD_S: Final = 0.5
 GPS_AHEAD_S: Final = 2.0
-"""How far samples are made ahead: few of them cost no less than many, yet making many at once
-would hold up an event loop."""
+"""How far samples are generated ahead: few at once cost as much as many, but too many at once
+would block an event loop."""
 
 IMU_SENSORS: Final = 0b0111
 GPS_SENSORS: Final = 0b1000
@@ -56,14 +56,14 @@ class Sent:
     """One payload on its way to the node's radio."""
 
     time_s: float
-    """True time at which the node hands it over."""
+    """True time at which the node passes it to the radio."""
     node_time_us: int
     """The payload's stamp on the node's clock, not wrapped."""
     payload: Payload
 
 
 class Node(ABC):
-    """A source of payloads, run on piece by piece.
+    """A source of payloads, run piece by piece.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Node(ABC):
     rate_hz : int
         What it reports as its sample rate.
     ahead_s : float
-        How far payloads are made ahead.
+        How far payloads are generated ahead.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Node(ABC):
     ) -> None:
         self.node_id = node_id
         self.restart_s = 0.0
-        """True time at which its watchdog bites; 0 for never."""
+        """True time at which its watchdog resets it; 0 for never."""
         self.radio_failed = 0
         self.radio_retries = 0
         self._clock = clock
@@ -99,12 +99,12 @@ class Node(ABC):
         self._statuses = 0
 
     def take(self, until_s: float) -> list[Sent]:
-        """Give every payload handed to the radio before a true time, in order."""
+        """Return every payload passed to the radio before a true time, in order."""
         made = [*self._waiting, *self._report(until_s)]
         if until_s > self._made_s:
             self._made_s = until_s + self._ahead_s
             made += self._make(self._made_s)
-        # Stable: a fix stays behind the quality payload of the same moment.
+        # Stable: a fix stays after the quality payload of the same time.
         made.sort(key=attrgetter("time_s"))
         ready = sum(1 for sent in made if sent.time_s < until_s)
         self._waiting = made[ready:]
@@ -112,10 +112,10 @@ class Node(ABC):
 
     @abstractmethod
     def _make(self, until_s: float) -> Iterator[Sent]:
-        """Make at least every payload that is handed over before a true time."""
+        """Generate at least every payload that is passed to the radio before a true time."""
 
     def _after_restart(self, sent: Sent) -> Sent | None:
-        """Silence a node while it starts anew, and let its clock begin at zero from then on."""
+        """Silence a node while it restarts, with its clock from zero then."""
         if not 0.0 < self.restart_s <= sent.time_s:
             return sent
         node_time_us = sent.node_time_us - self._clock.at(self.restart_s)
@@ -170,7 +170,7 @@ class GpsNode(Node):
 
 
 def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
-    """Put the two nodes into an aircraft."""
+    """Create the two nodes of an aircraft."""
     imu = ImuNode(aircraft, settings.imu_rate_hz)
     imu.restart_s = settings.imu_restart_s
     return (imu, GpsNode(aircraft, settings.geoid_separation_m))
@@ -277,5 +277,5 @@ def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float)
 
 
 def _held(values: FloatArray) -> IntArray:
-    """Scale to hundredths, held at the end of 16 bits."""
+    """Scale to hundredths, saturated to 16 bits."""
     return np.clip(np.rint(values * 100.0), 0, UINT16_MAX).astype(np.int64)

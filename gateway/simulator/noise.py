@@ -1,4 +1,4 @@
-"""Seeded chance for the sensors: noise that does not depend on how it is cut into pieces.
+"""Seeded noise for the sensors, independent of how it is divided into pieces.
 
 Every source of noise owns its generator and carries its state, so drawing a flight at once or
 second by second gives the same numbers, bit for bit.

@@ -1,11 +1,11 @@
 """The radio between nodes and receiver, the receiver, and its serial line.
 
 Theory of operation. Each node sends one payload after the other; a payload that meets noise is
-repeated by the radio chip, which delays it and all behind it, and is lost after the last try. The
-receiver stamps what arrives with its own clock and queues it for the serial line; what finds the
-queue full is dropped and counted. A frame's time is that of its last bit on the line.
+repeated by the radio chip, which delays it and all after it, and is lost after the last try. The
+receiver stamps arriving payloads with its own clock and queues them for the serial line; if the
+queue is full they are dropped and counted. A frame's time is that of its last bit on the line.
 
-Everything runs in pieces of `PIECE_S`, so memory stays the same however long it runs.
+Everything runs in pieces of `PIECE_S`, so memory use is constant.
 """
 
 import itertools
@@ -35,7 +35,7 @@ from gateway.wire.payloads import (
 )
 
 PIECE_S: Final = 0.1
-"""Short enough that making a piece holds up an event loop by no more than 2 ms."""
+"""Short enough that a piece blocks an event loop for no more than 2 ms."""
 
 ATTEMPT_S: Final = 0.00045
 """130 us of settling and 40 bytes with preamble, address and CRC at 1 Mbit/s."""
@@ -50,7 +50,7 @@ RECEIVER_SKEW_SHARE: Final = 0.5
 HANDLING_S: Final = 0.0001
 LINE_BUFFER_BYTES: Final = 512
 REPORT_ROOM_BYTES: Final = 80
-"""Kept free for the status frame, or a full line would never tell that it is full."""
+"""Kept free for the status frame, or a full line could never report that it is full."""
 BITS_PER_BYTE: Final = 10
 STATUS_S: Final = 1.0
 LAST_VEHICLE_ID: Final = 31
@@ -91,7 +91,7 @@ class _RadioPath:
         self._enter_loss = min(enter, 1.0)
 
     def run(self, until_s: float) -> Iterator[_Arrival]:
-        """Send all that the node hands over before a true time."""
+        """Send all payloads of the node before a true time."""
         for sent in self._node.take(until_s):
             yield from self._send(sent)
 
@@ -120,7 +120,7 @@ class _RadioPath:
 
 
 class SimulatedReceiver:
-    """The receiver on the ground, hearing the nodes.
+    """The receiver on the ground.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class SimulatedReceiver:
         self._line_free_s = 0.0
 
     def frames(self, until_s: float = math.inf) -> Iterator[TimedFrame]:
-        """Give the serial frames in the order of time; call it once.
+        """Yield the serial frames in the order of time; call it once.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class SimulatedReceiver:
         yield from self._write(time_s, encode_receiver_status(status), LINE_BUFFER_BYTES)
 
     def _write(self, time_s: float, content: bytes, room: int) -> Iterator[TimedFrame]:
-        # A dropped frame takes its number with it, so that the gateway sees the gap.
+        # A dropped frame uses up its number, so that the gateway sees the gap.
         self._frame_seq = (self._frame_seq + 1) % UINT8
         data = encode_frame(content)
         byte_s = BITS_PER_BYTE / self._settings.baud
@@ -225,8 +225,7 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
     ----------
     settings : SimulatorSettings
     start_unix_us : int
-        UTC at the start, which the GPS will tell; beyond the years that it can tell, 2000 to 2254,
-        it tells the nearest.
+        UTC at the start, which the GPS will report; limited to its range, 2000 to 2254.
 
     Returns
     -------

@@ -59,7 +59,7 @@ H_ACC_M: Final = 2.0
 V_ACC_M: Final = 3.0
 SPEED_ACC_MPS: Final = 0.3
 PDOP: Final = 1.8
-"""What is told of fixes where the recording says nothing."""
+"""PDOP of fixes if the recording has none."""
 UNKNOWN: Final = UINT16_MAX / 100.0
 TAIL_S: Final = 0.5
 
@@ -104,16 +104,16 @@ class RecordedFlight:
     def from_columns(
         columns: Mapping[str, FloatArray], gps_latency_s: float = 0.2
     ) -> "RecordedFlight":
-        """Make a flight from the columns of a log.
+        """Build a flight from the columns of a log.
 
         Parameters
         ----------
         columns : mapping of str to ndarray, each (N,)
-            `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s must be there. Known too:
+            `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s are required. Optional:
             `mx` `my` `mz` in uT, `baro_alt_m`, `gps_time_s`, `gps_lat`, `gps_lon`, `gps_alt_m`,
             `gps_vn` `gps_ve` `gps_vd` or `gps_speed_ms` and `gps_course_deg`. NaN is "no new one".
         gps_latency_s : float
-            What the log says of its GPS.
+            GPS latency given in the log.
 
         Returns
         -------
@@ -160,7 +160,7 @@ class RecordedFlight:
 
 
 class RecordedNode(Node):
-    """A node that sends what was recorded."""
+    """A node that sends recorded samples."""
 
     def __init__(
         self,
@@ -190,14 +190,14 @@ def fly_again(
     on_round: Callable[[int], None],
     start_unix_us: int = START_UNIX_US,
 ) -> Iterator[TimedFrame]:
-    """Fly a recording over and over; the nodes' clocks and numbers go on, as if nobody landed.
+    """Fly a recording repeatedly; the nodes' clocks and sequence numbers continue.
 
     Parameters
     ----------
     settings, flight, start_unix_us
         As for `replay`.
     on_round : callable
-        Called with the number of the round that begins, from 2, when its first frame is wanted.
+        Called with the number of the round that begins, from 2, before its first frame.
 
     Yields
     ------
@@ -226,9 +226,9 @@ def replay(
         Vehicle id, radio, line and clocks; its flight and sensors do not matter here.
     flight : RecordedFlight
     start_unix_us : int
-        UTC of the first row, which recordings do not tell.
+        UTC of the first row, which recordings do not contain.
     endless : bool
-        Begin anew whenever the recording has ended.
+        Restart whenever the recording has ended.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def replay(
 
 
 def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
-    """Yield the flight, and then again, each time behind the one before."""
+    """Yield the flight, then repeat it, each time after the one before."""
     yield flight
     for number in count(1) if endless else ():
         begin_s = number * flight.duration_s
@@ -281,7 +281,7 @@ def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
 
 
 def _velocity(columns: Mapping[str, FloatArray], blank: FloatArray) -> FloatArray:
-    """Take the GPS velocity, or make it from speed and course; shape (N, 3)."""
+    """Return the GPS velocity, or compute it from speed and course; shape (N, 3)."""
     vel = np.column_stack([columns.get(name, blank) for name in ("gps_vn", "gps_ve", "gps_vd")])
     speed = columns.get("gps_speed_ms", blank)
     course_rad = np.radians(columns.get("gps_course_deg", blank))

@@ -1,4 +1,4 @@
-"""When the nodes' clocks let them read their sensors, and what they then read.
+"""Sampling times by the nodes' clocks, and the sensor readings.
 
 A sampler runs along a trajectory, a whole flight at once or second by second: both give the same
 numbers, bit for bit.
@@ -75,7 +75,7 @@ class DeviceClock:
 
 
 class Ticks:
-    """Sampling instants that one node's timer makes."""
+    """Sampling instants of one node's timer."""
 
     def __init__(self, clock: DeviceClock, rate_hz: float, phase_us: int = 0) -> None:
         self._clock = clock
@@ -117,18 +117,18 @@ class ImuSamples:
 
     @property
     def accel_b_mps2(self) -> FloatArray:
-        """Specific force in body FRD as the counts tell it, not calibrated."""
+        """Specific force in body FRD from the counts, not calibrated."""
         scale = ACCEL_RANGES_G[ACCEL_RANGE] * STANDARD_GRAVITY_MPS2 / (INT16_MAX + 1)
         return np.asarray(self.accel_raw * FACE_UP * scale)
 
     @property
     def gyro_b_radps(self) -> FloatArray:
-        """Angular rate in body FRD as the counts tell it, not calibrated."""
+        """Angular rate in body FRD from the counts, not calibrated."""
         return np.asarray(np.radians(self.gyro_raw * FACE_UP / GYRO_LSB_PER_DPS[GYRO_RANGE]))
 
     @property
     def mag_b_ut(self) -> FloatArray:
-        """Magnetic field in body FRD, not calibrated; NaN unless sampled anew and in range."""
+        """Magnetic field in body FRD, not calibrated; NaN unless newly sampled and in range."""
         field = self.mag_raw * FACE_UP * (UT_PER_GAUSS / MAG_LSB_PER_GAUSS[MAG_GAIN])
         usable = self.mag_new & ~np.any(self.mag_raw == MAG_OVERFLOW, axis=1)
         return np.where(usable[:, np.newaxis], field, np.nan)
@@ -149,7 +149,7 @@ class ImuSampler:
         self._mag_raw = np.zeros((1, 3), dtype=np.int64)
 
     def take(self, until_s: float) -> ImuSamples:
-        """Run on to a true time and give every sample taken before it."""
+        """Run up to a true time and return every sample taken before it."""
         node_us, time_s = self._ticks.take(until_s)
         truth = self._trajectory.truth_at(time_s)
         counts = self.inertial.sample(truth)
@@ -191,7 +191,7 @@ class BaroSamples:
 
 
 class BaroSampler:
-    """Read the BMP180 along a trajectory; it hangs on the IMU node."""
+    """Read the BMP180 along a trajectory; it is on the IMU node."""
 
     def __init__(
         self, settings: SimulatorSettings, trajectory: Trajectory, vehicle_id: int
@@ -202,7 +202,7 @@ class BaroSampler:
         self._ticks = Ticks(clock, settings.baro_rate_hz, BARO_PHASE_US)
 
     def take(self, until_s: float) -> BaroSamples:
-        """Run on to a true time and give every sample taken before it."""
+        """Run up to a true time and return every sample taken before it."""
         node_us, time_s = self._ticks.take(until_s)
         truth = self._trajectory.truth_at(time_s)
         pressure_pa, temperature_degc = self.barometer.sample(truth)

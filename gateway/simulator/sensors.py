@@ -2,7 +2,7 @@
 
 Sensor axes are those of the chips on a level board: x forward, y left, z up; a body vector (FRD)
 has the components `FACE_UP * v_b` in them, and the other way round. An inertial or magnetic sensor
-reads `matrix @ v_s + bias` plus noise; `SensorErrors` tells the calibration that undoes it.
+reads `matrix @ v_s + bias` plus noise; `SensorErrors` is the calibration that undoes it.
 
 References
 ----------
@@ -94,7 +94,7 @@ class SensorErrors:
 
 @dataclass(frozen=True, slots=True)
 class InertialCounts:
-    """What the MPU6050's registers hold at N samples."""
+    """The MPU6050's registers at N samples."""
 
     accel: IntArray
     """Shape (N, 3), sensor axes."""
@@ -219,18 +219,18 @@ def warm_degc(time_s: FloatArray) -> FloatArray:
 
 
 def temperature_counts(temperature_degc: FloatArray) -> IntArray:
-    """Convert deg C to the MPU6050's temperature word."""
+    """Convert deg C to the MPU6050's temperature register."""
     return np.rint((temperature_degc - 36.53) * 340.0).astype(np.int64)
 
 
 def to_int16(values: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Round to 16-bit words of shape (N, 3), and tell which rows touched an end."""
+    """Round to 16-bit values of shape (N, 3), and return which rows saturated."""
     counts = np.clip(np.rint(values), INT16_MIN, INT16_MAX).astype(np.int64)
     return counts, np.any((counts == INT16_MIN) | (counts == INT16_MAX), axis=1)
 
 
 def mag_counts(field_ut: FloatArray, gain: int) -> IntArray:
-    """Convert uT to the HMC5883L's words; its overflow mark where an axis is out of range."""
+    """Convert uT to the HMC5883L's counts; its overflow value where an axis is out of range."""
     counts = np.rint(field_ut * (MAG_LSB_PER_GAUSS[gain] / UT_PER_GAUSS)).astype(np.int64)
     return np.where(np.abs(counts) > MAG_LIMIT, MAG_OVERFLOW, counts)
 

@@ -1,4 +1,4 @@
-"""What can be set about the simulated tracker."""
+"""Settings of the simulated tracker."""
 
 from typing import Annotated
 
@@ -58,7 +58,7 @@ class SimulatorSettings(Settings, frozen=True):
         setting("Mean time from a fix's validity to its arrival at the node.", "s", ge=0.02, le=1),
     ] = 0.16
     gps_latency_jitter_s: Annotated[
-        float, setting("Greatest departure from the mean latency.", "s", ge=0, le=0.08)
+        float, setting("Greatest deviation from the mean latency.", "s", ge=0, le=0.08)
     ] = 0.03
     gps_first_fix_s: Annotated[
         float, setting("Time from the start to the first fix.", "s", ge=0, le=600)

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else, and its figures and tables as files."""
+"""The report as one self-contained HTML page, and its figures and tables as files."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,7 +28,7 @@ PAGE_NAME: Final = "index.html"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One figure and the sentence that says what one sees."""
+    """One figure and its caption."""
 
     name: str
     """File name without its ending."""
@@ -46,7 +46,7 @@ class ReportTable:
     caption: str
     digits: int = 2
     strong: tuple[int, ...] = ()
-    """Rows that are to be seen first."""
+    """Rows to emphasise."""
 
     def rows(self) -> list[list[str]]:
         """Write the cells as text."""
@@ -64,19 +64,19 @@ class Section:
 
     title: str
     lead: str
-    """A few sentences; what stands between backticks is code."""
+    """A few sentences; parts in backticks are code."""
     pictures: list[Picture] = field(default_factory=list)
     tables: list[ReportTable] = field(default_factory=list)
 
     @property
     def anchor(self) -> str:
-        """Its place in the page's address."""
+        """Its anchor in the page's address."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """One number of the head of the page."""
+    """One number in the page's header."""
 
     value: str
     meaning: str
@@ -94,7 +94,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A picture as it stands in the page."""
+    """A picture as embedded in the page."""
 
     name: str
     wide: Markup
@@ -114,11 +114,11 @@ def write_report(
     ----------
     report : Report
     folder : Path
-        Made if it is not there.
+        Created if it does not exist.
     on_picture : callable
-        Called after each figure, for a progress bar; it must not be a thread's.
+        Called after each figure, for a progress bar without a thread.
     jobs : int, optional
-        Processes that draw; one a core by default.
+        Processes that draw; one per core by default.
 
     Returns
     -------
@@ -153,7 +153,7 @@ def render_page(report: Report, drawn: dict[str, Drawn]) -> str:
 
 
 def prose(text: str) -> Markup:
-    """Escape a text and set what stands between backticks as code."""
+    """Escape a text and set parts in backticks as code."""
     escaped = str(jinja2.filters.do_forceescape(text))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped))
 

@@ -1,4 +1,4 @@
-"""How the report's figures look, and how one drawing serves a light page, a dark page and a file.
+"""Style of the report's figures, which serve a light page, a dark page and a file.
 
 A figure is drawn once, in the light theme and with no ground. Inside the page its few colours are
 replaced by CSS variables, so the page's own theme colours it.
@@ -90,7 +90,7 @@ def styled() -> Iterator[None]:
 def panels(
     width_in: float, rows: int, row_height_in: float, *, columns: int = 1, share_x: bool = True
 ) -> tuple[Figure, list[Axes]]:
-    """Make a figure of panels one below the other, or side by side where there is room.
+    """Create a figure of panels one below the other, or side by side if there is room.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def legend_above(axes: Axes, columns: int = 4) -> None:
 
 
 def legend_outside(figure: Figure, axes: Axes, columns: int) -> None:
-    """Put the legend above everything that stands about a panel."""
+    """Put the legend above everything around a panel."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper left", ncols=columns, handlelength=1.4,

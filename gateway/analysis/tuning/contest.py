@@ -1,7 +1,7 @@
-"""Settings tried out on a flight: every point of a grid, or where an optimiser leads.
+"""Settings tried out on a flight: every point of a grid, or by an optimiser.
 
-Each trial fuses the flight causally, from the samples alone. Some GPS fixes are withheld from the
-fusion and judge it: a filter that only copies the GPS it was given, noise and all, gains nothing.
+Each trial fuses the flight causally, from the samples only. Some GPS fixes are withheld from the
+fusion to score it: a filter that only copies its GPS, noise included, gains nothing.
 """
 
 import itertools
@@ -61,7 +61,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Contest:
-    """What all trials have in common; one copy goes to each process."""
+    """The data shared by all trials; each process gets a copy."""
 
     flight: Flight
     fusion: FusionSettings
@@ -105,7 +105,7 @@ def parse_axis(name: str, text: str) -> Axis:
         values: Values
         if len(parts) == 3:
             steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
-            # The digits that a person would write, not those of the division.
+            # Rounded to the digits that a person would write.
             values = tuple(float(f"{step:.12g}") for step in steps)
         elif len(parts) == 2:
             values = (float(parts[0]), float(parts[1]))
@@ -121,7 +121,7 @@ def parse_axis(name: str, text: str) -> Axis:
 
 
 def with_value(settings: Any, key: str, value: Value) -> Any:
-    """Give settings with one value changed.
+    """Return settings with one value changed.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def with_value(settings: Any, key: str, value: Value) -> Any:
 
 
 def settings_at(contest: Contest, values: Sequence[Value]) -> FusionSettings:
-    """Put the values of one trial into the settings."""
+    """Return the settings with the values of one trial."""
     return with_values(contest.fusion, contest.keys, values)
 
 
 def with_values(
     fusion: FusionSettings, keys: Sequence[str], values: Sequence[Value]
 ) -> FusionSettings:
-    """Put values into settings by their keys; raises SweepError as `with_value`."""
+    """Return settings with values changed by key; raises SweepError as `with_value`."""
     for key, value in zip(keys, values, strict=True):
         fusion = with_value(fusion, key, value)
     return fusion
@@ -171,13 +171,13 @@ def make_contest(
     ----------
     flight : Flight
     fusion : FusionSettings
-        All that is not varied. Where the settings of one estimator are, it is chosen.
+        All settings that are not varied. If those of one estimator are varied, it is selected.
     keys : sequence of str
         Settings to vary.
     hold_out : int
-        Every so many-th fix is withheld from the fusion; 0 for none.
+        Every n-th fix is withheld from the fusion; 0 for none.
     interval_s : float
-        Where it is not 0, fuse only a fix in so many seconds, and withhold all others.
+        If not 0, fuse only one fix in this many seconds, and withhold all others.
 
     Returns
     -------
@@ -191,7 +191,7 @@ def make_contest(
     fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:
-        # Not both: a comb through another comb leaves gaps, or nothing.
+        # Not both: applied after one another they leave gaps, or nothing.
         keep = thin(flight, interval_s)
     elif hold_out:
         keep = withhold(flight, hold_out)
@@ -207,21 +207,21 @@ def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSett
 
 
 def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
-    """Score a flight with settings that nothing was changed in, by the same fixes."""
+    """Score a flight with unchanged settings, by the same fixes."""
     judge = rejudged(contest.judge, fusion)
     track = fuse(judge.fused, fusion)
     return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
 
 
 class Trials:
-    """Runs trials of one contest, remembering what neighbouring trials share."""
+    """Run trials of one contest, caching what neighbouring trials share."""
 
     def __init__(self, contest: Contest) -> None:
         self._contest = contest
         self._sensed: tuple[SensingSettings, Sensed] | None = None
 
     def warm_up(self) -> None:
-        """Do what every process would otherwise do again: compile, and filter the samples."""
+        """Compile and filter the samples in advance, once for all processes."""
         fusion, flight = self._contest.fusion, self._contest.judge.fused
         self._sensed = (fusion.sensing, sense(flight, fusion.sensing))
         fuse(flight, fusion, self._sensed[1])
@@ -237,7 +237,7 @@ class Trials:
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
-    """Judge by the trial's own latency, for another one would give it the answer."""
+    """Return the judge with the trial's own latency, because another would reveal the answer."""
     if settings.estimation.reference == judge.fused.fusion.estimation.reference:
         return judge
     fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))
@@ -259,7 +259,7 @@ def grid(axes: Sequence[Axis]) -> list[Values]:
 
 
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
-    """Lay trials out as a table, the best first.
+    """Return trials as a table, the best first.
 
     Raises
     ------
@@ -271,16 +271,16 @@ def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd
     column = COLUMN_OF[metric]
     if not table[column].notna().any():
         raise SweepError(
-            f"nothing to judge by: the flight has no {_LACKING[metric]}; choose another --metric"
+            f"the flight has no {_LACKING[metric]} to score by; choose another --metric"
         )
     table = table.dropna(axis="columns", how="all")
     return table.sort_values(column, kind="stable", ignore_index=True)
 
 
 def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
-    """Give the values of the trial with the least error, the first of equal ones.
+    """Return the values of the trial with the least error, the first of equal ones.
 
-    Not from the table: there numbers are its own kind of numbers.
+    Not from the table, whose numbers are NumPy types.
     """
     judged = COLUMN_OF[metric]
     scored = [trial for trial in trials if not math.isnan(trial[1][judged])]
@@ -288,7 +288,7 @@ def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
 
 
 def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
-    """Name the settings that change nothing, such as those that the estimator does not use.
+    """Return the settings that change nothing, such as those that the estimator does not use.
 
     Each is tried at its first, middle and last value, all others at their first, with every
     estimator that is varied.
@@ -318,7 +318,7 @@ def _is_alike(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
 _LACKING: Final[dict[Metric, str]] = {
     "held": "withheld fixes",
     "interpolated": "GPS",
-    "reference": "reference of the place",
+    "reference": "reference of the position",
     "attitude": "reference of the attitude",
 }
 

@@ -1,4 +1,4 @@
-"""Trials of a sweep on all cores: one process each, which have the flight from the start."""
+"""Trials of a sweep on all cores, in processes that share the flight."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,9 +20,9 @@ def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
     Parameters
     ----------
     contest : Contest
-        What all trials share.
+        The data shared by all trials.
     jobs : int, optional
-        How many processes; one a core by default.
+        Number of processes; one per core by default.
 
     Yields
     ------

@@ -138,7 +138,7 @@ def test_the_best_stands_first_and_what_is_not_known_is_left_out() -> None:
     table = tabulate(["k"], scores, "held")
     assert table["k"].tolist() == [1, 2, 0]
     assert "reference_m" not in table
-    with pytest.raises(SweepError, match="no reference of the place"):
+    with pytest.raises(SweepError, match="no reference of the position"):
         tabulate(["k"], scores, "reference")
 
 

@@ -88,7 +88,7 @@ def test_a_setting_that_changes_nothing_is_told(recording: Path, tmp_path: Path)
         (["--alpha", "1:2:3"], "alpha_accel = 1.5"),
         (["--vary", "alpha_accel"], "write NAME=VALUES"),
         (["--vary", "gama=1"], "no setting ends in 'gama'"),
-        (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the place"),
+        (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the position"),
     ],
 )
 def test_what_cannot_be_done_is_told(recording: Path, arguments: list[str], told: str) -> None:

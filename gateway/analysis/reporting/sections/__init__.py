@@ -1,1 +1,1 @@
-"""The sections of the report, one file a topic: numbers, pictures and what one sees."""
+"""The sections of the report, one file per topic: numbers, pictures and captions."""

@@ -1,4 +1,4 @@
-"""Acceleration: raw, Butterworth and Chebyshev, and what tells the two filters apart."""
+"""Acceleration: raw, Butterworth and Chebyshev, and how the two filters differ."""
 
 from typing import Final
 
@@ -17,14 +17,14 @@ AXIS_NAMES: Final = "xyz"
 
 
 def acceleration(case: Case) -> Section:
-    """Build the section; where the flight's rate is too low for the filters, their design alone."""
+    """Build the section; if the flight's rate is too low for the filters, only their design."""
     sensing, rate_hz = case.fusion.sensing, case.flight.rate_hz
     cutoff = sensing.accel_cutoff_hz
     if cutoff >= 0.5 * rate_hz:
         return Section(
             "Acceleration filters",
             f"At this flight's {rate_hz:.0f} samples/s a low-pass at {cutoff:g} Hz does nothing: "
-            "half the sample rate is the highest frequency that there is. So there is nothing to "
+            "half the sample rate is the highest possible frequency. So there is nothing to "
             "draw of this flight; the table shows the filters at the paper's rate.",
             [],
             [_paper_table(case)],
@@ -34,8 +34,8 @@ def acceleration(case: Case) -> Section:
         f"Second-order low-passes at {cutoff:g} Hz, as in figures 9 and 10 of the paper. "
         "Chebyshev passes all up to the cutoff and falls faster from there, but rings after a "
         "step and delays unevenly. "
-        "The paper holds that it also takes longer; with the same order both are the same five "
-        f"multiplications a sample, and the table tells what they take here.",
+        "The paper says that it also takes longer; with the same order both are the same five "
+        f"multiplications per sample, and the table gives their time here.",
         [
             _excerpt(case, 0, "fig09_acceleration_x"),
             _excerpt(case, 1, "fig10_acceleration_y"),
@@ -72,8 +72,8 @@ def _excerpt(case: Case, axis: int, name: str) -> Picture:
         name,
         lambda width: _draw_excerpt(case, axis, width),
         f"Specific force along body {AXIS_NAMES[axis]}, the {EXCERPT_S:.0f} s in which it changes "
-        "most: raw, and behind either filter. The lines nearly cover one another, so the lower "
-        "panel shows what Chebyshev gives less what Butterworth gives.",
+        "most: raw, and after either filter. The lines nearly cover one another, so the lower "
+        "panel shows Chebyshev minus Butterworth.",
     )
 
 

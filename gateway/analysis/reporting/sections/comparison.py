@@ -64,7 +64,7 @@ def _difference(a: Case, b: Case) -> Picture:
     return Picture(
         "comparison_difference",
         lambda width: _draw_difference(a, b, width),
-        "How far the two fused tracks are apart at each moment.",
+        "Distance between the two fused tracks over time.",
     )
 
 

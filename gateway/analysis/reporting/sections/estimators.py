@@ -16,13 +16,13 @@ from gateway.analysis.reporting.page import Picture, ReportTable, Section
 
 COLOURS: Final = {"paper": style.ORANGE, "complementary": style.BLUE, "eskf": style.PINK}
 STORY: Final = (
-    "Every estimator fused the same samples, and is judged against {}. `paper` is the paper's "
+    "Every estimator fused the same samples, and is compared with {}. `paper` is the paper's "
     "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
     "flight and slowly pulls the horizon over. `complementary` and `eskf` let the GPS velocity "
-    "tell the manoeuvre from gravity."
+    "distinguish the manoeuvre from gravity."
 )
 SMOOTHED_STORY: Final = (
-    " `smoothed` knows the whole flight at each instant: `eskf` from both ends, which only a "
+    " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
     "recording can be."
 )
 OTHER: Final = style.GREEN
@@ -30,7 +30,7 @@ TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
 def estimators(case: Case) -> Section | None:
-    """Build the section; None where there is nothing to judge by."""
+    """Build the section; None without a reference."""
     reference = _reference(case)
     if reference is None:
         return None
@@ -55,8 +55,8 @@ def estimators(case: Case) -> Section | None:
                     if turns
                     else ""
                 )
-                + "Where GPS is lost the place drifts until it is back; its scale is logarithmic. "
-                "The first seconds, in which every estimator settles, do not count.",
+                + "Without GPS the position drifts until it is back; its scale is logarithmic. "
+                "The first seconds, in which every estimator converges, do not count.",
             )
         ],
         [
@@ -86,7 +86,7 @@ def error_table(
     Returns
     -------
     DataFrame
-        One row a track; a column that no track knows is left out.
+        One row per track; a column without values is left out.
     """
     rows = []
     for name, track in tracks.items():
@@ -116,7 +116,7 @@ def _reference(case: Case) -> Reference | None:
     if case.frame is None:
         return None
     track = interpolate(fixes_of(case.flight), case.flight.time_us)
-    return Reference(track, is_exact=False, story="its own interpolated GPS, so not judged freely")
+    return Reference(track, is_exact=False, story="its own interpolated GPS, so not independent")
 
 
 def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:

@@ -1,4 +1,4 @@
-"""Place: the track on a map, GPS before and after interpolation, latitude and longitude."""
+"""Position: the track on a map, GPS before and after interpolation, latitude and longitude."""
 
 from typing import Final
 
@@ -43,7 +43,7 @@ def gps_interpolation(case: Case) -> Section | None:
     count = len(fixes_of(case.flight))
     return Section(
         "GPS before and after interpolation",
-        f"GPS tells the place {count} times in this flight, the IMU {len(case.flight.time_us)} "
+        f"GPS measures {count} times in this flight, the IMU {len(case.flight.time_us)} "
         "times (figures 11 to 13 of the paper). Straight lines between the fixes fill the gaps, "
         "but only afterwards: the next fix must be known. The fused track fills them at once. "
         "Gaps of more than 2 s are left open.",
@@ -65,7 +65,7 @@ def gps_interpolation(case: Case) -> Section | None:
                 lambda width: _draw_residuals(case, width),
                 "The whole flight: how far north and east the held fixes and the fused track are "
                 "from the interpolated GPS. The axis ends at what 99.5 % of the held values "
-                "reach; the first seconds, in which the estimator settles, do not count.",
+                "reach; the first seconds, in which the estimator converges, do not count.",
             ),
         ],
     )

@@ -32,7 +32,7 @@ def orientation(case: Case) -> Section | None:
     below = "its error" if flight.reference else f"how far it is from the estimator {case.chosen}"
     return Section(
         "Yaw and quaternion",
-        "Yaw by integrating the gyroscope alone drifts away without end; the magnetometer holds "
+        "Yaw by integrating the gyroscope alone drifts without limit; the magnetometer corrects "
         "it (figure 7 of the paper). In long turns the paper's filter slowly takes the bank "
         "for level flight, which tilts its compass; the drift of the gyroscope may be less "
         "than that for some minutes, but it never comes back. The quaternion has no gimbal lock "
@@ -56,14 +56,14 @@ def orientation(case: Case) -> Section | None:
 
 @dataclass(frozen=True, slots=True)
 class YawLines:
-    """Yaw by several ways, continuous, in degrees."""
+    """Yaw by several methods, continuous, in degrees."""
 
     yaw_deg: dict[str, FloatArray]
-    """Shape (N,) each, by what it is called in the legend."""
+    """Shape (N,) each, by name in the legend."""
     reference_deg: FloatArray
-    """What they are judged by."""
+    """The reference."""
     story: str
-    """What that is."""
+    """Description of the reference."""
 
     def error_deg(self, name: str) -> FloatArray:
         """Error of a line; that of the gyroscope may exceed a turn."""
@@ -92,7 +92,7 @@ def yaw_lines(case: Case) -> YawLines:
     yaw = {GYRO: continuous_yaw_deg(gyro_q)}
     yaw |= {name: continuous_yaw_deg(track.q_nb) for name, track in fused.items()}
     for name, line in yaw.items():
-        # All begin in the same turn.
+        # All start in the same turn.
         both = np.flatnonzero(np.isfinite(line) & np.isfinite(reference_deg))
         turns = np.round((line[both[:1]] - reference_deg[both[:1]]) / 360.0)
         yaw[name] = line - 360.0 * (turns[0] if len(turns) else 0.0)
@@ -125,7 +125,7 @@ def _yaw_table(lines: YawLines) -> pd.DataFrame:
 
 
 def integrate_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
-    """Turn an attitude on by the angular rate alone.
+    """Integrate an attitude from the angular rate only.
 
     Parameters
     ----------

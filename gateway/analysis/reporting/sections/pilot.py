@@ -1,4 +1,4 @@
-"""The page for people who fly: the flight in figures, on a map, and over time."""
+"""The section for pilots: the flight in figures, on a map, and over time."""
 
 from datetime import UTC, datetime
 from typing import Final
@@ -26,12 +26,12 @@ FEET_PER_M: Final = 3.28084
 
 
 def figures_of(case: Case) -> PilotFigures | None:
-    """Sum the flight up; None without GPS."""
+    """Summarise the flight; None without GPS."""
     return None if case.frame is None else pilot_figures(case.flight, case.track, case.frame)
 
 
 def pilot_facts(figures: PilotFigures) -> list[Fact]:
-    """Choose the numbers for the head of the page."""
+    """Choose the numbers for the page's header."""
     minutes, seconds = divmod(round(figures.airborne_s), 60)
     facts = [
         Fact(f"{minutes}:{seconds:02d}", "minutes in the air"),

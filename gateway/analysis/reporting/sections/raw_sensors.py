@@ -49,13 +49,13 @@ def noise(case: Case) -> Section:
         tail = " The flight has no rest long enough for an Allan deviation."
     return Section(
         "Noise",
-        "What the inertial sensors feel, by frequency, and how far averaging at rest helps." + tail,
+        "Spectrum of the inertial sensors, and how far averaging at rest helps." + tail,
         pictures,
     )
 
 
 def timing(case: Case) -> Section | None:
-    """Build the section of jitter and loss; None where the recording has no node times."""
+    """Build the section of jitter and loss; None if the recording has no node times."""
     node = case.flight.node_time_us
     if node is None or len(node) < 3:
         return None
@@ -107,7 +107,7 @@ def missing_samples(node_time_us: IntArray) -> FloatArray:
     """Count the samples missing before each but the first, by the node's own clock."""
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     missing = np.maximum(np.rint(interval_us / np.median(interval_us)) - 1.0, 0.0)
-    # So long a gap is a node that was switched off.
+    # In a gap this long the node was switched off.
     return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
 
 
@@ -150,14 +150,14 @@ def magnetometer(case: Case) -> Section | None:
 
 
 def heights(case: Case) -> Section | None:
-    """Build the section of height sources; None where there is only one."""
+    """Build the section of height sources; None if there is only one."""
     flight = case.flight
     if case.frame is None or not len(flight.baro_time_us):
         return None
     offset_m = baro_offset_m(flight)
     return Section(
         "Height sources",
-        "Height above mean sea level by GPS, by the barometer and fused. The barometer tells the "
+        "Height above mean sea level by GPS, by the barometer and fused. The barometer gives the "
         f"standard atmosphere's height; it is shifted by {offset_m:+.1f} m here, so that it agrees "
         "with GPS in the mean.",
         [
@@ -226,7 +226,7 @@ def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
         style.draw(above, flight.time_s, truth, style.REFERENCE, case.truth_name, lw=3, alpha=0.3)
     for name, (time_us, alt_m, colour) in _height_lines(case, offset_m).items():
         seconds = flight.seconds(time_us)
-        # Nothing was measured in a dropout: the line ends at its begin.
+        # Nothing was measured in a dropout: the line ends at its start.
         alt_m = np.where(np.diff(seconds, append=seconds[-1:]) > MAX_GAP_S, np.nan, alt_m)
         style.draw(above, seconds, alt_m, colour, name, lw=1.0)
         style.draw(below, seconds, alt_m - _height_reference(case, time_us), colour, name, lw=1.0)

@@ -18,7 +18,7 @@ COLOUR_MAP: Final = "cividis_r"
 
 
 def weights(case: Case) -> Section | None:
-    """Build the section; None without GPS that could judge the weights."""
+    """Build the section; None without GPS."""
     if case.frame is None:
         return None
     thinned = blend_table(case.flight, case.fusion, case.sensed, INTERVAL_S)
@@ -42,7 +42,7 @@ def weights(case: Case) -> Section | None:
                 _beside_paper(thinned),
                 "GPS thinned to one fix a second. Latitude and longitude: mean error against "
                 "interpolated GPS, as in the paper. Held out: horizontal RMS error at the fixes "
-                "that the filter never saw. Against reference: horizontal RMS error over the "
+                "withheld from the filter. Against reference: horizontal RMS error over the "
                 "whole flight, stretches without GPS included. All in metres.",
                 strong=(_best(thinned),),
             ),
@@ -64,7 +64,7 @@ def _lead(table: pd.DataFrame) -> str:
     )
     return (
         "Alpha is the weight of the integrated acceleration in the velocity, beta that of the "
-        f"integrated velocity in the place. {shape} with alpha and with beta in every row and "
+        f"integrated velocity in the position. {shape} with alpha and with beta in every row and "
         f"column; the smallest error is at {best.alpha:g}/{best.beta:g}. The figures differ from "
         "the paper's in size for three reasons: it is another flight; here the filter blends once "
         "at each fix and with the corrected equations, since the printed ones cannot be computed; "
