@@ -58,7 +58,7 @@ class GatewaySettings(Settings, frozen=True):
 
     @property
     def default_aircraft(self) -> AircraftSettings:
-        """The settings of an aircraft that has no file of its own."""
+        """The settings of an aircraft without its own file."""
         return AircraftSettings(
             vehicle=self.vehicle, sensing=self.sensing, estimation=self.estimation
         )
@@ -198,7 +198,7 @@ def _document(file: Path) -> Any:
     try:
         return tomlkit.parse(file.read_text(encoding="utf-8") if file.exists() else "")
     except ValueError as error:
-        raise OSError(errno.EINVAL, "is no TOML: mend or remove it", str(file)) from error
+        raise OSError(errno.EINVAL, "is not TOML: repair or remove it", str(file)) from error
 
 
 def _write_document(file: Path, document: Any, rights: int) -> None:

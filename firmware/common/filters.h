@@ -46,7 +46,7 @@ constexpr LowPassDesign low_pass_design(double cutoff_hz, double rate_hz) {
     return LowPassDesign{(c1 - c2) / 4, c1, c2};
 }
 
-// Starts the filter as if `x` had stood at its input for ever.
+// Starts the filter as if its input had always been `x`.
 void low_pass_start(LowPass *filter, int16_t x);
 
 // Takes one sample; the output is read with low_pass_output.
@@ -77,5 +77,5 @@ struct Mean {
 
 void mean_add(Mean *mean, int16_t x);
 
-// Rounded to counts; 0 without samples. Starts anew.
+// Rounded to counts; 0 without samples. Restarts the mean.
 int16_t mean_take(Mean *mean);

@@ -6,7 +6,7 @@
 //     angular rate   mean since the last payload (so that no rotation is lost between payloads),
 //                    then the high-pass; raw: the mean alone
 //
-// A reading on the last count of its range is told by a flag in the next payload.
+// A reading on the last count of its range sets a flag in the next payload.
 #pragma once
 
 #include <stdint.h>

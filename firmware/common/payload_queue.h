@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Payloads that wait for the radio. Where it does not keep up the oldest goes: a fresh sample is
+// Payloads that wait for the radio. If it does not keep up the oldest is dropped: a fresh sample is
 // worth more than a stale one.
 #pragma once
 

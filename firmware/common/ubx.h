@@ -25,7 +25,7 @@ constexpr uint16_t UBX_CFG_NAV5 = ubx_id(0x06, 0x24);
 constexpr uint8_t UBX_NAV_PVT_SIZE = 92;
 
 // Reader. A message longer than the buffer is dropped at its length field; whatever is broken,
-// the next sync bytes start anew.
+// the next sync bytes start again.
 struct UbxReader {
     uint8_t state;
     uint8_t check_a;

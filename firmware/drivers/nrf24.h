@@ -45,8 +45,8 @@ struct Nrf24Packet {
 // Takes the next received packet; false if there is none.
 bool nrf24_receive(Nrf24Packet *packet);
 
-// Leaves and enters reception, so that the carrier detector measures afresh.
+// Leaves and enters reception, so that the carrier detector measures again.
 void nrf24_restart_listening();
 
-// Whether a carrier above -64 dBm stood on the channel; valid 0.2 ms after the restart.
+// Whether a carrier above -64 dBm was on the channel; valid 0.2 ms after the restart.
 bool nrf24_carrier();

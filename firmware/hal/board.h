@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What every board has: the reason of its start, a watchdog and a supply voltage.
+// Functions of every board: reset cause, watchdog and supply voltage.
 #pragma once
 
 #include <stdint.h>

@@ -6,7 +6,7 @@
 
 void clock_start();
 
-// Microseconds since the start; wraps every 71.6 minutes. Compare with clock_passed alone.
+// Microseconds since the start; wraps every 71.6 minutes. Compare only with clock_passed.
 uint32_t clock_us();
 
 // The same from inside an interrupt.

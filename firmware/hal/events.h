@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the interrupts tell the main loop, and the sleep between.
+// Events from the interrupts to the main loop, and the sleep between them.
 #pragma once
 
 #include <stdint.h>
@@ -12,6 +12,6 @@ enum Event : uint8_t {
     EVENT_UART = 1 << 4,   // a byte came in
 };
 
-// Sleeps until at least one event since the last call. What happened is asked of the drivers, by
-// state and not by event: so an event that a set-up swallowed is never missed.
+// Sleeps until at least one event since the last call. The caller then checks the drivers' states,
+// not the event, so an event that was consumed during a set-up is never missed.
 void events_wait();

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // I2C master at 400 kHz, driven by interrupts, one transfer at a time: an optional write, then an
-// optional read behind a repeated start. EVENT_TWI tells its end.
+// optional read behind a repeated start. EVENT_TWI signals its end.
 #pragma once
 
 #include <stdint.h>

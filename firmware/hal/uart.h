@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The UART, 8N1, with a ring in each direction. EVENT_UART tells a byte that came in.
+// The UART, 8N1, with a ring in each direction. EVENT_UART signals a received byte.
 #pragma once
 
 #include <stdint.h>

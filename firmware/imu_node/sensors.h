@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The three sensors of the GY-87 on one bus: who may use it when, and who is there at all.
+// The three sensors of the GY-87 on one bus: which may use it when, and which are present.
 //
 // One transfer runs at a time. The MPU6050's goes first, since its registers hold a reading for
 // one period only; magnetometer and barometer fill the gaps. A sensor that fails three times in a
@@ -55,7 +55,7 @@ struct SensorReadings {
 // Finds and sets up the sensors; with the self-test if the board started cold.
 void sensors_start(Sensors *sensors, bool self_test);
 
-// To be called at every event; returns SensorNews and fills what they tell.
+// To be called at every event; returns SensorNews and fills in the new readings.
 uint8_t sensors_poll(Sensors *sensors, uint32_t now_us, SensorReadings *readings);
 
 // WireSensor bits.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sends payloads in order, each until it is acknowledged or hopeless.
+// Sends payloads in order, each until it is acknowledged or given up.
 //
 // | state   | event                    | action                                | next    |
 // | ------- | ------------------------ | ------------------------------------- | ------- |
@@ -13,7 +13,7 @@
 // | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
 //
 // Two nodes whose packets collided would collide again if both paused for the same time; so every
-// round of retries waits for a while drawn anew, longer ones the more rounds have failed.
+// round of retries waits for a new random time, which grows with the failed rounds.
 #pragma once
 
 #include <stdint.h>

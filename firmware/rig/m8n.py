@@ -1,4 +1,4 @@
-"""u-blox NEO-M8N on a serial line: NMEA at 9600 baud until it is told otherwise.
+"""u-blox NEO-M8N on a serial line: NMEA at 9600 baud until it is configured.
 
 u-blox 8 / M8 receiver description including protocol specification, revision 2018.
 """

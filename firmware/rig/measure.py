@@ -1,6 +1,6 @@
 """Print the measured table of firmware/README.md: `python -m firmware.rig.measure`.
 
-Every figure comes from the programs as they run on the bench; the last line tells how fast the
+Every figure comes from the programs as they run on the bench; the last line says how fast the
 bench itself ran.
 """
 

@@ -26,7 +26,7 @@
 enum { SUPPLY_MV = 3300, MCUSR = 0x54, UART_OUT_SIZE = 4096 };
 enum { TWCR_TWIE = 0, TWCR_TWEN = 2, TWCR_TWSTO = 4, TWCR_TWSTA = 5, TWCR_TWEA = 6, TWCR_TWINT = 7 };
 
-/* What the bus tells the model; it answers with an acknowledgement or a byte. */
+/* A message of the bus to the model, which answers with an acknowledgement or a byte. */
 enum { BUS_START = 0, BUS_ADDRESS = 1, BUS_WRITE = 2, BUS_READ = 3, BUS_STOP = 4 };
 
 typedef uint8_t (*spi_callback)(uint8_t byte);

@@ -55,28 +55,28 @@ class RecordingSettings(Settings, frozen=True):
         ),
     ] = "in_flight"
     folder: Annotated[
-        str, setting("Folder of the recordings; made if it is not there.", path=True)
+        str, setting("Folder of the recordings; created if it does not exist.", path=True)
     ] = "~/mavgate/recordings"
     tlog: Annotated[bool, setting("Record all MAVLink that is sent and received.")] = True
-    table: Annotated[bool, setting("Record raw samples and fused states, one CSV an aircraft.")] = (
-        True
-    )
+    table: Annotated[
+        bool, setting("Record raw samples and fused states, one CSV per aircraft.")
+    ] = True
     rotate_mb: Annotated[
-        float, setting("A file that grows larger is closed and the next begun.", "MB", ge=1, le=1e6)
+        float, setting("A larger file is closed and the next one started.", "MB", ge=1, le=1e6)
     ] = 512.0
     rotate_min: Annotated[
-        float, setting("A file that grows older is closed and the next begun.", "min", ge=1, le=1e4)
+        float, setting("An older file is closed and the next one started.", "min", ge=1, le=1e4)
     ] = 120.0
     free_floor_mb: Annotated[
         float, setting("Recording stops when the disk has less space left.", "MB", ge=0, le=1e6)
     ] = 200.0
     flush_s: Annotated[
-        float, setting("What is lost at most when the gateway is killed.", "s", ge=0.05, le=1)
+        float, setting("Most that is lost when the gateway is killed.", "s", ge=0.05, le=1)
     ] = 0.5
     sync_s: Annotated[
         float,
         setting(
-            "How often the disk itself must hold all; longer spares a card, but a loss of power "
+            "How often data is synced to the disk; longer spares a card, but a loss of power "
             "costs more.",
             "s",
             ge=0.05,

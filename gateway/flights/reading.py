@@ -59,7 +59,7 @@ class ReadOptions:
     current: PipelineSettings
     """The settings of today."""
     choice: SettingsChoice = "recorded"
-    """Whose settings a table is fused with; those of today where it has none of its own."""
+    """Settings to fuse a table with; the current ones if it has none."""
     position: Position = "causal"
     columns: ColumnMap | None = None
     """For a CSV that is not ours; by default those of a tracker log."""

@@ -265,7 +265,7 @@ class Fanout:
             for lane in lanes:
                 outlet = self._outlets[lane.client_id]
                 if outlet.width is not None:
-                    # In place: a lane that began anew would send at once.
+                    # In place: a new lane would send at once.
                     lane.interval_us = outlet.interval_us(key, plan)
                     is_stale |= (lane.interval_us > 0) != is_limited
         return is_stale

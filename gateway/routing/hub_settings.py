@@ -28,7 +28,7 @@ class HubSettings(Settings, frozen=True):
         float,
         setting(
             "A client of a listening UDP port is dropped after this silence. Ground stations "
-            "send a heartbeat every second. One that came by WebSocket is dropped after so long "
+            "send a heartbeat every second. A WebSocket client is dropped after so long "
             "without an answer to the pings that it has answered before.",
             "s",
             ge=2,
@@ -38,8 +38,8 @@ class HubSettings(Settings, frozen=True):
     queue_bytes: Annotated[
         int,
         setting(
-            "What may wait for a slow or stalled client by TCP or WebSocket; beyond it the oldest "
-            "telemetry goes. Small: fresh data after a stall. Large: fewer gaps.",
+            "Queue of a slow or stalled client by TCP or WebSocket; when it is full the oldest "
+            "telemetry is dropped. Small: fresh data after a stall. Large: fewer gaps.",
             "byte",
             ge=1024,
             le=16_777_216,
@@ -56,8 +56,8 @@ class HubSettings(Settings, frozen=True):
     tls_certificate: Annotated[
         str,
         setting(
-            "PEM file with the certificate of this machine, and of those who vouch for it, that "
-            "wss-listen: shows. One that is replaced holds for the next who connect.",
+            "PEM file with the certificate of this machine, and its chain, that "
+            "wss-listen: presents. A replaced one is used for new connections.",
             path=True,
         ),
     ] = ""
@@ -70,8 +70,8 @@ class HubSettings(Settings, frozen=True):
     tls_authority: Annotated[
         str,
         setting(
-            "PEM file with the certificates that wss: accepts servers by, as of an authority of "
-            "one's own; empty for those that the machine knows.",
+            "PEM file with the certificates of the authorities that wss: accepts, such as your "
+            "own; empty for those of the system.",
             path=True,
         ),
     ] = ""

@@ -81,13 +81,25 @@ class NodeCalibration(Settings, frozen=True):
     ] = IDENTITY3
     gyro_residual_radps: Annotated[
         float,
-        setting("What the last calibration left: deviation at rest.", "rad/s", ge=0.0, le=10.0),
+        setting("Residual of the last calibration: deviation at rest.", "rad/s", ge=0.0, le=10.0),
     ] = 0.0
     accel_residual_mps2: Annotated[
-        float, setting("What it left of the poses' differences.", "m/s2", ge=0.0, le=100.0)
+        float,
+        setting(
+            "Residual of the last calibration: difference between the poses.",
+            "m/s2",
+            ge=0.0,
+            le=100.0,
+        ),
     ] = 0.0
     mag_residual_ut: Annotated[
-        float, setting("What it left of the field's differences.", "uT", ge=0.0, le=1000.0)
+        float,
+        setting(
+            "Residual of the last calibration: difference of the field's strength.",
+            "uT",
+            ge=0.0,
+            le=1000.0,
+        ),
     ] = 0.0
 
     def __post_init__(self) -> None:

@@ -58,8 +58,8 @@ class SensingSettings(Settings, frozen=True):
     gyro_highpass_hz: Annotated[
         float,
         setting(
-            "Cutoff of the angular rate's first-order high-pass; 0 for none. It takes the steady "
-            "rate of a long turn away like a bias. Only the paper's estimator uses it.",
+            "Cutoff of the angular rate's first-order high-pass; 0 for none. It removes the steady "
+            "rate of a long turn like a bias. Only the paper's estimator uses it.",
             "Hz",
             ge=0.0,
             le=10.0,

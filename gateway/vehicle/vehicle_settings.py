@@ -39,7 +39,7 @@ class RateSettings(Settings, frozen=True):
     mission_current_hz: Annotated[float, _rate("MISSION_CURRENT")] = 1.0
     radio_status_hz: Annotated[float, _rate("RADIO_STATUS")] = 1.0
     high_latency2_hz: Annotated[
-        float, _rate("HIGH_LATENCY2, to links of less than 100 bytes a second alone,")
+        float, _rate("HIGH_LATENCY2, only to links of less than 100 bytes/s,")
     ] = 0.2
     battery_status_hz: Annotated[float, _rate("BATTERY_STATUS of each node")] = 1.0
 
@@ -48,22 +48,22 @@ class VehicleSettings(Settings, frozen=True):
     """The vehicle that ground stations see; one per aircraft."""
 
     type: Annotated[
-        VehicleType, setting("What ground stations draw and how they lay out their screens.")
+        VehicleType, setting("Vehicle type, by which ground stations choose icon and display.")
     ] = "fixed_wing"
     rates: RateSettings = RateSettings()
     armed_when: Annotated[
         ArmedWhen,
         setting(
-            "When the vehicle reports itself armed. Ground stations start flight time, distance, "
-            "track and their own logs by it."
+            "When the vehicle reports itself armed. Ground stations base flight time, distance, "
+            "track and their own logs on it."
         ),
     ] = "flying_or_recording"
     signing_passphrase: Annotated[
         str,
         setting(
             "MAVLink 2 signing: the same passphrase as in the ground station. Everything sent is "
-            "signed then, and nobody changes anything without a signature. Empty for none. "
-            "`mavgate reload` takes over another."
+            "then signed, and changes are accepted only with a signature. Empty for none. "
+            "`mavgate reload` applies a changed one."
         ),
     ] = ""
     node_silent_s: Annotated[

@@ -297,7 +297,7 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
     alt_amsl_m = fix.alt_amsl_mm * M_PER_MM
     quality = node.quality
     separation_m = NAN if quality is None else quality.geoid_separation_cm * M_PER_CM
-    # Another epoch's accuracy would vouch for a fix it does not know; the geoid stays.
+    # The accuracy of another epoch does not belong to this fix; the geoid stays.
     if quality is None or quality.itow_ms != fix.itow_ms:
         quality = payloads.GpsQualityPayload(fix.itow_ms, *(UINT16_MAX,) * 5, 0, None)
     utc_us = None if quality.utc is None else round(quality.utc.timestamp() * US_PER_S)

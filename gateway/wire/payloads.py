@@ -29,14 +29,14 @@ MAG_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
 
 
 class FrameKind(IntEnum):
-    """What the receiver sends: low nibble of a frame's first byte."""
+    """Kinds of the receiver's frames: low nibble of a frame's first byte."""
 
     RADIO = 1
     RECEIVER_STATUS = 2
 
 
 class PayloadKind(IntEnum):
-    """What a node sends: low nibble of a payload's first byte."""
+    """Kinds of a node's payloads: low nibble of a payload's first byte."""
 
     IMU = 1
     BARO = 2
@@ -97,7 +97,7 @@ class BaroPayload:
 
 @dataclass(frozen=True, slots=True)
 class GpsFixPayload:
-    """Place and velocity of one UBX-NAV-PVT."""
+    """Position and velocity of one UBX-NAV-PVT."""
 
     itow_ms: int
     lat_dege7: int
@@ -121,7 +121,7 @@ class GpsQualityPayload:
     pdop_centi: int
     geoid_separation_cm: int
     utc: datetime | None
-    """To a hundredth of a second; None unless the receiver vouches for date and time."""
+    """To a hundredth of a second; None unless the receiver reports date and time as valid."""
 
 
 @dataclass(frozen=True, slots=True)

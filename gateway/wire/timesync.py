@@ -11,7 +11,7 @@ sum of distances to the points.
 | ------------------------------------------------------ | -------------------------------------- |
 | stamp agrees with the arrival, any number of wraps on  | unwraps it, adds the point             |
 | stamp is late, or early, by less than RESTART_JUMP_US  | the same: a queue, not a restart       |
-| stamp disagrees by more                                | the remote restarted: learns anew      |
+| stamp disagrees by more                                | the remote restarted: starts again     |
 | packet seems to come before it was sent                | waits for a second one that agrees     |
 
 References

@@ -68,7 +68,7 @@ class Step(StrEnum):
 
 
 Capture = Callable[[float], NodeSamples]
-"""Waits for so many seconds of samples."""
+"""Waits for a number of seconds of samples."""
 Solve = Callable[[Step, NodeCalibration], NodeCalibration]
 Save = Callable[[NodeCalibration], None]
 

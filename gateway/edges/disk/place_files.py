@@ -64,7 +64,7 @@ class PlaceFiles:
                 self.broken[vehicle_id] = _broken(file)
                 log.warning(
                     "%s cannot be read and is left alone: %s. Missions, mark and home of aircraft "
-                    "%d begin empty and are not kept until it is mended or removed.",
+                    "%d begin empty and are not kept until it is repaired or removed.",
                     file,
                     error,
                     vehicle_id,

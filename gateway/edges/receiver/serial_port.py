@@ -50,7 +50,7 @@ class SerialSettings(Settings, frozen=True):
         setting(
             'Where the receiver is: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
             'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), or "auto" for the only known USB '
-            "adapter. `mavgate ports` lists what there is.",
+            "adapter. `mavgate ports` lists them.",
             pattern=r"^(auto|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
         ),
     ] = "auto"

@@ -112,22 +112,22 @@ def encode_head(header: TableHeader) -> str:
 
 
 def encode_header(header: TableHeader) -> str:
-    """Write a header as a line of its own."""
+    """Write a header as a comment line."""
     return f"{HEADER_PREFIX}{msgspec.json.encode(header).decode()}\n"
 
 
 def encode_state(state: FusionState) -> str:
-    """Write a state as a line of its own."""
+    """Write a state as a comment line."""
     return f"{STATE_PREFIX}{msgspec.json.encode(state).decode()}\n"
 
 
 def encode_mark(mark: TableMark) -> str:
-    """Write a mark as a line of its own."""
+    """Write a mark as a comment line."""
     return f"{MARK_PREFIX}{msgspec.json.encode(mark).decode()}\n"
 
 
 def encode_node(status: NodeStatus) -> str:
-    """Write a node's report as a line of its own."""
+    """Write a node's report as a comment line."""
     return f"{NODE_PREFIX}{msgspec.json.encode(status).decode()}\n"
 
 

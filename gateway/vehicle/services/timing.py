@@ -28,7 +28,7 @@ class TimingService:
         Parameters
         ----------
         request : Request
-            A PING with target 0, 0 is a request; one with a target is an answer to somebody. A
+            A PING with target 0, 0 is a request; one with a target is an answer. A
             TIMESYNC with `tc1` 0 is a request.
         now_us : int
             Gateway clock.

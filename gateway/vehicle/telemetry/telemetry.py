@@ -61,7 +61,7 @@ class Telemetry:
         self.state: NavState | None = None
         self._reference_alt_m = NAN
         self._ground_alt_m = NAN
-        """Height of the first good fix, whoever sets home."""
+        """Height of the first good fix, independent of home."""
         self._sample: ImuSample | None = None
         self._baro: BaroSample | None = None
         self.fix: GpsFix | None = None

@@ -11,7 +11,7 @@ An upload, seen from here:
 | upload | the last item, well             | store all, ACK accepted           | idle   |
 | upload | the item asked for, bad         | ACK with what is bad              | idle   |
 | upload | another item                    | REQUEST_INT of the one asked for  | upload |
-| upload | MISSION_COUNT, same client      | begin anew                        | upload |
+| upload | MISSION_COUNT, same client      | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK (cancelled)         |                                   | idle   |
 | upload | 250 ms without the item         | REQUEST_INT again, five times     | upload |
