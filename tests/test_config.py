@@ -231,7 +231,7 @@ def test_a_file_that_is_broken_while_it_runs_is_left_alone(settings: GatewaySett
     file = aircraft_file(settings, 3)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(b"[vehicle\xff")
-    with pytest.raises(OSError, match="mend or remove it"):
+    with pytest.raises(OSError, match="repair or remove it"):
         save_aircraft(settings, 3, settings.default_aircraft)
     assert file.read_bytes() == b"[vehicle\xff"
 
