@@ -59,6 +59,6 @@ def test_a_flight_without_fixes_has_no_frame() -> None:
 
 
 def test_too_few_samples_are_no_flight() -> None:
-    samples = list(short_case().sensed.samples[:1])
+    samples = short_case().sensed.log.samples()[:1]
     with pytest.raises(ValueError, match="1 IMU samples are no flight"):
         flight_of_samples(samples, [], [], name="x", story="", fusion=FusionSettings())
