@@ -153,7 +153,7 @@ def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
         expect(told).to_be_visible(timeout=START_LIMIT_MS)  # It may compile them first.
         return rows.count() > 0
 
-    for _ in range(60):
+    for _ in range(240):
         if is_compared():
             break
         desk.page.wait_for_timeout(500)
