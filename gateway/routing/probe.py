@@ -8,7 +8,7 @@ another gateway are answered by that component too and not forwarded: they measu
 
 from typing import Final
 
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import all as dialect
 
 from gateway.routing.routing_table import Origin
 from gateway.units import US_PER_S

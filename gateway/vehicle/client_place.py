@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 DEGE7: Final = 1e7
 

@@ -1,4 +1,4 @@
-"""Messages of the standard that pymavlink's `common` dialect lacks.
+"""Messages of the standard that pymavlink's dialects lack.
 
 Clients request them all the same, and one of them, PROTOCOL_VERSION, decides whether
 QGroundControl uses MAVLink 2. Each is laid out as the standard's generator does it: larger fields
@@ -8,12 +8,10 @@ first, and a CRC seeded by the definition.
 import struct
 from typing import Any, ClassVar, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
 MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
-MAVLINK_MSG_ID_AVAILABLE_MODES: Final = 435
-MAVLINK_MSG_ID_CURRENT_MODE: Final = 436
 
 _Base: Any = mavlink.MAVLink_message
 
@@ -55,21 +53,3 @@ class ComponentMetadata(_Extra):
     msgname = "COMPONENT_METADATA"
     crc_extra = 182
     unpacker = struct.Struct("<II100s")
-
-
-class AvailableModes(_Extra):
-    """AVAILABLE_MODES: custom_mode, properties, number_modes, mode_index, standard_mode, name."""
-
-    id = MAVLINK_MSG_ID_AVAILABLE_MODES
-    msgname = "AVAILABLE_MODES"
-    crc_extra = 134
-    unpacker = struct.Struct("<IIBBB35s")
-
-
-class CurrentMode(_Extra):
-    """CURRENT_MODE: custom_mode, intended_custom_mode, standard_mode."""
-
-    id = MAVLINK_MSG_ID_CURRENT_MODE
-    msgname = "CURRENT_MODE"
-    crc_extra = 193
-    unpacker = struct.Struct("<IIB")

@@ -2,10 +2,10 @@
 
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.vehicle.dialect import AvailableModes, CurrentMode, ProtocolVersion
+from gateway.vehicle.dialect import ProtocolVersion
 
 CAPABILITIES: Final = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -18,8 +18,6 @@ CAPABILITIES: Final = (
 )
 
 MODE_NAME: Final = b"Tracking"
-NOT_USER_SELECTABLE: Final = 2
-"""MAV_MODE_PROPERTY: there is nothing to switch to."""
 
 UID_PREFIX: Final = int.from_bytes(b"mavgate")
 
@@ -60,9 +58,18 @@ def protocol_version() -> Any:
 
 def available_modes() -> Any:
     """Encode AVAILABLE_MODES: the one mode that a tracker has."""
-    return AvailableModes(0, NOT_USER_SELECTABLE, 1, 1, 0, MODE_NAME)
+    return mavlink.MAVLink_available_modes_message(
+        number_modes=1,
+        mode_index=1,
+        standard_mode=mavlink.MAV_STANDARD_MODE_NON_STANDARD,
+        custom_mode=0,
+        properties=mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE,
+        mode_name=MODE_NAME,
+    )
 
 
 def current_mode() -> Any:
     """Encode CURRENT_MODE."""
-    return CurrentMode(0, 0, 0)
+    return mavlink.MAVLink_current_mode_message(
+        standard_mode=mavlink.MAV_STANDARD_MODE_NON_STANDARD, custom_mode=0, intended_custom_mode=0
+    )

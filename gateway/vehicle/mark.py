@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 import pymap3d.vincenty as vincenty
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NAN, NavState
 from gateway.vehicle.client_place import is_on_earth

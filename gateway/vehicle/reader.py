@@ -3,7 +3,7 @@
 from collections import Counter
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import Incoming
 from gateway.vehicle.actions import Request

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any, Final, Protocol
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.actions import Answer, Reply, Request

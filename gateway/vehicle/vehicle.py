@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, Protocol
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import (
     BaroSample,
@@ -20,9 +20,7 @@ from gateway.units import US_PER_S
 from gateway.vehicle import identity
 from gateway.vehicle.actions import Action, Answer, Reply, Request, SettingsChange
 from gateway.vehicle.dialect import (
-    MAVLINK_MSG_ID_AVAILABLE_MODES,
     MAVLINK_MSG_ID_COMPONENT_METADATA,
-    MAVLINK_MSG_ID_CURRENT_MODE,
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
 )
 from gateway.vehicle.encoder import Encoder
@@ -152,8 +150,8 @@ class Vehicle:
                 self.system_id, self.health.boards.firmware
             ),
             MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: identity.protocol_version(),
-            MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(),
-            MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(),
+            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(),
+            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(),
             MAVLINK_MSG_ID_COMPONENT_METADATA: self._metadata.announcement,
         }
         commands = CommandService(self._intervals, self._build, self._knows, self._explain)

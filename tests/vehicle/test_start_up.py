@@ -131,17 +131,6 @@ def test_modes_are_as_the_development_dialect_has_them() -> None:
             dialect.ComponentMetadata,
             "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64",
         ),
-        (
-            dialect.AvailableModes,
-            (
-                "uint32_t custom_mode/uint32_t properties/uint8_t number_modes/uint8_t mode_index/"
-                "uint8_t standard_mode/char mode_name/\x23"
-            ),
-        ),
-        (
-            dialect.CurrentMode,
-            "uint32_t custom_mode/uint32_t intended_custom_mode/uint8_t standard_mode/",
-        ),
     ],
 )
 def test_crc_seeds_follow_from_the_definitions(kind: Any, fields: str) -> None:

@@ -19,7 +19,7 @@ A link of a few bytes a second gets HIGH_LATENCY2 alone, which carries a whole v
 from collections.abc import Mapping
 from typing import Final
 
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import all as dialect
 
 from gateway.units import US_PER_S
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.client_place import GLOBAL_FRAMES

@@ -8,7 +8,7 @@ change things get it.
 from collections.abc import Iterable
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
 from gateway.vehicle.actions import Answer, Reply, Request

@@ -14,7 +14,7 @@ A start that failed stays pending: the recorder retries by itself, and announces
 
 from typing import Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import Answer, RecordingRequest

@@ -11,7 +11,7 @@ every `REFILL_US`.
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 

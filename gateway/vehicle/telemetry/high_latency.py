@@ -8,7 +8,7 @@ References
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import to_euler
 from gateway.records import NAN, GpsFix, NavState

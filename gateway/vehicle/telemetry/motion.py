@@ -15,7 +15,7 @@ stall turn or a touch-and-go does not flip the state.
 import math
 from typing import Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NavFlags, NavState
 from gateway.units import US_PER_S

@@ -14,7 +14,7 @@ first: a supply that sags when the radio sends, a broken cable to the sensors, a
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import LinkReport, NodeStatus
 from gateway.vehicle.telemetry import fields

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import msgspec
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState, NodeStatus
 from gateway.vehicle.home import Home, is_good_enough, place_of

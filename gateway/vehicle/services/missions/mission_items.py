@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.vehicle.client_place import DEGE7, GLOBAL_FRAMES, height_amsl_m, is_on_earth
 from gateway.vehicle.home import Place

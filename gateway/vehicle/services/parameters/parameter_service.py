@@ -8,7 +8,7 @@ change goes to all, so that every ground station's table stays up to date.
 from collections.abc import Mapping
 from typing import Any, Final, Protocol
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.settings import Settings
 from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange

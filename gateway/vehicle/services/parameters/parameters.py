@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.rotation import Matrix3, euler_deg_from_matrix, matrix_from_euler_deg
 from gateway.records import Vec3
