@@ -1,4 +1,4 @@
-"""What a log of another program tells of its GPS and compass, or else its motion."""
+"""GPS latency and declination of a foreign log: from its comments, else from its motion."""
 
 import re
 from collections.abc import Sequence
@@ -32,31 +32,31 @@ def aircraft_for(
     files: Sequence[Path],
     table: RecordedTable,
     options: ReadOptions,
-    told_s: float | None = None,
+    given_s: float | None = None,
 ) -> AircraftSettings:
-    """Choose the settings for a flight, and complete them by what its log tells.
+    """Choose the settings for a flight, and complete them from its log.
 
     Parameters
     ----------
     files : sequence of Path
         The parts of one flight.
     table : RecordedTable
-        Their rows; not read here. Its remarks tell a latency that was estimated or assumed.
+        Their rows; not read here. A remark is added if the latency is estimated or assumed.
     options : ReadOptions
-        Settings of today that are not the usual ones go before the log's word.
-    told_s : float, optional
-        The GPS latency as the user tells it; it is not looked for then.
+        Current settings that differ from the defaults take precedence over the log.
+    given_s : float, optional
+        The GPS latency as the user gives it; it is not estimated then.
 
     Returns
     -------
     AircraftSettings
         Those of `aircraft_of`. For a log of another program, `gps_latency_s` and
-        `declination_deg` of its # lines count, else the latency that its manoeuvres tell.
+        `declination_deg` of its # lines are used, else the latency estimated from its manoeuvres.
 
     Raises
     ------
     FlightError
-        If a # line tells what cannot be.
+        If a value in a # line is out of range.
     """
     aircraft = aircraft_of(table, options)
     if is_table(files[0]):
@@ -64,7 +64,7 @@ def aircraft_for(
     facts = facts_of(files[0])
     aircraft = with_facts(aircraft, facts)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    known = told_s is not None or "gps_latency_s" in facts
+    known = given_s is not None or "gps_latency_s" in facts
     if known or latency_s != USUAL.gps_latency_s:
         return aircraft
     quiet = replace(options, progress=None)
@@ -76,8 +76,8 @@ def aircraft_for(
     if found is None:
         how = f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
     else:
-        told = f"{found.latency_s:.3f} s +- {found.std_s:.3f} s"
-        how = f"{told} is estimated from its manoeuvres"
+        estimate = f"{found.latency_s:.3f} s +- {found.std_s:.3f} s"
+        how = f"{estimate} is estimated from its manoeuvres"
         aircraft = with_facts(aircraft, {"gps_latency_s": found.latency_s})
     table.remarks.append(f"{files[0]}: gives no GPS latency; {how}; gps_latency_s sets it")
     return aircraft
@@ -99,7 +99,7 @@ def facts_of(file: Path) -> dict[str, float]:
 
 
 def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftSettings:
-    """Put what a log tells in place of the usual settings; raises FlightError if it cannot be."""
+    """Replace default settings by values of a log; raises FlightError if one is out of range."""
     reference = aircraft.estimation.reference
     if "gps_latency_s" in facts and reference.gps_latency_s == USUAL.gps_latency_s:
         reference = msgspec.structs.replace(reference, gps_latency_s=facts["gps_latency_s"])

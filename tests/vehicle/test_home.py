@@ -138,7 +138,7 @@ def test_it_is_forgotten_and_measured_anew(clock: ManualClock) -> None:
     station = GroundStation(Vehicle(VehicleSettings(), 1, stored=stored), clock)
     assert home(station) == [OPERATOR, 10.0, 20.0, 30.0]
     told = texts(station.vehicle.on_gps(FIX, 0))
-    assert told == ["Home is the one kept, 4927564 m from here", "GPS fix"]
+    assert told == ["Stored home is used, 4927564 m from here", "GPS fix"]
     assert texts(station.vehicle.on_gps(FIX, 1)) == [], "once"
     [echo] = [m for m in station.send(set_message("HOME_SOURCE", NONE)) if m.param_id == NAMES[0]]
     assert echo.param_value == NONE

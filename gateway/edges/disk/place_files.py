@@ -140,4 +140,4 @@ class PlaceFiles:
 
 
 def _broken(file: Path) -> str:
-    return f"{file.name} is broken: mend or remove it"
+    return f"{file.name} is broken: repair or remove it"

@@ -291,7 +291,7 @@ def unaided_density(s: EskfState, p: EskfGains) -> float:
 
 @compiled
 def watch_way(s: EskfState, dt: float) -> None:
-    """Notice by the way of the last seconds what no hand carries so far: it flies.
+    """Detect flight: the way of the last seconds is longer than a hand carries anything.
 
     A take-off run is as smooth as rest, and its pull looks like tilt; only its way tells. The
     speed of about zero is refuted by it, so what that has corrected meanwhile is taken back.

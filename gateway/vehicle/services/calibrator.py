@@ -131,7 +131,7 @@ class Calibrator:
             nothing = not any(whole(value) for value in values)
             return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
         if self._in_flight():
-            return DENIED, _text("calibration failed: it flies")
+            return DENIED, _text("calibration failed: in flight")
         kind, six_sides = asked
         if self._run is not None:
             again = (self._run.kind, self._run.six_sides) == asked
@@ -145,7 +145,7 @@ class Calibrator:
         if run is None:
             return []
         if self._in_flight():
-            return self._fail("it flies")
+            return self._fail("in flight")
         if run.kind is CalibrationKind.MAG:
             return self._on_mag(run, sample)
         if sample.mag_b_ut is not None and not run.six_sides:

@@ -25,7 +25,7 @@ RESPOND_TO_ALL: Final = 2
 """Last parameter of MAV_CMD_REQUEST_MESSAGE."""
 
 REFUSALS: Final = {
-    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: "A tracker cannot be armed: it flies nothing",
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: "A tracker cannot be armed: it controls nothing",
     mavlink.MAV_CMD_DO_SET_MODE: "A tracker has no modes to switch",
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
 }

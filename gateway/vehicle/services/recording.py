@@ -84,7 +84,7 @@ class RecordingService:
         """Report a failure when the recorder does not answer in time."""
         if self._due_us is None or now_us < self._due_us:
             return []
-        return self._end(FAILED) + self._explain("Cannot record: no answer of the disk", now_us)
+        return self._end(FAILED) + self._explain("Cannot record: no answer from the disk", now_us)
 
     def next_due_us(self) -> int | None:
         """Return when to give up."""

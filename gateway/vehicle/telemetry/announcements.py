@@ -37,12 +37,12 @@ FLAG_TEXTS: Final = (
     (
         NavFlags.SENSOR_FAULT,
         StatusText(CRITICAL, "Sensor fault"),
-        StatusText(INFO, "Sensors well again"),
+        StatusText(INFO, "Sensors OK again"),
     ),
     (
         NavFlags.DEGRADED,
         StatusText(WARNING, "Estimator degraded"),
-        StatusText(INFO, "Estimator well again"),
+        StatusText(INFO, "Estimator OK again"),
     ),
 )
 """A flag of the estimator, the text when it rises, and the text when it falls."""

@@ -3,7 +3,7 @@
 A node reports once a second what it counted since its start. Most faults of cheap boards show here
 first: a supply that sags when the radio sends, a broken cable to the sensors, a lost antenna.
 
-| topic  | gets worse                                     | is well again                        |
+| topic  | gets worse                                     | is good again                        |
 | ------ | ---------------------------------------------- | ------------------------------------ |
 | supply | below the limit of the settings                | `HYSTERESIS_V` above it              |
 | bus    | an error more than in the report before        | `QUIET_REPORTS` without one          |
@@ -120,13 +120,13 @@ class NodeHealth:
                 f"bus {number}",
                 known.bus.note(errors > 0),
                 f"{name}: bus errors, {status.bus_errors} so far",
-                f"{name}: bus well again",
+                f"{name}: bus OK again",
             ),
             _finding(
                 f"radio {number}",
                 known.radio.note(share >= FAILED_SHARE),
                 f"{name}: {min(share, 1.0):.0%} of radio sends failed",
-                f"{name}: radio well again",
+                f"{name}: radio OK again",
             ),
         ]
 
@@ -198,7 +198,7 @@ class NodeHealth:
             f"supply {status.node.node_id}",
             node.low,
             f"{name}: supply low, {supply_v:.2f} V",
-            f"{name}: supply well again, {supply_v:.2f} V",
+            f"{name}: supply OK again, {supply_v:.2f} V",
         )
 
 

@@ -123,7 +123,7 @@ async def test_one_that_cannot_be_written_holds_up_no_other(
     bench.files.load()
     bench.files.save(1, FIRST)
     await bench.save(2, SECOND)
-    assert bench.files.broken == {1: "1.places.json is broken: mend or remove it"}
+    assert bench.files.broken == {1: "1.places.json is broken: repair or remove it"}
     file.unlink()
     assert bench.read() == {2: SECOND}
     await bench.save(2, FIRST)
@@ -141,7 +141,7 @@ async def test_a_broken_file_is_told_and_left_alone(
     assert f"{file} cannot be read and is left alone: " in caplog.text
     await bench.save(1, FIRST)
     assert file.read_bytes() == content
-    assert bench.told == [(1, "1.places.json is broken: mend or remove it")]
+    assert bench.told == [(1, "1.places.json is broken: repair or remove it")]
     file.unlink()
     await bench.save(1, FIRST)
     assert bench.read() == {1: FIRST, 2: SECOND}

@@ -178,7 +178,7 @@ def fly(station: GroundStation, seconds: float) -> list[Any]:
 def test_none_is_begun_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
     fly(station, 3.0)
     found = station.command(CALIBRATE, *params)
-    assert (acks(found), cal_texts(found)) == ([DENIED], ["calibration failed: it flies"])
+    assert (acks(found), cal_texts(found)) == ([DENIED], ["calibration failed: in flight"])
     assert acks(station.command(CALIBRATE)) == [ACCEPTED], "what runs may be cancelled"
 
 
@@ -187,7 +187,7 @@ def test_none_goes_on_in_flight(station: GroundStation, params: tuple[int, ...])
     station.command(CALIBRATE, *params)
     found = fly(station, 3.0)
     assert acks(found)[-1] == FAILED
-    assert cal_texts(found)[-1] == "calibration failed: it flies"
+    assert cal_texts(found)[-1] == "calibration failed: in flight"
     assert station.of(CalibrationMeasured) == []
 
 

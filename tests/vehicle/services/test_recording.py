@@ -51,7 +51,7 @@ def test_a_disk_that_never_answers(station: GroundStation) -> None:
     assert results(station.wait(PATIENCE_US / 1e6 - 0.001)) == []
     found = station.wait(0.002)
     assert results(found) == [(START, FAILED)]
-    assert texts(found) == ["Cannot record: no answer of the disk"]
+    assert texts(found) == ["Cannot record: no answer from the disk"]
 
 
 def test_a_start_while_it_records_is_accepted_and_holds(station: GroundStation) -> None:

@@ -78,7 +78,7 @@ def test_a_supply_that_sags_and_recovers(flying: Flying) -> None:
         flying.report(supply_mv=supply_mv)
     assert flying.told == [
         (WARNING, "IMU node 0: supply low, 2.98 V"),
-        (INFO, "IMU node 0: supply well again, 3.10 V"),
+        (INFO, "IMU node 0: supply OK again, 3.10 V"),
     ]
 
 
@@ -96,7 +96,7 @@ def test_bus_errors_are_told_once_also_where_the_counter_begins_anew(flying: Fly
     assert flying.told == [(WARNING, "IMU node 0: bus errors, 65535 so far")]
     for _ in range(QUIET_REPORTS):
         flying.report()
-    assert flying.told[1:] == [(INFO, "IMU node 0: bus well again")]
+    assert flying.told[1:] == [(INFO, "IMU node 0: bus OK again")]
 
 
 def test_a_radio_that_is_not_heard(flying: Flying) -> None:

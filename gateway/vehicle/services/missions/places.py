@@ -88,7 +88,7 @@ class PlaceService:
             return []
         self._home_untold = False
         distance_m, _ = distance_and_bearing(place_of(fix), home)
-        text = f"Home is the one kept, {distance_m:.0f} m from here"
+        text = f"Stored home is used, {distance_m:.0f} m from here"
         return self._explain(text, now_us)
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
