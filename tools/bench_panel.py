@@ -19,12 +19,12 @@ import sys
 import tempfile
 import threading
 import time
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from bench_latency import await_answer, cpu_seconds, exchange, frames, free_port
+from bench_latency import GATEWAY, Line, Nodes, cpu_seconds
+from bench_pauses import free_ports
 from playwright.sync_api import Browser, Page, sync_playwright
 from pymavlink.dialects.v20 import common as mavlink
 from rich import box
@@ -144,7 +144,7 @@ def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
 
 def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict]:
     """Measure delay, CPU and memory with one viewer and with several."""
-    port = free_port()
+    (port,) = free_ports(1)
     config = folder / "panel.toml"
     config.write_text("[panel]\nmap_styles = []\n")
     found = []
@@ -183,53 +183,47 @@ def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict]:
 
 def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict:
     """Measure the gateway's own delay without a panel and with one that is looked at, in turns."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    port, source = free_port(), frames(GATEWAY_HZ)
     config = folder / "gateway.toml"
     config.write_text(
-        f'aircraft_folder = "{folder}/aircraft"\n[hub]\nendpoints = ["udp:127.0.0.1:{port}"]\n'
+        f'aircraft_folder = "{folder}/aircraft"\n'
         f"[vehicle.rates]\nattitude_quaternion_hz = 1000\n"
         f'[recording]\nfolder = "{folder}/recordings"\n[panel]\nport = 0\nmap_styles = []\n'
     )
-    command = ["run", "--plain", "--config", str(config), "--port", os.ttyname(slave)]
+    command = [
+        "env", f"XDG_RUNTIME_DIR={folder}", sys.executable, "-m", "gateway.cli",
+        "run", "--plain", "--config", str(config),
+        "--port", "{line}", "--endpoint", "udp:127.0.0.1:{port}",
+    ]  # fmt: skip
     late: dict[str, list[float]] = {"without": [], "read": [], "drawn": []}
+    moments = Nodes().moments(GATEWAY_HZ, 1)
 
     def turn(for_s: float) -> list[float]:
         """Exchange frames after a pause in which the node went on unheard."""
         nonlocal ended
         for _ in range(round((time.perf_counter() - ended) * GATEWAY_HZ)):
-            next(source)
-        found = exchange(master, sock, source, GATEWAY_HZ, for_s)
+            next(moments)
+        found = line.exchange(GATEWAY_HZ, for_s)
         ended = time.perf_counter()
         return found
 
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", port))
-        sock.setblocking(False)
-        gateway = subprocess.Popen(
-            [sys.executable, "-m", "gateway.cli", *command],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-        )  # fmt: skip
-        try:
-            await_answer(gateway, master, sock, source, GATEWAY_HZ)
-            ended = time.perf_counter()
-            for _ in range(TURNS):
-                turn(SETTLE_MS / 1000)
-                late["without"] += turn(seconds)
-                with running("panel", "--config", str(config), folder=folder) as (_, link):
-                    for key, path in (("read", "web/icon.svg"), ("drawn", "")):
-                        page = browser.new_page()
-                        page.goto(link + path)
-                        if key == "read":
-                            page.evaluate(READ)
-                        turn(SETTLE_MS / 1000)
-                        late[key] += turn(seconds)
-                        page.close()
-        finally:
-            gateway.terminate()
-            gateway.wait(20)
+    line = Line(GATEWAY, command, moments)
+    try:
+        line.await_answer(GATEWAY_HZ)
+        ended = time.perf_counter()
+        for _ in range(TURNS):
+            turn(SETTLE_MS / 1000)
+            late["without"] += turn(seconds)
+            with running("panel", "--config", str(config), folder=folder) as (_, link):
+                for key, path in (("read", "web/icon.svg"), ("drawn", "")):
+                    page = browser.new_page()
+                    page.goto(link + path)
+                    if key == "read":
+                        page.evaluate(READ)
+                    turn(SETTLE_MS / 1000)
+                    late[key] += turn(seconds)
+                    page.close()
+    finally:
+        line.close()
     p99 = {key: float(np.percentile(values, 99)) for key, values in late.items()}
     return {"p99_us": p99, "ratio": p99["read"] / p99["without"]}
 

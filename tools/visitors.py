@@ -2,8 +2,8 @@
 
     python tools/visitors.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
 
-For `soak.py`: they ask a gateway for parameters, missions, messages, rates and files, stay for
-some seconds and leave, until the process is ended. Its metrics are scraped meanwhile.
+For `bench_pauses.py`: they ask a gateway for parameters, missions, messages, rates and files, stay
+for some seconds and leave, until the process is ended. Its metrics are scraped meanwhile.
 """
 
 import asyncio

@@ -91,12 +91,12 @@ class DaskCluster:
         for future in done:
             number = numbers.pop(future)
             error = future.exception()
-            outcome = self._told(error) if error is not None else future.result()
+            outcome = self._failure_of(error) if error is not None else future.result()
             future.release()
             hand_out()
             yield number, outcome
 
-    def _told(self, error: BaseException) -> WorkFailed:
+    def _failure_of(self, error: BaseException) -> WorkFailed:
         if isinstance(error, self._distributed.KilledWorker):
             return WorkFailed("every worker that took it died: out of memory, or killed")
         if isinstance(error, asyncio.CancelledError):
