@@ -131,6 +131,9 @@ def test_parameter_is_found_changed_live_and_shown_against_its_default(desk: Des
     expect(row).to_contain_text("-10 to 10 rad/s · default 0")
     field = row.get_by_label("CAL_GYRO_BIAS_Z")
     field.fill("0.8")
+    # The view is refreshed meanwhile; what is typed must stay.
+    begun_us = desk.page.evaluate("mavgate.state.time_us")
+    desk.page.wait_for_function(f"mavgate.state.time_us > {begun_us} + 6e5")
     field.press("Enter")
     desk.page.wait_for_function("Math.abs(mavgate.state.rate_b_radps[2]) > 0.3")
     expect(row).to_have_class(re.compile(r"\bchanged\b"))

@@ -36,6 +36,8 @@ class ParameterRow:
                 ui.label(_range_of(meta)).classes("range")
                 self._trouble = ui.label().classes("trouble").props("role=alert")
             self._field = self._build_field()
+        # At once: a later first refresh would overwrite what is typed meanwhile.
+        self.refresh(dialogue)
 
     def refresh(self, dialogue: Dialogue) -> None:
         """Show the aircraft's present value."""

@@ -45,6 +45,7 @@ class _TuningView:
     def __init__(self, context: ViewContext) -> None:
         self._context = context
         self._rows: dict[str, ParameterRow] = {}
+        self._grouped: object = None
         self._drawn: object = None
         self._asked: int | None = None
 
@@ -86,7 +87,7 @@ class _TuningView:
         self._comparison = ComparisonCard(self._context)
 
     def _on_select(self) -> None:
-        self._drawn = None
+        self._grouped = None
         self._group.set_value(ALL)
         self._draw()
         self._chart.reload()
@@ -105,8 +106,8 @@ class _TuningView:
         self._state.set_text(_state_of(dialogue))
         complete = dialogue.parameters.state is ListState.COMPLETE
         state = (system_id, len(dialogue.parameters.entries), len(dialogue.metas))
-        if complete and state != self._drawn:
-            self._drawn = state
+        if complete and state != self._grouped:
+            self._grouped = state
             groups = sorted(
                 {_group_of(name, dialogue.metas) for name in dialogue.parameters.entries}
             )
@@ -116,13 +117,19 @@ class _TuningView:
             row.refresh(dialogue)
 
     def _draw(self, _: Any = None) -> None:
-        """Build the visible rows."""
+        """Build the visible rows; leave them as they are, with what is typed, if none changes."""
         dialogue = self._dialogue
+        names = [] if dialogue is None else self._wanted(dialogue)
+        metas = {} if dialogue is None else {name: dialogue.metas.get(name) for name in names}
+        known = 0 if dialogue is None else len(dialogue.parameters.entries)
+        state = (self._context.system_id, known > 0, metas)
+        if state == self._drawn:
+            return
+        self._drawn = state
         self._list.clear()
         self._rows = {}
         if dialogue is None:
             return
-        names = self._wanted(dialogue)
         last = ""
         with self._list:
             for name in names[:MAX_ROWS]:
@@ -130,12 +137,11 @@ class _TuningView:
                 if group != last:
                     last = group
                     ui.label(group).classes("group")
-                meta = dialogue.metas.get(name) or ParameterMeta(name=name)
+                meta = metas[name] or ParameterMeta(name=name)
                 self._rows[name] = ParameterRow(self._context, dialogue, meta)
             if len(names) > MAX_ROWS:
                 ui.label(f"{len(names) - MAX_ROWS} more; search for them").classes("empty")
             if not names:
-                known = dialogue.parameters.entries
                 text = "No parameter matches." if known else "No parameters yet."
                 ui.label(text).classes("empty")
 
