@@ -40,7 +40,7 @@ def main() -> None:
 
     estimator = make_estimator(with_estimator(case.fusion, "paper").estimation)
     fixes: list[GpsFix] = list(flight.fixes)
-    for sample in case.sensed.samples:
+    for sample in case.sensed.log.samples():
         while fixes and fixes[0].time_us <= sample.time_us:
             estimator.update_gps(fixes.pop(0))
         estimator.update_imu(sample)

@@ -327,7 +327,8 @@ class Bench:
             self._sinks[0].sendto(ask.pack(station), forwarder)
             station.seq = (station.seq + 1) % 256
             time.sleep(0.005)
-        reached, end_s = set(), time.monotonic() + COMMANDED_S
+        reached: set[int] = set()
+        end_s = time.monotonic() + COMMANDED_S
         reader = mavlink.MAVLink(None)
         while time.monotonic() < end_s and len(reached) < systems:
             if select.select([self._source], (), (), 0.1)[0]:
@@ -358,7 +359,7 @@ class Bench:
                 return
             time.sleep(0.05)
         self.close()
-        raise RuntimeError(f"{shlex.join(self.process.args)} forwards nothing")
+        raise RuntimeError(f"{self.process.args!r} forwards nothing")
 
     def _send(self, frame: bytes) -> None:
         with contextlib.suppress(ConnectionRefusedError):

@@ -197,7 +197,7 @@ class Line:
                     self._sock.recv(2048)
                 self._waiting.clear()
                 return
-        raise SystemExit(f"no answer from {self.process.args}")
+        raise SystemExit(f"no answer from {self.process.args!r}")
 
     def exchange(self, rate_hz: int, seconds: float) -> list[float]:
         """Send at a rate and match each IMU frame with its answer, in order.

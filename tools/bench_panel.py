@@ -21,18 +21,20 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from bench_latency import GATEWAY, Line, Nodes, cpu_seconds
-from bench_pauses import free_ports
 from playwright.sync_api import Browser, Page, sync_playwright
 from pymavlink.dialects.v20 import common as mavlink
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.panel.panel_server import make_parts
 from gateway.panel.panel_settings import PanelSettings
+from tools.bench_latency import GATEWAY, Line, Nodes, cpu_seconds
+from tools.bench_pauses import free_ports
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
@@ -107,7 +109,7 @@ class Vehicle(threading.Thread):
 
 
 @contextlib.contextmanager
-def running(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+def running(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """Run a command that prints the panel's link, until the end of the block."""
     log = folder / f"{time.monotonic_ns()}.log"
     with log.open("w") as output:
@@ -130,7 +132,7 @@ def running(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen, s
 def memory_mb(pid: int) -> float:
     """Return how much memory a process holds."""
     text = Path(f"/proc/{pid}/status").read_text()
-    return int(re.search(r"VmRSS:\s+(\d+)", text)[1]) / 1000
+    return int(re.findall(r"VmRSS:\s+(\d+)", text)[0]) / 1000
 
 
 def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
@@ -142,7 +144,7 @@ def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
     return pages
 
 
-def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict]:
+def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict[str, float]]:
     """Measure delay, CPU and memory with one viewer and with several."""
     (port,) = free_ports(1)
     config = folder / "panel.toml"
@@ -181,7 +183,7 @@ def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict]:
     return found
 
 
-def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict:
+def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str, Any]:
     """Measure the gateway's own delay without a panel and with one that is looked at, in turns."""
     config = folder / "gateway.toml"
     config.write_text(
@@ -196,6 +198,7 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict:
     ]  # fmt: skip
     late: dict[str, list[float]] = {"without": [], "read": [], "drawn": []}
     moments = Nodes().moments(GATEWAY_HZ, 1)
+    ended = 0.0
 
     def turn(for_s: float) -> list[float]:
         """Exchange frames after a pause in which the node went on unheard."""
@@ -228,7 +231,7 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict:
     return {"p99_us": p99, "ratio": p99["read"] / p99["without"]}
 
 
-def measure_hours() -> list[dict]:
+def measure_hours() -> list[dict[str, float]]:
     """Measure what the panel's memory of one aircraft at 25 Hz takes, minute for minute."""
     parts = make_parts(PanelSettings(), Path(), None, None)
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -243,7 +246,7 @@ def measure_hours() -> list[dict]:
     return found
 
 
-def show(found: dict) -> None:
+def show(found: dict[str, Any]) -> None:
     """Print the figures as tables, each with its goal."""
     table = Table(title=f"datagram in to drawn in the browser, {RATE_HZ} Hz", box=box.SIMPLE_HEAD)
     for column in ("viewers", "drawn Hz", "p50 ms", "p99 ms", "panel's CPU %", "MB", "grown MB"):

@@ -57,8 +57,10 @@ def main() -> None:
     figure, panels = plt.subplot_mosaic(
         [["map", "roll"], ["map", "height"]], figsize=(11, 5), width_ratios=[1, 1.15]
     )
-    north_east = np.array([displacement_m(*home, *row, 0.0) for row in seen["fix"][:, 1:3]])
-    track = np.array([displacement_m(*home, *row, 0.0) for row in seen["place"][:, 1:3]])
+    north_east, track = (
+        np.array([displacement_m(*home, lat, lon, 0.0) for lat, lon in seen[name][:, 1:3]])
+        for name in ("fix", "place")
+    )
     panels["map"].plot(*north_east.T[::-1], ".", ms=3, color=GREY, label="GPS fixes, 5 Hz")
     panels["map"].plot(*track.T[::-1], color=BLUE, label="GLOBAL_POSITION_INT")
     panels["map"].plot(0, 0, "^", color=ORANGE, label="home")

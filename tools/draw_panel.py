@@ -6,8 +6,9 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Literal
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 CHROMIUM = "/usr/bin/chromium"
@@ -25,7 +26,7 @@ port = 0
 tiles_folder = "{folder}/tiles"
 map_styles = []
 """
-SHOTS = (("flight", "dark"), ("map", "light"))
+SHOTS: tuple[tuple[str, Literal["dark", "light"]], ...] = (("flight", "dark"), ("map", "light"))
 AS_WITH_A_GRAPHICS_CARD = """
 const extension = WebGLRenderingContext.prototype.getExtension;
 WebGLRenderingContext.prototype.getExtension = function (name) {
@@ -33,7 +34,7 @@ WebGLRenderingContext.prototype.getExtension = function (name) {
 };
 """
 """Hides who draws, since the page draws the 3D coarser where the processor does."""
-SIZE = {"width": 1440, "height": 900}
+SIZE: ViewportSize = {"width": 1440, "height": 900}
 
 
 def draw(page: Page, view: str) -> None:

@@ -25,10 +25,12 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
-from bench_hub import HANDSHAKE, Bench, Latency, source_frames
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tools.bench_hub import HANDSHAKE, Bench, Latency, source_frames
 
 HEALTHY = 4
 RATE_HZ = 500
@@ -323,8 +325,8 @@ def main() -> None:
                 "gap_us": gaps[1],
             }
             good = lost == 0 and after <= LIMIT * before and gaps[1] <= GAP_LIMIT_US
-            row = (f"{before:.0f}", f"{after:.0f}", f"{after / before:.2f}")
-            row += (*(f"{gap / 1000:.1f}" for gap in gaps), "yes" if good else "no")
+            row = [f"{before:.0f}", f"{after:.0f}", f"{after / before:.2f}"]
+            row += [*(f"{gap / 1000:.1f}" for gap in gaps), "yes" if good else "no"]
             table.add_row(name, str(lost), *row)
     finally:
         bench.close()

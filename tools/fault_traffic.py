@@ -12,9 +12,13 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
 
-from bench_hub import SOURCE_SYSTEM, source_frames
 from pymavlink.dialects.v20 import common as mavlink
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tools.bench_hub import SOURCE_SYSTEM, source_frames
 
 TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
 PORTS = 31
@@ -65,14 +69,14 @@ def asking(port: int, host: str, frame: bytes, ports: int = PORTS) -> Batch:
     for sock in callers:
         sock.send(heartbeat(200))
     for sock in itertools.cycle(callers):
-        yield lambda sock=sock: sock.send(frame)
+        yield partial(sock.send, frame)
 
 
 def bursts(port: int) -> Batch:
     """Have a file sent byte by byte, again and again, from many ports."""
     callers = [(sock, ftp_session(sock)) for sock in (caller(UNTRUSTED, port) for _ in range(16))]
     for sock, session in itertools.cycle(callers):
-        yield lambda sock=sock, session=session: sock.send(ftp(BURST_READ_FILE, session, b"", 1))
+        yield partial(sock.send, ftp(BURST_READ_FILE, session, b"", 1))
 
 
 def ftp_session(sock: socket.socket) -> int:
@@ -104,7 +108,7 @@ def crowd(port: int) -> Batch:
     callers = [caller(UNTRUSTED, port) for _ in range(100)]
     frames = [heartbeat(1 + number) for number in range(100)]
     for sock, frame in itertools.cycle(zip(callers, frames, strict=True)):
-        yield lambda sock=sock, frame=frame: sock.send(frame)
+        yield partial(sock.send, frame)
 
 
 def twins(port: int) -> Batch:
@@ -116,7 +120,7 @@ def twins(port: int) -> Batch:
         frame = bytes(message.pack(link))
         link.seq = (link.seq + 1) % 256
         for sock in callers:
-            yield lambda sock=sock, frame=frame: sock.send(frame)
+            yield partial(sock.send, frame)
 
 
 LIST = packed(mavlink.MAVLink_param_request_list_message(1, 1))

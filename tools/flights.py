@@ -146,7 +146,7 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
                 gps_us.append(record.time_us)
                 gps.append(gps_row(record, settings, earth))
     log = SampleLog(*(np.array(column) for column in (imu_us, imu, baro_us, baro, gps_us, gps)))
-    truth = flown.trajectory.truth_at(log.imu_time_us * 1e-6)
+    truth = flown.trajectory.truth_at(np.asarray(log.imu_time_us * 1e-6, np.float64))
     origin = (flown.settings.home_lat_deg, flown.settings.home_lon_deg)
     flight = Flight(
         name=f"simulated {seed}{'' if calibrated else ' uncalibrated'}",

@@ -366,7 +366,7 @@ def bounded(name: str, examples: int, *, always_the_same: bool) -> Property:
         deadline=None,
         derandomize=always_the_same,
         suppress_health_check=checks,
-        **({"database": None} if always_the_same else {}),
+        database=None if always_the_same else settings().database,
     )
     ready: Property = chosen(TARGETS[name])
     return ready
@@ -382,7 +382,8 @@ def main() -> int:
     wanted = options.targets or list(TARGETS)
     if unknown := set(wanted) - set(TARGETS):
         parser.error(f"no such target: {', '.join(sorted(unknown))}")
-    end_s, failed, runs = time.monotonic() + 60.0 * options.minutes, set(), dict.fromkeys(wanted, 0)
+    failed: set[str] = set()
+    end_s, runs = time.monotonic() + 60.0 * options.minutes, dict.fromkeys(wanted, 0)
     for name in itertools.cycle(wanted):
         if time.monotonic() > end_s or failed >= set(wanted):
             break

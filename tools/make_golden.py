@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.cli.app import app
+from gateway.records import BaroRaw, GpsFix
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.simulator.flight import fly
@@ -31,8 +32,10 @@ RATE_HZ = 25
 EVERY = 50
 """Of the fused rows, those that are kept."""
 ESTIMATORS = ("paper", "complementary", "eskf")
-NAMES = ("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m")
-NAMES += ("gps_time_s", "gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd")
+NAMES = (
+    *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),
+    *("gps_time_s", "gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"),
+)
 
 
 def write_log(path: Path) -> None:
@@ -53,10 +56,10 @@ def write_log(path: Path) -> None:
     rows.writerow(NAMES)
     baro, gps = [""], [""] * 7
     for record in flown.records():
-        match type(record).__name__:
-            case "BaroRaw":
+        match record:
+            case BaroRaw():
                 baro = [f"{chain.baro(record).alt_pressure_m:.3f}"]
-            case "GpsFix":
+            case GpsFix():
                 if record.fix_ok:
                     place = (record.lat_dege7 / 1e7, record.lon_dege7 / 1e7)
                     vel = [f"{v:.3f}" for v in record.vel_n_mps]

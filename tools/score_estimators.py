@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -32,6 +33,7 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_LON,
 )
+from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import smooth
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
@@ -60,22 +62,26 @@ THIN_S = 0.95
 REPEATS = 3
 
 
+def estimator_of(name: str, flight: Flight) -> KernelEstimator[Any, Any]:
+    """Make a compiled estimator with a flight's references."""
+    found = make_estimator(EstimationSettings(estimator=name, reference=flight.reference))
+    assert isinstance(found, KernelEstimator)
+    return found
+
+
 def run_complementary(flight: Flight) -> np.ndarray:
     """Run the default estimator."""
-    settings = EstimationSettings(estimator="complementary", reference=flight.reference)
-    return make_estimator(settings).run(flight.log)
+    return estimator_of("complementary", flight).run(flight.log)
 
 
 def run_eskf(flight: Flight) -> np.ndarray:
     """Run the Kalman filter."""
-    settings = EstimationSettings(estimator="eskf", reference=flight.reference)
-    return make_estimator(settings).run(flight.log)
+    return estimator_of("eskf", flight).run(flight.log)
 
 
 def run_smoothed(flight: Flight) -> np.ndarray:
     """Run the Kalman filter from both ends."""
-    settings = EstimationSettings(estimator="eskf", reference=flight.reference)
-    return smooth(make_estimator(settings), flight.log)
+    return smooth(estimator_of("eskf", flight), flight.log)
 
 
 OWN: dict[str, Run] = {"paper": run_paper, "complementary": run_complementary, "eskf": run_eskf}

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from flights import Flight, north_east_m, read_flight
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 from rich import box
@@ -23,12 +22,14 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation, Slerp
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.config import GatewaySettings
 from gateway.edges.disk import tracker_csv
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
 from gateway.units import DEG_PER_DEGE7, US_PER_S
+from tools.flights import Flight, north_east_m, read_flight
 
 FINAL_HEARTBEATS = 5
 """So many heartbeats without an attitude between them: the log has ended."""

@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
-from gateway.records import GpsFixType, ImuFlags, NodeId
+from gateway.records import GpsFixType, ImuFlags, LinkReport, NodeId
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
@@ -115,7 +115,7 @@ async def soak(options: argparse.Namespace) -> int:
     return judge(snapshot.report, tracker, settled_kib)
 
 
-def judge(report, tracker: Tracker, settled_kib: int) -> int:
+def judge(report: LinkReport, tracker: Tracker, settled_kib: int) -> int:
     """Print the account and tell whether it adds up."""
     status = 0
     for link in sorted(report.nodes, key=lambda node: node.node.node_id):

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -33,9 +33,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+from gateway.simulator.timed_frame import TimedFrame
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.station import Station
-from tests.end_to_end.test_demo import MavProxy
 from tests.end_to_end.test_ground_stations import CONFIG
 from tests.vehicle.test_start_up import qgroundcontrol
 
@@ -63,8 +63,11 @@ def process_figures(pid: int) -> str:
     return f"CPU {own:.2f} s (and {waited:.2f} s of compilers), {resident_mb:.0f} MB"
 
 
-def feed(master: int, frames: Iterator, began_s: float) -> None:
-    """Write the receiver's frames at their own time; what nobody has read yet is not waited for."""
+def feed(master: int, frames: Iterable[TimedFrame], began_s: float) -> Iterator[float]:
+    """Write the receiver's frames at their own time, and yield the seconds until each.
+
+    What nobody has read yet is not waited for.
+    """
     for frame in frames:
         while (early_s := began_s + frame.time_s - time.monotonic()) > 0.0:
             yield early_s

@@ -72,7 +72,7 @@ class TurnWatch(selectors.EpollSelector):
             if took_ns > watch._longest[0]:
                 watch._longest = took_ns, getattr(handle, "_callback", None)
 
-        asyncio.Handle._run = run  # type: ignore[method-assign]  # noqa: SLF001
+        asyncio.Handle._run = run  # type: ignore[method-assign, assignment]  # noqa: SLF001
         gc.callbacks.append(self._on_collection)
 
     def select(self, timeout: float | None = None) -> list[Any]:

@@ -12,10 +12,13 @@ import random
 import struct
 import sys
 import urllib.request
+from pathlib import Path
 
-from bench_hub import HANDSHAKE
-from fault_traffic import heartbeat, packed, request_message
 from pymavlink.dialects.v20 import common as mavlink
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tools.bench_hub import HANDSHAKE
+from tools.fault_traffic import heartbeat, packed, request_message
 
 AT_ONCE = 6
 """Stations that are there at a time."""
