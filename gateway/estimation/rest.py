@@ -16,6 +16,10 @@ FLOWN_S: Final = 20.0
 """A bias is that of a motion which lasted so long."""
 REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
+SHAKEN: Final = 5.0
+"""An engine that idles shakes the gyroscope by so many times more than rest without one."""
+STEADY: Final = 0.15
+"""Its average stays this much closer to itself then: noise and vibration average out."""
 
 
 class RestSettings(Settings, frozen=True):
@@ -90,6 +94,8 @@ def watch_rest(
 ) -> None:
     """Judge whether the aircraft stands: quiet sensors, small rate, no GPS speed.
 
+    A gyroscope that an idling engine shakes is quiet where its average is.
+
     Parameters
     ----------
     s : RestState
@@ -104,16 +110,19 @@ def watch_rest(
         Time step, s.
     """
     share = min(1.0, dt / REST_TAU_S)
-    gyro_sq, accel_sq, largest = 0.0, 0.0, 0.0
+    gyro_sq, accel_sq, mean_sq, largest = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         s.gyro_lp[k] += share * (gyro[k] - s.gyro_lp[k])
         s.gyro_rest[k] += share * (s.gyro_lp[k] - s.gyro_rest[k])
         s.accel_lp[k] += share * (accel[k] - s.accel_lp[k])
         gyro_sq += (gyro[k] - s.gyro_lp[k]) ** 2
+        mean_sq += (s.gyro_lp[k] - s.gyro_rest[k]) ** 2
         accel_sq += (accel[k] - s.accel_lp[k]) ** 2
         largest = max(largest, abs(s.gyro_lp[k]))
+    still_sq = p.rest_gyro_radps**2
+    shaken = gyro_sq < SHAKEN**2 * still_sq and mean_sq < STEADY**2 * still_sq
     quiet = (
-        gyro_sq < p.rest_gyro_radps**2
+        (gyro_sq < still_sq or shaken)
         and accel_sq < p.rest_accel_mps2**2
         and largest < p.bias_limit_radps
         and not moving

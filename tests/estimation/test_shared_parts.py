@@ -61,6 +61,17 @@ class TestRest:
     def test_trembling(self) -> None:
         assert self.watch(lambda t: (0.2 * math.sin(30 * t), 0.0, 0.0)) == 0
 
+    @pytest.mark.parametrize(("wander_radps", "rests"), [(0.0, 1), (0.03, 0)])
+    def test_an_idling_engine_shakes_but_leaves_the_average(
+        self, wander_radps: float, rests: int
+    ) -> None:
+        """A hover is as shaken, and its average wanders."""
+
+        def gyro(t: float) -> tuple[float, float, float]:
+            return (0.06 * math.sin(190 * t), wander_radps * math.sin(3 * t), 0.0)
+
+        assert self.watch(gyro) == rests
+
     def test_shaking(self) -> None:
         def shaken(t: float) -> tuple[float, float, float]:
             return (3.0 * math.sin(30 * t), 0.0, -9.81)
