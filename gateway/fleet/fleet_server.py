@@ -174,9 +174,9 @@ class FleetServer:
                 self._session.ask_round_trips()
             await asyncio.sleep(KEEP_S)
 
-    def _take(self, name: str, data: bytes) -> None:
+    def _take(self, name: str, data: bytes, is_own: bool) -> None:
         if (site := self._site(name)) is not None:
-            site.take(data)
+            site.take(data, is_own=is_own)
 
     def _note_round_trip(self, name: str, round_trip_us: int) -> None:
         if (site := self._sites.get(name)) is not None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from gateway.edges.hub.fleet_link.site_keys import out_key, ping_key, presence_key, site_of
+from gateway.edges.hub.fleet_link.site_keys import OWN, out_key, ping_key, presence_key, site_of
 from gateway.edges.hub.fleet_link.zenoh_session import (
     Inlet,
     Outlets,
@@ -31,8 +31,8 @@ PING_TIMEOUT_S: Final = 5.0
 class SessionEvents:
     """What is called on the loop."""
 
-    frames: Callable[[str, bytes], None]
-    """With a site and what it has published."""
+    frames: Callable[[str, bytes, bool], None]
+    """With a site, what it has published, and whether that is of its gateway's own vehicles."""
     presence: Callable[[str, str, bool], None]
     """With a site, one of its sessions, and whether that has come or gone."""
     round_trip: Callable[[str, int], None]
@@ -181,8 +181,8 @@ class FleetSession:
         import zenoh
 
         events = self._events
-        frames: Inlet[tuple[str, bytes]] = Inlet(
-            lambda sample: events.frames(site_of(sample[0]), sample[1])
+        frames: Inlet[tuple[str, bytes, bool]] = Inlet(
+            lambda sample: events.frames(site_of(sample[0]), *sample[1:])
         )
         presence: Inlet[tuple[str, bool]] = Inlet(self._note_token)
         trips: Inlet[tuple[str, int]] = Inlet(lambda item: events.round_trip(*item))
@@ -192,7 +192,9 @@ class FleetSession:
             self._declared += [
                 session.declare_subscriber(
                     out_key(pattern, "*"),
-                    lambda sample: frames.put((str(sample.key_expr), sample.payload.to_bytes())),
+                    lambda sample: frames.put(
+                        (str(sample.key_expr), sample.payload.to_bytes(), _is_own(sample))
+                    ),
                 ),
                 session.liveliness().declare_subscriber(
                     presence_key(pattern, "*"),
@@ -204,6 +206,11 @@ class FleetSession:
     def _note_token(self, news: tuple[str, bool]) -> None:
         key, is_here = news
         self._events.presence(site_of(key), key.rpartition("/")[2], is_here)
+
+
+def _is_own(sample: "zenoh.Sample") -> bool:
+    mark = sample.attachment
+    return mark is not None and mark.to_bytes() == OWN
 
 
 def key_pattern(site: str) -> str:

@@ -109,14 +109,26 @@ class FrameTranslation:
         for traffic in self.traffic.values():
             traffic.marks.append((now_us, traffic.frames))
 
-    def from_site(self, frame: bytes, now_us: int) -> bytes | None:
-        """Return a frame of the site as it is to be seen here; None if it cannot pass."""
+    def from_site(self, frame: bytes, now_us: int, *, is_own: bool = False) -> bytes | None:
+        """Return a frame of the site as it is to be seen here; None if it cannot pass.
+
+        Parameters
+        ----------
+        frame : bytes
+            As it came.
+        now_us : int
+            Gateway time.
+        is_own : bool, optional
+            Whether the site's gateway made it, so that it has not been here before; any other frame
+            may have come to the site from the ground stations here.
+        """
         origin = origin_of(frame)
         vehicle = (self._site, origin[0])
-        has_id = self.id_of(origin[0]) is not None
-        if self._loops.is_back(frame, vehicle, has_id=has_id, now_us=now_us):
-            self.counters.looped += 1
-            return None
+        if not is_own:
+            has_id = self.id_of(origin[0]) is not None
+            if self._loops.is_back(frame, vehicle, has_id=has_id, now_us=now_us):
+                self.counters.looped += 1
+                return None
         own_id = self._ids.id_of(*vehicle)
         if own_id is None:
             self.counters.unmapped += 1

@@ -4,7 +4,8 @@ Frames pass a hub byte for byte, so one that comes from a vehicle and equals one
 lately for another vehicle has most likely gone round. Two aircraft of one type say equal things
 too: their heartbeats differ by nothing but their number, and many have the same system id. So what
 a vehicle repeats proves nothing where ids are equal by themselves, and one that has an id loses
-nothing before a whole run of its frames had been here.
+nothing before a whole run of its frames had been here. What a site has marked as made by its own
+gateway is not asked about at all.
 """
 
 from typing import Final, NamedTuple

@@ -39,14 +39,14 @@ class SiteClient(Client):
         self.become("connecting")
         return self
 
-    def take(self, data: bytes) -> None:
-        """Take what the site has published."""
+    def take(self, data: bytes, *, is_own: bool) -> None:
+        """Take what the site has published; of its gateway's own vehicles, or of its clients."""
         now_us = self.context.now_us()
         events: list[bytes | SplitFault] = []
         for event in split_datagram(data):
             if isinstance(event, SplitFault):
                 events.append(event)
-            elif (frame := self.translation.from_site(event, now_us)) is not None:
+            elif (frame := self.translation.from_site(event, now_us, is_own=is_own)) is not None:
                 events.append(frame)
         if self.state != "open":
             self.become("open")

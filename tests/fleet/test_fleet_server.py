@@ -50,6 +50,9 @@ async def test_one_sites_frames_never_reach_another(world: World) -> None:
     await world.until(lambda: len(world.systems()) == 2)
     before = {name: hub.clients()[0].received for name, hub in world.sites.items()}
     await world.until(lambda: len(world.got) > 200)
+    assert world.vehicles["field-a"].heartbeat() == world.vehicles["field-b"].heartbeat()
+    looped = [site["looped"] for site in world.fleet.status()["sites"]]
+    assert looped == [0, 0], "each is known for its own, though they say the same"
     for name, hub in world.sites.items():
         senders = {each.frame[5] for each in world.heard[name]}
         assert senders <= {255}

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 import zenoh
 
 from gateway.edges.hub.fleet_link import zenoh_session
+from gateway.edges.hub.fleet_link.site_keys import OWN
 from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inlet
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.edges.hub.conftest import Rig
@@ -84,10 +86,14 @@ class Far:
         config.insert_json5("scouting/multicast/enabled", "false")
         self.session = zenoh.open(config)
         self.got: list[tuple[str, bytes]] = []
+        self.marks: dict[str, set[bytes | None]] = defaultdict(set)
+        """What was attached, by key."""
         self._subscribers = [self.session.declare_subscriber(key, self._note) for key in keys]
 
     def _note(self, sample: zenoh.Sample) -> None:
-        self.got.append((str(sample.key_expr), sample.payload.to_bytes()))
+        key, mark = str(sample.key_expr), sample.attachment
+        self.got.append((key, sample.payload.to_bytes()))
+        self.marks[key].add(mark and mark.to_bytes())
 
     def messages(self, message_id: int) -> list[bytes]:
         return [data for _, data in self.got if message_id_of(data) == message_id]
@@ -149,21 +155,23 @@ class TestSite:
         far.session.put("mavlink/field/1/in", rig.sender(255, 190).heartbeat())
         await until(rig, hub, lambda: hub.clients()[0].received == 2)
 
-    async def test_an_autopilot_behind_it_has_keys_of_its_own(
+    async def test_an_autopilot_behind_it_has_keys_of_its_own_and_no_mark(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         hub = await open_site(rig, router)
         hub.add("udp-listen:127.0.0.1:0?trusted=yes")
         station = rig.station(hub.listening_ports()[0])
-        far = visit("mavlink/field/7/out")
+        far = visit("mavlink/field/*/out")
         autopilot = rig.sender(7)
 
         def heard() -> bool:
             station.say(autopilot.heartbeat())
-            return bool(far.got)
+            hub.send(rig.out(rig.vehicle.command(1, 1)))
+            hub.send(rig.out(rig.vehicle.heartbeat()))
+            return far.marks.keys() >= {"mavlink/field/7/out"} and bool(far.messages(76))
 
         await until(rig, hub, heard)
-        assert far.got[0][0] == "mavlink/field/7/out"
+        assert far.marks == {"mavlink/field/7/out": {None}, "mavlink/field/1/out": {OWN}}
 
     async def test_filters_rates_and_packing(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
@@ -205,6 +213,7 @@ class TestSite:
         hub = await open_site(rig, router, "keys=mavlink_raw")
         far = visit("mavlink_raw/out")
         await until_heard(rig, hub, far)
+        assert far.marks == {"mavlink_raw/out": {None}}
         far.session.put("mavlink_raw/in", rig.sender(255, 190).command(1, 1))
         await until(rig, hub, lambda: bool(rig.incoming))
 

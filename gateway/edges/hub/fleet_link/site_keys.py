@@ -8,12 +8,17 @@
 | `mavlink/SITE/ping`          | the site answers queries at once                            |
 | `mavlink/SITE/recordings`    | the site answers queries for its recordings                 |
 | `mavlink_raw/out`, `…/in`    | the same without sites, as mavlink-server has it            |
+
+`OWN` is attached to what a site publishes for its gateway's own vehicles. The hub takes no frame in
+their name from a client, so such a frame began here and has not gone round any loop. What a client
+of the site sent, as an autopilot behind it, and what other programs publish has no attachment.
 """
 
 from typing import Final
 
 ROOT: Final = "mavlink"
 ALL_SYSTEMS: Final = "*"
+OWN: Final = b"own"
 
 
 def out_key(site: str, system: object) -> str:

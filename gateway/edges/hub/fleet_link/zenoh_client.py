@@ -6,13 +6,14 @@ so that nothing old ever arrives as new.
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.fleet_link.query_answers import QueryAnswers
 from gateway.edges.hub.fleet_link.recording_answers import RecordingAnswers
 from gateway.edges.hub.fleet_link.site_keys import (
     ALL_SYSTEMS,
+    OWN,
     in_key,
     out_key,
     ping_key,
@@ -43,6 +44,14 @@ RAW_OUT: Final = "mavlink_raw/out"
 RAW_IN: Final = "mavlink_raw/in"
 
 
+class _Way(NamedTuple):
+    """How frames are published."""
+
+    key: str
+    mark: bytes | None
+    """Attached; None for nothing."""
+
+
 class ZenohClient(Client):
     """A fleet behind a router."""
 
@@ -56,7 +65,7 @@ class ZenohClient(Client):
         """Begin without a session; the first tick opens it."""
         super().__post_init__()
         self._namesakes: set[str] = set()
-        self._packers: dict[str, Packer] = {}
+        self._packers: dict[_Way, Packer] = {}
         self._inlets: list[Inlet[Any]] = []
         self._declared: list[object] = []
 
@@ -70,13 +79,18 @@ class ZenohClient(Client):
         if self.state != "open" or self._outlets is None:
             self.counters.dropped += 1
             return
-        key = RAW_OUT if self._is_raw else out_key(self.endpoint.site, origin_of(frame)[0])
-        if message_id in PATIENT_IDS:
-            self._publish(key, [frame], patient=True)
-        elif self.endpoint.pack_bytes:
-            self._pack(key, frame)
+        origin = origin_of(frame)
+        if self._is_raw:
+            way = _Way(RAW_OUT, None)
         else:
-            self._publish(key, [frame], patient=False)
+            mark = OWN if self.context.is_own(origin) else None
+            way = _Way(out_key(self.endpoint.site, origin[0]), mark)
+        if message_id in PATIENT_IDS:
+            self._publish(way, [frame], patient=True)
+        elif self.endpoint.pack_bytes:
+            self._pack(way, frame)
+        else:
+            self._publish(way, [frame], patient=False)
 
     def tick(self, now_us: int) -> None:
         """Open the session, and see whether it has a router."""
@@ -185,23 +199,23 @@ class ZenohClient(Client):
         if text:
             log.warning("%s: %s; rename one of them", self.name, text)
 
-    def _pack(self, key: str, frame: bytes) -> None:
-        packer = self._packers.setdefault(key, Packer(self.endpoint.pack_bytes))
-        self._publish(key, packer.add(frame), patient=False)
+    def _pack(self, way: _Way, frame: bytes) -> None:
+        packer = self._packers.setdefault(way, Packer(self.endpoint.pack_bytes))
+        self._publish(way, packer.add(frame), patient=False)
         if not self._is_gathering:
             self._is_gathering = True
             self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def _flush(self) -> None:
         self._is_gathering = False
-        for key, packer in self._packers.items():
-            self._publish(key, packer.flush(), patient=False)
+        for way, packer in self._packers.items():
+            self._publish(way, packer.flush(), patient=False)
 
-    def _publish(self, key: str, frames: list[bytes], *, patient: bool) -> None:
+    def _publish(self, way: _Way, frames: list[bytes], *, patient: bool) -> None:
         if not frames or self._outlets is None:
             return
         data = b"".join(frames)
-        if self._outlets.publish(key, data, patient=patient):
+        if self._outlets.publish(way.key, data, patient=patient, mark=way.mark):
             self.counters.sent += len(frames)
             self.counters.bytes_sent += len(data)
         else:

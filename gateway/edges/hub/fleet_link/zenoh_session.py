@@ -41,6 +41,7 @@ PATIENT_IDS: Final = BULK_IDS | {75, 76, 77, 253}
 """Parameters, missions, files, commands, their answers, texts: none of them comes again."""
 
 Item = TypeVar("Item")
+_Patient = tuple["zenoh.Publisher", bytes, bytes | None]
 
 
 def session_config(place: str, file: str, mode: str = "client") -> "zenoh.Config":
@@ -179,12 +180,14 @@ class Outlets:
         self._zenoh = zenoh
         self._session = session
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
-        self._waiting: queue.Queue[tuple[zenoh.Publisher, bytes] | None] = queue.Queue(MAX_PATIENT)
+        self._waiting: queue.Queue[_Patient | None] = queue.Queue(MAX_PATIENT)
         self._is_closed = False
         self._thread = threading.Thread(target=self._publish, name="zenoh-patient", daemon=True)
         self._thread.start()
 
-    def publish(self, key: str, payload: bytes, *, patient: bool) -> bool:
+    def publish(
+        self, key: str, payload: bytes, *, patient: bool, mark: bytes | None = None
+    ) -> bool:
         """Publish without waiting; return whether it was taken.
 
         Parameters
@@ -195,13 +198,15 @@ class Outlets:
             Some frames.
         patient : bool
             Whether it waits for a congested link, and is not dropped.
+        mark : bytes, optional
+            Attached to it.
         """
         publisher = self._publishers.get((key, patient)) or self._declare(key, patient=patient)
         if not patient:
-            publisher.put(payload)
+            publisher.put(payload, attachment=mark)
             return True
         try:
-            self._waiting.put_nowait((publisher, payload))
+            self._waiting.put_nowait((publisher, payload, mark))
         except queue.Full:
             return False
         return True
@@ -235,9 +240,9 @@ class Outlets:
 
     def _publish(self) -> None:
         while (item := self._waiting.get()) is not None and not self._is_closed:
-            publisher, payload = item
+            publisher, payload, mark = item
             try:
-                publisher.put(payload)
+                publisher.put(payload, attachment=mark)
             except self._zenoh.ZError as error:
                 log.debug("not published: %s", error)
 
