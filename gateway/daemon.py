@@ -113,7 +113,7 @@ class Daemon:
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._metrics = MetricsServer(self._metrics_text)
-        self._write_metrics: Callable[[Snapshot], str] | None = None
+        self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
         self._notifier = ServiceNotifier()
         self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
         self._sent: Counter[int] = Counter()
@@ -235,7 +235,7 @@ class Daemon:
             self._write_metrics = prometheus_text
         self._metrics.listen(port)
 
-    def _metrics_text(self) -> str:
+    def _metrics_text(self) -> Iterator[str]:
         assert self._write_metrics is not None
         return self._write_metrics(self.snapshot())
 

@@ -14,7 +14,12 @@ import pytest
 
 from gateway.compiled import address_of, array_at, compiled, compiled_with, digest_of
 from gateway.compiled.compiler import compile_dispatcher
-from gateway.compiled.entry_point import EntryPoint
+from gateway.compiled.entry_point import (
+    EntryPoint,
+    NotCompiledError,
+    dispatched,
+    nothing_compiled,
+)
 from gateway.estimation.complementary.complementary_kernels import KERNELS
 
 FLOAT = np.dtype(np.float64)
@@ -57,6 +62,19 @@ def test_an_entry_point_does_what_its_function_does_and_is_kept(folder: Path) ->
     assert first.is_kept
     assert use(EntryPoint(scale)) == [3.25, 7.75]
     assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.io
+def test_a_running_gateway_compiles_nothing(folder: Path) -> None:
+    with nothing_compiled():
+        with pytest.raises(NotCompiledError):
+            use(EntryPoint(scale))
+        with pytest.raises(NotCompiledError):
+            dispatched(scale)(0, 0, 0.0)
+    assert not list(folder.iterdir())
+    use(EntryPoint(scale))
+    with nothing_compiled():
+        assert use(EntryPoint(scale)) == [3.25, 7.75], "what is kept is loaded"
 
 
 @pytest.mark.io

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.support.warm_up import make_ready
+from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
@@ -76,13 +77,14 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
     gc.collect()
     gc.freeze()
     watch.install()
-    daemon.start()
-    watch.restart()
-    try:
-        await asyncio.sleep(seconds)
-        watch.stop()
-    finally:
-        daemon.close()
+    with nothing_compiled():
+        daemon.start()
+        watch.restart()
+        try:
+            await asyncio.sleep(seconds)
+            watch.stop()
+        finally:
+            daemon.close()
 
 
 def run(options: argparse.Namespace, folder: Path) -> TurnWatch:

@@ -2,7 +2,8 @@
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import update_wrapper
 from inspect import signature
 from typing import Any, Final, Generic, ParamSpec, TypeVar
@@ -15,6 +16,27 @@ Result = TypeVar("Result")
 INTERPRETED: Final = os.environ.get("NUMBA_DISABLE_JIT", "0") != "0"
 """Run everything as Python, for a debugger."""
 C_TYPES: Final[dict[Any, Any]] = {int: ctypes.c_int64, float: ctypes.c_double}
+
+
+_may_compile = True
+
+
+class NotCompiledError(ValueError):
+    """Machine code is not cached, and this process may not compile."""
+
+
+@contextmanager
+def nothing_compiled() -> Iterator[None]:
+    """Raise NotCompiledError where this process would compile: it takes seconds.
+
+    For a running gateway, whose event loop would stop meanwhile, whichever thread compiles.
+    """
+    global _may_compile
+    before, _may_compile = _may_compile, False
+    try:
+        yield
+    finally:
+        _may_compile = before
 
 
 class EntryPoint(Generic[Parameters]):
@@ -59,6 +81,8 @@ class EntryPoint(Generic[Parameters]):
         name, digest = self._name, digest_of(self._function)
         code = kept_code(name, digest)
         if code is None:
+            if not _may_compile:
+                raise NotCompiledError(f"{name} is not compiled yet")
             from gateway.compiled.compiler import compile_entry
 
             code = compile_entry(self._function)
@@ -78,6 +102,8 @@ class _Dispatched(Generic[Parameters, Result]):
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         if self._dispatcher is None:
+            if not _may_compile:
+                raise NotCompiledError(f"{self._function.__qualname__} is for recordings")
             from gateway.compiled.compiler import compile_dispatcher
 
             self._dispatcher = compile_dispatcher(self._function)

@@ -6,6 +6,8 @@ by it, while the memory behind it is a plain structured scalar whose fields numb
 """
 
 import zlib
+from collections.abc import Hashable
+from functools import cache
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
@@ -33,6 +35,11 @@ def layout(declaration: type) -> np.dtype[np.void]:
     numpy.dtype
         Structured type with one 8-byte aligned field per annotation, in their order.
     """
+    return _layout(cast(Hashable, declaration))
+
+
+@cache
+def _layout(declaration: Hashable) -> np.dtype[np.void]:
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for name, hint in get_type_hints(declaration, include_extras=True).items():
         if hint is float:

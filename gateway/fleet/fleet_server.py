@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -136,7 +138,7 @@ class FleetServer:
             "clients": [client for client in self._hub.clients() if client.name not in self._sites],
         }
 
-    def _metrics_text(self) -> str:
+    def _metrics_text(self) -> Iterator[str]:
         # Not above: most fleets serve no metrics, and need not wait for the library.
         from gateway.edges.operator.hub_metrics import hub_families, text_of
         from gateway.fleet.fleet_metrics import fleet_families
@@ -144,7 +146,7 @@ class FleetServer:
         status, hub = self.status(), self._hub
         clients = tuple(status["clients"])
         about_hub = hub_families(hub.counters(), hub.listeners(), clients, self._now_us())
-        return text_of([*fleet_families(status), *about_hub])
+        return text_of(chain(fleet_families(status), about_hub))
 
     def _set_id(self, params: IdParams) -> list[str]:
         if not SITE_NAME.fullmatch(params.site):

@@ -173,7 +173,7 @@ class Fanout:
         if self._is_metered:
             self.meter(key_of(frame), message_id, 1, len(frame))
         sequence = sequence_of(frame)
-        copies = {0: self._seal(frame, sequence)}
+        copies: dict[int, bytes] = {}
         for lane in plan.due(now_us) if plan.limited else plan.open:
             skipped = lane.stamp.skipped
             if skipped not in copies:

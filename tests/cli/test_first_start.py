@@ -1,6 +1,7 @@
 """What the first start shows, and what helps at the prompt."""
 
 import io
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 
@@ -9,7 +10,7 @@ from rich.console import Console
 
 from gateway.cli.app import app
 from gateway.cli.support import warm_up
-from gateway.cli.support.warm_up import ENTRY_POINTS, make_ready
+from gateway.cli.support.warm_up import ENTRY_POINTS, SCANNER, make_ready
 from gateway.compiled.entry_point import EntryPoint
 
 pytestmark = pytest.mark.io
@@ -33,9 +34,10 @@ class Compiler:
     ) -> None:
         while_waiting()
         entry_points = [entry_point for share in shares for entry_point in share]
-        [name] = [n for n, known in ENTRY_POINTS.items() if set(known) == set(entry_points)]
-        self.asked.append(("apart", name))
-        self.kept.add(name)
+        names = [n for n, known in ENTRY_POINTS.items() if set(known) <= set(entry_points)]
+        assert {point for n in names for point in ENTRY_POINTS[n]} == set(entry_points)
+        self.asked += [("apart", name) for name in names]
+        self.kept.update(names)
 
     def behind(self, _work: object, names: Iterable[str]) -> None:
         self.asked += [("behind", name) for name in names]
@@ -63,22 +65,48 @@ def test_the_first_start_waits_for_the_chosen_estimator_alone(
     console = Console(file=shown, force_terminal=is_terminal, width=100)
     monkeypatch.setattr(warm_up, "console_of", lambda **_: console)
     make_ready("eskf")
-    others = [("behind", name) for name in ENTRY_POINTS if name != "eskf"]
-    assert compiler.asked == [("apart", "eskf"), ("here", "eskf"), *others]
+    first = [(where, name) for where in ("apart", "here") for name in ("eskf", SCANNER)]
+    others = [("behind", name) for name in ENTRY_POINTS if name not in ("eskf", SCANNER)]
+    assert compiler.asked == [*first, *others]
     assert ("compiling the estimator" in shown.getvalue()) == is_terminal
 
 
 def test_others_that_are_missing_are_not_waited_for(compiler: Compiler) -> None:
-    compiler.kept.update({"complementary", "paper"})
+    compiler.kept.update({"complementary", "paper", SCANNER})
     make_ready("complementary")
-    assert compiler.asked == [("here", "complementary"), ("behind", "eskf")]
+    here = [("here", name) for name in ("complementary", SCANNER)]
+    assert compiler.asked == [*here, ("behind", "eskf")]
+
+
+def test_every_aircraft_with_an_estimator_of_its_own_has_it_at_the_start(
+    compiler: Compiler,
+) -> None:
+    make_ready("complementary", "eskf")
+    chosen = {"complementary", "eskf", SCANNER}
+    assert {name for where, name in compiler.asked if where == "apart"} == chosen
+    assert {name for where, name in compiler.asked if where == "here"} == chosen
+    assert compiler.asked[-1] == ("behind", "paper")
+
+
+def test_the_gateway_holds_no_machine_code_that_is_not_made_ready() -> None:
+    """What it may call while telemetry flows; whole recordings are fused by other commands."""
+    tell = (
+        "import gc, gateway.cli.live.run;"
+        "from gateway.compiled.entry_point import EntryPoint;"
+        "points = {p for p in gc.get_objects() if isinstance(p, EntryPoint)};"
+        "from gateway.cli.support.warm_up import ENTRY_POINTS;"
+        "ready = {p for points in ENTRY_POINTS.values() for p in points};"
+        "print(*sorted(p.__name__ for p in points - ready), len(ready))"
+    )
+    done = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["run", "run", "10"]
 
 
 def test_a_later_start_shows_nothing(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler.kept.update(ENTRY_POINTS)
     monkeypatch.setattr(warm_up, "console_of", lambda **_: pytest.fail("a clock"))
     make_ready("paper")
-    assert compiler.asked == [("here", "paper")]
+    assert compiler.asked == [("here", "paper"), ("here", SCANNER)]
 
 
 @pytest.mark.parametrize(

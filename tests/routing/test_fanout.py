@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.records import ClientInterval
 from gateway.routing.endpoint import parse_endpoint
 from gateway.routing.fanout import MAX_PLANS, Fanout
-from gateway.wire.mavlink_splitter import split_datagram
+from gateway.wire.mavlink_splitter import restamp, split_datagram
 
 ATTITUDE_ID = 30
 
@@ -71,6 +71,23 @@ def test_late_and_early_leavers(fanout: Fanout, vehicle: Vehicle) -> None:
     fanout.remove(99)
     fanout.publish(vehicle.attitude(), 0)
     assert (len(first.frames), len(second.frames)) == (2, 2)
+
+
+def test_a_frame_is_sealed_once_for_all_that_get_the_same(vehicle: Vehicle) -> None:
+    sealed: list[int] = []
+
+    def seal(frame: bytes, sequence: int) -> bytes:
+        sealed.append(sequence)
+        return restamp(frame, sequence)
+
+    fanout = Fanout(seal)
+    fanout.publish(vehicle.attitude(), 0)
+    assert sealed == [], "nobody gets it"
+    outlets = [Outlet(fanout, client_id, "?deny=0") for client_id in range(3)]
+    fanout.publish(vehicle.heartbeat(), 0)
+    fanout.publish(vehicle.attitude(), 0)
+    assert [outlet.sequences() for outlet in outlets] == [[1]] * 3
+    assert sealed == [1]
 
 
 def test_an_outlet_may_leave_while_it_is_sent_to(fanout: Fanout, vehicle: Vehicle) -> None:

@@ -20,6 +20,7 @@ from gateway.cli.support.settings_options import (
     read_aircraft,
 )
 from gateway.cli.support.warm_up import make_ready
+from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.operator.keyboard import Keyboard
@@ -68,8 +69,9 @@ def run_gateway(
         return with_endpoints(settings, endpoint)
 
     settings = or_refuse(read)
-    make_ready(settings.estimation.estimator)
     aircraft = read_aircraft(settings)
+    own = {one.estimation.estimator for one in aircraft.values()}
+    make_ready(settings.estimation.estimator, *own - {settings.estimation.estimator})
     page = PanelProcess(config) if panel or settings.panel.enabled else None
     asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
 
@@ -108,18 +110,19 @@ async def serve(
     gc.collect()
     gc.freeze()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
-    daemon.start()
-    if panel is not None:
-        panel.start(daemon.control_socket)
-    try:
-        if view is None:
-            await _log_lines(daemon, stopped)
-        else:
-            await _live_view(daemon, view, stopped, panel)
-    finally:
+    with nothing_compiled():
+        daemon.start()
         if panel is not None:
-            panel.close()
-        daemon.close()
+            panel.start(daemon.control_socket)
+        try:
+            if view is None:
+                await _log_lines(daemon, stopped)
+            else:
+                await _live_view(daemon, view, stopped, panel)
+        finally:
+            if panel is not None:
+                panel.close()
+            daemon.close()
 
 
 def _open_view() -> "LiveView":

@@ -17,6 +17,7 @@ from gateway.estimation.complementary.complementary_kernels import KERNELS as CO
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper.paper_entry import step_live
 from gateway.estimation.select import EstimationSettings
+from gateway.flightlog.tlog.tlog_scan import scan_at
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 
@@ -24,50 +25,55 @@ log = logging.getLogger(__name__)
 
 REHEARSAL_US: Final = 100_000
 SAMPLE_US: Final = 10_000
+SCANNER: Final = "the reader of tlogs"
+"""Shifts the times of a recording, once GPS tells the time."""
 ENTRY_POINTS: Final[dict[str, tuple[EntryPoint[...], ...]]] = {
     "paper": (step_live,),
     "complementary": COMPLEMENTARY.live,
     "eskf": ESKF.live,
+    SCANNER: (scan_at,),
 }
-"""The machine code that each estimator needs, the largest first."""
+"""The machine code that each estimator needs, the largest first, and what every gateway needs."""
 BEHIND: Final = 10
 """Niceness of the process that compiles while telemetry runs."""
 
 
-def is_kept(estimator: str) -> bool:
-    """Return whether the machine code of an estimator is on disk."""
-    return all(entry_point.is_kept for entry_point in ENTRY_POINTS[estimator])
+def is_kept(name: str) -> bool:
+    """Return whether the machine code of an estimator, or of the scanner, is on disk."""
+    return all(entry_point.is_kept for entry_point in ENTRY_POINTS[name])
 
 
-def make_ready(estimator: str) -> None:
-    """Load or compile an estimator in this process, and compile the others in the background.
+def make_ready(*estimators: str) -> None:
+    """Load or compile estimators in this process, and compile the others in the background.
 
     The machine code is cached beside the source, so only the first start after an upgrade
-    compiles: the chosen estimator first, and then the others in a separate process while telemetry
+    compiles: the chosen estimators first, and then the others in a separate process while telemetry
     runs, since a ground station may choose one in flight, when compiling would interrupt the
     attitude for seconds; loading one from disk takes some hundredths of a second. This process
     never imports the compiler, which needs more memory than everything else together.
 
     Parameters
     ----------
-    estimator : str
-        Name of the one in the settings.
+    *estimators : str
+        Names of those in the settings.
     """
     missing = [name for name in ENTRY_POINTS if not is_kept(name)]
-    if estimator in missing:
-        log.info("compiling the estimator %s, this once; later starts take a second", estimator)
+    if chosen := [name for name in missing if name in (*estimators, SCANNER)]:
+        log.info("compiling %s, this once; later starts take a second", " and ".join(chosen))
         begin = time.monotonic()
         with _clock() as show:
             # In separate processes, because the compiler's memory is never freed; this one reads
             # the cache. The largest entry point takes as long as all others together.
-            largest, *others = ENTRY_POINTS[estimator]
-            run_copies(_compile, [[largest], others], show)
+            largest = [ENTRY_POINTS[name][0] for name in chosen if name != SCANNER]
+            others = [point for name in chosen for point in ENTRY_POINTS[name]]
+            shares = [largest, [point for point in others if point not in largest]]
+            run_copies(_compile, filter(None, shares), show)
         log.info("compiled in %.0f s", time.monotonic() - begin)
-        missing.remove(estimator)
-    _rehearse(estimator)
-    if missing:
-        log.info("compiling %s for a later choice, behind the telemetry", " and ".join(missing))
-        begin_copy(_compile_behind, missing)
+    for name in (*estimators, SCANNER):
+        _rehearse(name)
+    if behind := [name for name in missing if name not in chosen]:
+        log.info("compiling %s for a later choice, behind the telemetry", " and ".join(behind))
+        begin_copy(_compile_behind, behind)
 
 
 @contextmanager
@@ -102,6 +108,10 @@ def _compile_behind(names: Iterable[str]) -> None:
 
 
 def _rehearse(name: str) -> None:
+    """Load here what is cached, or could not be."""
+    if name == SCANNER:
+        scan_at.prepare()
+        return
     settings = AircraftSettings(estimation=EstimationSettings(estimator=name))
     pipeline = Pipeline(PipelineSettings(settings))
     for record in _at_rest():

@@ -39,9 +39,9 @@ CLIENT_COUNTERS: Final = (
 )
 
 
-def text_of(found: Iterable[Metric]) -> str:
-    """Write families in the Prometheus text format."""
-    return generate_latest(_Moment(found)).decode()
+def text_of(found: Iterable[Metric]) -> Iterator[str]:
+    """Write families in the Prometheus text format, and yield them one by one."""
+    return (generate_latest(_Moment([family])).decode() for family in found)
 
 
 def gauge(name: str, text: str, labels: Labels, samples: Iterable[Sample]) -> Metric:

@@ -94,7 +94,7 @@ FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
 )
 
 
-def prometheus_text(snapshot: Snapshot) -> str:
+def prometheus_text(snapshot: Snapshot) -> Iterator[str]:
     """Write a snapshot in the Prometheus text format.
 
     Parameters
@@ -102,10 +102,10 @@ def prometheus_text(snapshot: Snapshot) -> str:
     snapshot : Snapshot
         The daemon's state now.
 
-    Returns
-    -------
+    Yields
+    ------
     str
-        One line per sample, with help and type before each family.
+        One family: its help and type, then one line per sample.
     """
     return text_of(families(snapshot))
 

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from gateway.edges.reasons import reason_of
@@ -25,10 +25,10 @@ class MetricsServer:
     Parameters
     ----------
     text : callable
-        Returns the present metrics, as `metric_families.text_of` writes them.
+        Returns the present metrics in pieces, as `hub_metrics.text_of` writes them.
     """
 
-    def __init__(self, text: Callable[[], str]) -> None:
+    def __init__(self, text: Callable[[], Iterator[str]]) -> None:
         self._text = text
         self._wanted = 0
         self._reason = ""
@@ -118,15 +118,20 @@ class MetricsServer:
                         if not data:
                             return
                         request += data
-                    await loop.sock_sendall(connection, self._respond(request))
+                    await loop.sock_sendall(connection, await self._respond(request))
             except (OSError, TimeoutError) as error:
                 log.debug("metrics request failed: %s", error)
 
-    def _respond(self, request: bytes) -> bytes:
+    async def _respond(self, request: bytes) -> bytes:
         words = request.split()
         if words[:1] != [b"GET"]:
             return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
-        body = self._text().encode()
+        pieces = []
+        for piece in self._text():
+            pieces.append(piece.encode())
+            # All of them take some milliseconds, so telemetry goes on between two.
+            await asyncio.sleep(0)
+        body = b"".join(pieces)
         head = (
             f"HTTP/1.1 200 OK\r\nContent-Type: {CONTENT_TYPE}\r\n"
             f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"

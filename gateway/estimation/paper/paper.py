@@ -154,6 +154,8 @@ class PaperEstimator:
         reference: ReferenceSettings,
         rest: RestSettings,
     ) -> None:
+        # Before a sample waits for it.
+        step_live.prepare()
         self._settings = settings
         self._reference = reference
         self._rest = filled_record(RestGains, rest_gains(rest))

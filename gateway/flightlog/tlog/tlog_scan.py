@@ -177,7 +177,7 @@ def scan(
     arrays = (extra, records, damage, found)
     flags = final * _FINAL | strict * _STRICT | in_step * _IN_STEP
     places = [address_of(array) for array in (data, *arrays)]
-    _scan_at(len(data), records.shape[1], flags, *places)
+    scan_at(len(data), records.shape[1], flags, *places)
     at, count, damaged, in_step_now = found.tolist()
     return (at, count, damaged, bool(in_step_now))
 
@@ -247,4 +247,4 @@ def _walk(
     return (at, count, damaged, in_step)
 
 
-_scan_at: Final = EntryPoint(scan_entry)
+scan_at: Final = EntryPoint(scan_entry)

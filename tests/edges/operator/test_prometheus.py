@@ -3,6 +3,7 @@
 import asyncio
 import dataclasses
 import socket
+from collections.abc import Iterator
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -73,6 +74,7 @@ SNAPSHOT = Snapshot(
     aircraft=(AircraftStatus(1, FIX, Way(47.0, 8.0, 500.0, 120.0, 90.0), None, (BOARD,)),),
 )
 PORT = '{endpoint="tcp-listen:0.0.0.0:1?name=here",name="here"}'
+TEXT = "".join(prometheus_text(SNAPSHOT))
 LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
 
 
@@ -109,12 +111,12 @@ LABELS = '{client="7",name="the \\"tablet\\"",remote="10.0.0.7:14550"}'
     ],
 )
 def test_samples(line: str) -> None:
-    assert line in prometheus_text(SNAPSHOT).splitlines()
+    assert line in TEXT.splitlines()
 
 
 def test_every_family_is_declared_once_before_its_samples() -> None:
     declared: list[str] = []
-    for line in prometheus_text(SNAPSHOT).splitlines():
+    for line in TEXT.splitlines():
         if line.startswith("# TYPE"):
             declared.append(line.split()[2])
         elif not line.startswith("#"):
@@ -123,7 +125,7 @@ def test_every_family_is_declared_once_before_its_samples() -> None:
 
 
 def test_what_is_not_known_is_left_out() -> None:
-    text = prometheus_text(dataclasses.replace(SNAPSHOT, states=((1, NOTHING),)))
+    text = "".join(prometheus_text(dataclasses.replace(SNAPSHOT, states=((1, NOTHING),))))
     assert "NaN" not in text
     assert "mavgate_vehicle_latitude_degrees{" not in text
     assert 'mavgate_vehicle_valid{quantity="position",vehicle="1"} 0.0' in text
@@ -131,7 +133,7 @@ def test_what_is_not_known_is_left_out() -> None:
 
 def test_another_program_reads_it() -> None:
     """Every family of the text, as Prometheus' own reader understands it."""
-    read = list(text_string_to_metric_families(prometheus_text(SNAPSHOT)))
+    read = list(text_string_to_metric_families(TEXT))
     assert {family.type for family in read} == {"counter", "gauge"}
     assert all(len(family.documentation) > 10 for family in read)
     names = {s.labels["name"] for f in read if f.name == "mavgate_client_open" for s in f.samples}
@@ -154,7 +156,7 @@ class TestServer:
         head, _, body = answer.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200 OK")
         assert f"Content-Length: {len(body)}".encode() in head
-        assert body.decode() == prometheus_text(SNAPSHOT)
+        assert body.decode() == TEXT
         assert (await self.ask(server.port, b"POST / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 405")
         port = server.port
         server.close()
@@ -162,6 +164,22 @@ class TestServer:
         assert server.port == 0
         with pytest.raises(ConnectionRefusedError):
             await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
+
+    async def test_the_loop_goes_on_between_two_families(self) -> None:
+        called: list[int] = []
+        before: list[int] = []
+
+        def text() -> Iterator[str]:
+            for family in prometheus_text(SNAPSHOT):
+                before.append(len(called))
+                asyncio.get_running_loop().call_soon(called.append, len(before))
+                yield family
+
+        server = MetricsServer(text)
+        server.listen(_free_port())
+        await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n")
+        server.close()
+        assert before == list(range(TEXT.count("# TYPE")))
 
     async def test_zero_serves_none(self) -> None:
         server = MetricsServer(lambda: prometheus_text(SNAPSHOT))

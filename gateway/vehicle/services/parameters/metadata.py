@@ -6,12 +6,18 @@ References
 """
 
 import json
+from functools import cache
 from typing import Any, Final
 
 from gateway import __version__
+from gateway.settings import Settings
 from gateway.vehicle.dialect import ComponentMetadata
 from gateway.vehicle.services.ftp import crc32
-from gateway.vehicle.services.parameters.parameters import Parameter, ParameterTable
+from gateway.vehicle.services.parameters.parameters import (
+    Parameter,
+    ParameterTable,
+    parameters_of,
+)
 from gateway.vehicle.telemetry.messages import boot_ms
 
 GENERAL_PATH: Final = "/general.json"
@@ -24,23 +30,7 @@ class Metadata:
     """The metadata files of one vehicle."""
 
     def __init__(self, table: ParameterTable) -> None:
-        described = [_describe(parameter) for parameter in table.parameters]
-        self._parameters = _json({"version": 1, "parameters": described})
-        self._general = _json(
-            {
-                "version": 1,
-                "vendorName": "mavgate",
-                "modelName": "mavgate tracker",
-                "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
-                "metadataTypes": [
-                    {
-                        "type": TYPE_PARAMETER,
-                        "uri": f"mftp://{PARAMETER_PATH}",
-                        "fileCrc": crc32(self._parameters),
-                    }
-                ],
-            }
-        )
+        self._general, self._parameters = _files(table.kinds)
 
     def general(self) -> bytes:
         """Return the file that lists the others."""
@@ -54,6 +44,27 @@ class Metadata:
         """Encode COMPONENT_METADATA."""
         uri = f"mftp://{GENERAL_PATH}".encode()
         return ComponentMetadata(boot_ms(now_us), crc32(self._general), uri)
+
+
+@cache
+def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[bytes, bytes]:
+    """Write the two files, once for all vehicles."""
+    described = [_describe(parameter) for parameter in parameters_of(kinds)]
+    parameters = _json({"version": 1, "parameters": described})
+    general = {
+        "version": 1,
+        "vendorName": "mavgate",
+        "modelName": "mavgate tracker",
+        "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
+        "metadataTypes": [
+            {
+                "type": TYPE_PARAMETER,
+                "uri": f"mftp://{PARAMETER_PATH}",
+                "fileCrc": crc32(parameters),
+            }
+        ],
+    }
+    return _json(general), parameters
 
 
 def _describe(parameter: Parameter) -> dict[str, Any]:

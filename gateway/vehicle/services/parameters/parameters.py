@@ -10,6 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -130,20 +131,12 @@ class ParameterTable:
 
     def __init__(self, sections: Mapping[str, Settings]) -> None:
         self.sections = dict(sections)
-        self.parameters = tuple(
-            sorted(
-                (p for key, tree in sections.items() for p in _walk(key, tree)),
-                key=lambda parameter: parameter.name,
-            )
-        )
-        self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
+        self.kinds = tuple((key, type(tree)) for key, tree in sections.items())
+        self.parameters = parameters_of(self.kinds)
+        self.index = {p.name: n for n, p in enumerate(self.parameters)}
         # As they were set: a matrix alone would give others, where the pitch is a right angle or
         # only some of the three have been set yet.
-        self.index = {p.name: n for n, p in enumerate(self.parameters)}
-        if len(self.index) < len(self.parameters):
-            names = [p.name for p in self.parameters]
-            twice = sorted({name for name in names if names.count(name) > 1})
-            raise ValueError(f"parameter names used twice: {', '.join(twice)}")
+        self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
 
     def number(self, parameter: Parameter) -> float:
         """Read a parameter."""
@@ -193,13 +186,36 @@ class ParameterTable:
         return angles if matrix == value else euler_deg_from_matrix(value)
 
 
-def _walk(section: str, tree: Settings, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
-    fields = fields_of(type(tree))
+@cache
+def parameters_of(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[Parameter, ...]:
+    """List the parameters of some classes of settings, in the order of their names.
+
+    They are worked out once, which takes some milliseconds, and shared by all vehicles.
+
+    Parameters
+    ----------
+    kinds : tuple
+        Key and class of each section.
+
+    Raises
+    ------
+    ValueError
+        If two settings would share a name.
+    """
+    found = [parameter for key, kind in kinds for parameter in _walk(key, kind)]
+    names = Counter(parameter.name for parameter in found)
+    if twice := sorted(name for name, count in names.items() if count > 1):
+        raise ValueError(f"parameter names used twice: {', '.join(twice)}")
+    return tuple(sorted(found, key=lambda parameter: parameter.name))
+
+
+def _walk(section: str, kind: type[Settings], path: tuple[str, ...] = ()) -> Iterator[Parameter]:
+    fields = fields_of(kind)
     bare_keys = Counter(without_unit(field.name) for field in fields)
     for field in fields:
         inner = (*path, field.name)
         if field.section is not None:
-            yield from _walk(section, getattr(tree, field.name), inner)
+            yield from _walk(section, field.section, inner)
             continue
         group = path[-1] if path else section
         default = field.default

@@ -211,6 +211,13 @@ def test_the_defaults_leave_alone_what_is_no_parameter() -> None:
     assert fresh == VehicleSettings(signing_passphrase="correct horse")
 
 
+def test_a_second_vehicle_costs_no_second_walk_through_the_settings() -> None:
+    first, second = (ParameterTable({"vehicle": VehicleSettings()}) for _ in range(2))
+    assert first.parameters is second.parameters
+    first.change(first.parameters[first.index["RATE_ATT"]], 7.0)
+    assert second.sections == {"vehicle": VehicleSettings()}
+
+
 def test_two_settings_of_one_name_are_a_fault_of_the_caller() -> None:
     class Twice(Settings, frozen=True):
         """Two keys that differ beyond sixteen characters."""
