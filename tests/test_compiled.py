@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,13 +14,14 @@ import numpy as np
 import pytest
 
 from gateway.compiled import address_of, array_at, compiled, compiled_with, digest_of
-from gateway.compiled.compiler import compile_dispatcher
+from gateway.compiled.compiler import compile_dispatcher, compile_entry
 from gateway.compiled.entry_point import (
     EntryPoint,
     NotCompiledError,
     dispatched,
     nothing_compiled,
 )
+from gateway.compiled.machine_code import keep_code
 from gateway.estimation.complementary.complementary_kernels import KERNELS
 
 FLOAT = np.dtype(np.float64)
@@ -121,16 +123,37 @@ def test_an_entry_point_may_not_allocate(folder: Path) -> None:
 
 
 @pytest.mark.io
-def test_what_is_kept_is_loaded_without_numba() -> None:
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no linker")
+def test_what_is_kept_is_loaded_without_numba_and_llvm() -> None:
     for entry in KERNELS.live:
         entry.prepare()
     tell = (
         "import sys; from gateway.estimation.select import EstimationSettings, make_estimator;"
         "make_estimator(EstimationSettings(estimator='complementary'));"
-        "print('numba' in sys.modules)"
+        "print({'numba', 'llvmlite'} & {*sys.modules})"
     )
     other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
-    assert other.stdout == "False\n"
+    assert other.stdout == "set()\n"
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("linker", [None, "/bin/false"])
+def test_what_cannot_be_linked_is_loaded_by_llvm(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, linker: str | None
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda _: linker)
+    assert compile_entry(compiled(scale)).shared is None
+    assert use(EntryPoint(scale)) == [3.25, 7.75]
+    assert use(EntryPoint(scale)) == [3.25, 7.75]
+
+
+@pytest.mark.io
+def test_what_the_system_does_not_load_is_loaded_by_llvm(folder: Path) -> None:
+    use(EntryPoint(scale))
+    kept = compile_entry(compiled(scale))
+    name, digest = f"{__name__}.scale", digest_of(scale)
+    keep_code(name, digest, kept._replace(shared=b"no library"))
+    assert use(EntryPoint(scale)) == [3.25, 7.75]
 
 
 @pytest.mark.io

@@ -4,9 +4,13 @@ Imported only when there is something to compile: numba takes 60 MB and a quarte
 """
 
 import hashlib
-from collections.abc import Callable
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable
 from functools import cache
 from inspect import signature
+from pathlib import Path
 from types import FunctionType
 from typing import Any, Final
 
@@ -17,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic, overload, typeof_impl
 
 from gateway.compiled import array_at, digest_of, is_compiled
-from gateway.compiled.machine_code import MachineCode, target_machine
+from gateway.compiled.machine_code import ENTRY, MachineCode
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
 """Offline fusion of a log must give exactly what it gave live."""
@@ -46,11 +50,55 @@ def compile_entry(function: Callable[..., None]) -> MachineCode:
     arguments = [TYPES[p.annotation] for p in signature(function).parameters.values()]
     entry = numba.cfunc(types.void(*arguments), **STRICT)(function)
     module = llvm.parse_assembly(entry.inspect_llvm())
-    helpers = [f.name for f in module.functions if f.is_declaration]
-    helpers = [name for name in helpers if name.startswith(("NRT_", "Py", "numba_"))]
-    if any("alloc" in name.lower() for name in helpers):
+    if any("alloc" in name.lower() for name in _helpers(module.functions)):
         raise TypeError(f"{function.__qualname__} allocates, which an entry point may not")
-    return MachineCode(entry.native_name, helpers, target_machine().emit_object(module))
+    _isolate(module, entry.native_name)
+    relocatable = _target_machine().emit_object(module)
+    return MachineCode(relocatable, _link(relocatable))
+
+
+def _helpers(values: Iterable[Any]) -> list[str]:
+    """List the symbols of numba and Python that code needs; they are only used to raise."""
+    missing = (value.name for value in values if value.is_declaration)
+    return [name for name in missing if name.startswith(("NRT_", "Py", "numba_"))]
+
+
+def _isolate(module: Any, entry: str) -> None:
+    """Make the code need no more than the C library: what would raise, stops the process."""
+    stubs = [f'target triple = "{module.triple}"', "declare void @llvm.trap()"]
+    stubs += [
+        f"define void @{name}() {{ call void @llvm.trap() unreachable }}"
+        for name in _helpers(module.functions)
+    ]
+    stubs += [f"@{name} = global i64 0" for name in _helpers(module.global_variables)]
+    module.link_in(llvm.parse_assembly("\n".join(stubs)))
+    for value in (*module.functions, *module.global_variables):
+        if value.name == entry:
+            value.name = ENTRY
+        elif not value.is_declaration:
+            value.linkage = "internal"
+
+
+@cache
+def _target_machine() -> Any:
+    """Return LLVM's description of any processor of this kind."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(opt=3, reloc="pic", codemodel="small")
+
+
+def _link(relocatable: bytes) -> bytes | None:
+    """Make a library of an object file, if there is a linker."""
+    linker = shutil.which("cc")
+    if linker is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder, "entry.o"), Path(folder, "entry.so")
+        source.write_bytes(relocatable)
+        command = [linker, "-shared", "-nostartfiles", "-s", "-o", str(target), str(source), "-lm"]
+        done = subprocess.run(command, capture_output=True, check=False)
+        return target.read_bytes() if done.returncode == 0 else None
 
 
 def compile_dispatcher(function: Callable[..., Any]) -> Callable[..., Any]:

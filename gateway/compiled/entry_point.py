@@ -9,6 +9,7 @@ from inspect import signature
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 from gateway.compiled import compiled, digest_of
+from gateway.compiled.machine_code import keep_code, kept_code, load_code
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -70,19 +71,15 @@ class EntryPoint(Generic[Parameters]):
         """Whether its machine code is cached, or not needed."""
         if INTERPRETED:
             return True
-        # Imported late, here and below, because LLVM takes 40 MB.
-        from gateway.compiled.machine_code import kept_code
-
         return kept_code(self._name, digest_of(self._function)) is not None
 
     def _load(self) -> Callable[..., None]:
-        from gateway.compiled.machine_code import keep_code, kept_code, load_code
-
         name, digest = self._name, digest_of(self._function)
         code = kept_code(name, digest)
         if code is None:
             if not _may_compile:
                 raise NotCompiledError(f"{name} is not compiled yet")
+            # Imported late, here and below: numba takes 60 MB.
             from gateway.compiled.compiler import compile_entry
 
             code = compile_entry(self._function)

@@ -1,6 +1,6 @@
-"""A cache of machine code on disk, loaded by LLVM without numba in some milliseconds.
+"""A cache of machine code on disk, loaded without numba in some milliseconds.
 
-A file's name contains a digest of the sources, versions and processor that its code was compiled
+A file's name contains a digest of the sources, versions and platform that its code was compiled
 from and for, and its first bytes are a digest of its content: damaged or foreign files are ignored.
 """
 
@@ -8,53 +8,39 @@ import contextlib
 import ctypes
 import hashlib
 import os
-import platform
 import sys
 import tempfile
 from collections.abc import Iterator
 from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import llvmlite.binding as llvm
 import msgspec
 
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 READABLE: Final = 0o644
 
 
+ENTRY: Final = "entry"
+"""The function's symbol."""
+
+
 class MachineCode(NamedTuple):
-    """A relocatable object that holds one function."""
+    """One function, for any processor of this platform."""
 
-    symbol: str
-    """The function's."""
-    helpers: list[str]
-    """Symbols of numba and Python that are called only to raise: no entry point raises."""
-    content: bytes
-
-
-@cache
-def target_machine() -> Any:
-    """Return LLVM's description of this processor."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(),
-        features=llvm.get_host_cpu_features().flatten(),
-        opt=3,
-        reloc="static" if platform.machine() in {"x86_64", "i686"} else "default",
-        codemodel="jitdefault",
-        jit=True,
-    )
+    relocatable: bytes
+    """An object file, which LLVM loads."""
+    shared: bytes | None
+    """The same as a library, which the system loads: LLVM takes 40 MB. None without a linker."""
 
 
 @cache
 def _made_for() -> str:
-    features = llvm.get_host_cpu_features().flatten()
-    here = (llvm.get_process_triple(), llvm.get_host_cpu_name(), features, sys.version)
     compiler = Path(__file__).with_name("compiler.py").read_text()
-    return repr((here, version("numba"), version("llvmlite"), compiler))
+    here = (EXTENSION_SUFFIXES[0], sys.version, version("numba"), version("llvmlite"))
+    return repr((here, compiler))
 
 
 def _file(folder: Path, name: str, digest: str) -> Path:
@@ -119,19 +105,32 @@ def keep_code(name: str, digest: str, code: MachineCode) -> None:
             return
 
 
+def load_code(code: MachineCode) -> int:
+    """Load machine code into this process for good, and return the address of its function."""
+    if code.shared is not None:
+        # It may be forbidden to execute what lies there.
+        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(suffix=".so") as file:
+            file.write(code.shared)
+            file.flush()
+            function = ctypes.CDLL(file.name)[ENTRY]
+            return ctypes.cast(function, ctypes.c_void_p).value or 0
+    return _load_by_llvm(code.relocatable)
+
+
 _ENGINES: Final[list[Any]] = []
 """Their code is valid as long as they live."""
 
 
-def load_code(code: MachineCode) -> int:
-    """Load machine code into this process, and return the address of its function."""
-    helpers = llvm.parse_assembly("\n".join(f"declare void @{name}()" for name in code.helpers))
-    engine = llvm.create_mcjit_compiler(helpers, target_machine())
-    abort = ctypes.cast(ctypes.CDLL(None).abort, ctypes.c_void_p).value
-    for helper in helpers.functions:
-        engine.add_global_mapping(helper, abort)
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code.content))
+def _load_by_llvm(relocatable: bytes) -> int:
+    # Imported late, because most gateways need none.
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(relocatable))
     engine.finalize_object()
     _ENGINES.append(engine)
-    address: int = engine.get_function_address(code.symbol)
+    address: int = engine.get_function_address(ENTRY)
     return address
