@@ -23,7 +23,13 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 NAN = math.nan
 
 
-def feed(state: AlignmentState, attitude: Rotation, seed: int, noise_mps: float = 0.0) -> None:
+def feed(
+    state: AlignmentState,
+    attitude: Rotation,
+    seed: int,
+    noise_mps: float = 0.0,
+    pull_mps2: float = 3.0,
+) -> None:
     """Ten seconds of accelerations, seen in a frame that lies in NED by `attitude`."""
     rng = np.random.default_rng(seed)
     state.pair_s = -1e9
@@ -31,7 +37,7 @@ def feed(state: AlignmentState, attitude: Rotation, seed: int, noise_mps: float 
     for k in range(50):
         told = vel + rng.normal(0.0, noise_mps, 3) if noise_mps else vel
         align_by_velocity(state, 0.2 * k, tuple(told), tuple(force_i), 0.2)
-        accel = rng.normal(0.0, 3.0, 3)
+        accel = rng.normal(0.0, pull_mps2, 3)
         vel = vel + 0.2 * accel
         force_n = accel - [0.0, 0.0, STANDARD_GRAVITY_MPS2]
         force_i = force_i + 0.2 * attitude.inv().apply(force_n)
@@ -54,13 +60,26 @@ def test_the_standard_deviations_are_honest() -> None:
         state = new_record(AlignmentState)
         feed(state, attitude, seed, 0.2)
         q = solve_alignment(state)
-        stds = alignment_std(state, misfit(state, q))
+        stds = alignment_std(state, misfit(state, q), 0.0)
         true = tuple(attitude.as_quat(scalar_first=True))
         # The same vector in the body stands for the vertical of both.
         level.append(level_difference(q, true) / stds[0])
         heading.append(heading_difference(q, true) / stds[1])
     assert 0.2 < np.sqrt(np.mean(np.square(level))) < 1.2
     assert 0.2 < np.sqrt(np.mean(np.square(heading))) < 1.2
+
+
+def test_a_doubtful_bias_makes_the_heading_doubtful_and_the_more_the_less_pulls() -> None:
+    """A frame that drifts off level lets gravity pass for a pull."""
+    found = []
+    for pull_mps2 in (3.0, 0.3):
+        state = new_record(AlignmentState)
+        feed(state, Rotation.identity(), 1, pull_mps2=pull_mps2)
+        known, doubtful = (alignment_std(state, 1.0, math.radians(b))[1] for b in (0.0, 0.6))
+        found.append(math.sqrt(doubtful**2 - known**2))
+    # Half a degree a second for ten seconds is a tilt of 1.7 deg rms, which is 0.3 m/s2.
+    assert math.radians(2.0) < found[0] < math.radians(10.0)
+    assert found[1] > 5.0 * found[0]
 
 
 def test_gravity_tells_the_level_alone() -> None:
@@ -70,7 +89,7 @@ def test_gravity_tells_the_level_alone() -> None:
     force = attitude.inv().apply([0.0, 0.0, -STANDARD_GRAVITY_MPS2])
     for k in range(30):
         align_by_gravity(state, 0.1 * k, tuple(force * 0.1 * k), 0.1)
-    level_std, heading_std = alignment_std(state, 1.0)
+    level_std, heading_std = alignment_std(state, 1.0, 0.0)
     found = Rotation.from_quat(solve_alignment(state), scalar_first=True)
     np.testing.assert_allclose(found.apply(force), [0.0, 0.0, -STANDARD_GRAVITY_MPS2], atol=1e-6)
     assert level_std < 0.05

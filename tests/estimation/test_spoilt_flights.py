@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import GYRO, NAV_FLAGS, NAV_LAT
+from gateway.estimation.columns import GYRO, NAV_ATTITUDE_STD, NAV_FLAGS, NAV_LAT
 from gateway.records import NavFlags
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
@@ -69,6 +69,26 @@ def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
     assert tilt_deg < LIMIT_DEG
     assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
+
+
+@pytest.mark.parametrize("how", ["zero_rows", "no_height", "silence", "gyro_off", "half_rate"])
+def test_real_car(data_dir: Path, how: str) -> None:
+    """Without a compass; its engine idles before it goes, and shows the gyroscope's bias."""
+    flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
+    tilt_deg, heading_deg, place_m = off(flight, "eskf", how)
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < LIMIT_DEG
+    assert place_m < PLACE_M
+
+
+def test_a_heading_that_nothing_tells_is_not_vouched_for(data_dir: Path) -> None:
+    """Begun on a straight road: the pull of a speed of about zero is no heading."""
+    spoilt = mid_air(read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz"))
+    out, time_s = run_eskf(spoilt.flight), spoilt.flight.log.imu_time_us * 1e-6
+    straight = time_s < spoilt.ends_s + 30.0
+    flags = out[straight, NAV_FLAGS].astype(int)
+    assert not (flags & int(NavFlags.HEADING_VALID)).any()
+    assert (out[straight, NAV_ATTITUDE_STD + 2] > math.radians(50.0)).all()
 
 
 @pytest.mark.parametrize("name", RUNS)

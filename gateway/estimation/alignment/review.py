@@ -72,7 +72,7 @@ def lose(s: ReviewState) -> None:
 
 
 @compiled
-def find(s: ReviewState, q_nb: Quat) -> Quat:
+def find(s: ReviewState, q_nb: Quat, enough_rad: float = FOUND_HEADING_RAD) -> Quat:
     """Note that the attitude is known again, and tell it.
 
     Parameters
@@ -81,6 +81,8 @@ def find(s: ReviewState, q_nb: Quat) -> Quat:
         `heading_known` is 0 afterwards where the alignment tells no heading.
     q_nb : tuple of 4 floats
         The estimator's own, whose heading is kept then.
+    enough_rad : float
+        Standard deviation up to which a heading is taken.
 
     Returns
     -------
@@ -89,7 +91,7 @@ def find(s: ReviewState, q_nb: Quat) -> Quat:
     """
     s.lost, s.doubt_s = 0, 0.0
     found = as_quat(s.found_q_nb)
-    s.heading_known = 1 if s.by_gps == 1 and s.heading_std < FOUND_HEADING_RAD else 0
+    s.heading_known = 1 if s.by_gps == 1 and s.heading_std < enough_rad else 0
     if s.heading_known == 1:
         return found
     half = 0.5 * heading_difference(q_nb, found)
@@ -97,15 +99,20 @@ def find(s: ReviewState, q_nb: Quat) -> Quat:
 
 
 @compiled
-def tells_heading(s: ReviewState) -> bool:
+def tells_heading(s: ReviewState, enough_rad: float = FOUND_HEADING_RAD) -> bool:
     """Return whether a heading that is not known yet can be had from the alignment."""
-    found = s.by_gps == 1 and s.level_std < FOUND_LEVEL_RAD and s.heading_std < FOUND_HEADING_RAD
+    found = s.by_gps == 1 and s.level_std < FOUND_LEVEL_RAD and s.heading_std < enough_rad
     return bool(s.lost == 0 and s.heading_known == 0 and found)
 
 
 @compiled
 def is_to_be_taken(
-    s: ReviewState, q_nb: Quat, level_told: float, heading_told: float, dt: float
+    s: ReviewState,
+    q_nb: Quat,
+    level_told: float,
+    heading_told: float,
+    bias_radps: float,
+    dt: float,
 ) -> bool:
     """Solve the alignment after a new pair and compare it with the attitude.
 
@@ -117,6 +124,8 @@ def is_to_be_taken(
         The estimator's own attitude.
     level_told, heading_told : float
         Its standard deviations, rad.
+    bias_radps : float
+        Standard deviation of the gyroscope's bias.
     dt : float
         Length of the pair, s.
 
@@ -126,7 +135,7 @@ def is_to_be_taken(
         Whether the alignment's attitude is to take its place: see `find`.
     """
     q_ni = solve_alignment(s)
-    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni))
+    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni), bias_radps)
     write_quat(s.found_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
     if s.lost == 1:
         s.lost_s += dt

@@ -35,6 +35,8 @@ GRAVITY_NOISE_MPS2: Final = 1.0
 """Acceleration that goes unseen where gravity alone is the reference."""
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 """What the gyroscope's bias may be off."""
+RAMP_SHARE: Final = 1.0 / math.sqrt(12.0)
+"""Of what a steady drift comes to, its deviation from the mean."""
 PULL_TAU_S: Final = 3.0
 TURNING_TAU_S: Final = 20.0
 PULL_KEPT: Final = 0.7
@@ -277,7 +279,7 @@ def misfit(s: AlignmentState, q_ni: Quat) -> float:
 
 
 @compiled
-def alignment_std(s: AlignmentState, excess: float) -> tuple[float, float]:
+def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[float, float]:
     """Return how well the pairs say the level and the heading.
 
     Parameters
@@ -286,6 +288,8 @@ def alignment_std(s: AlignmentState, excess: float) -> tuple[float, float]:
         Unchanged.
     excess : float
         See `misfit`.
+    bias_radps : float
+        Standard deviation of the gyroscope's bias.
 
     Returns
     -------
@@ -303,10 +307,14 @@ def alignment_std(s: AlignmentState, excess: float) -> tuple[float, float]:
     level_var = (a + b) / level
     heading_var = UNKNOWN_RAD * UNKNOWN_RAD
     if determinant > 0.1 * level:
-        heading_var = level / determinant
+        # Where the frame drifts off level, gravity seems to pull: the less there was of real pull,
+        # the further that turns the heading.
+        off_level = bias_radps * RAMP_SHARE * s.gathered_s
+        pulled = math.sqrt(level) * off_level * off_level
+        heading_var = (excess + pulled) * level / determinant + drift
     return (
         math.sqrt(min(excess * level_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
-        math.sqrt(min(excess * heading_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
+        math.sqrt(min(heading_var, UNKNOWN_RAD * UNKNOWN_RAD)),
     )
 
 

@@ -72,7 +72,8 @@ def found_heading_std(s: ComplementaryState) -> float:
 def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     q = as_quat(s.q_nb)
-    if not is_to_be_taken(s, q, LEVEL_STD_RAD, math.sqrt(heading_variance(s)), dt):
+    heading_told = math.sqrt(heading_variance(s))
+    if not is_to_be_taken(s, q, LEVEL_STD_RAD, heading_told, 0.0, dt):
         if tells_heading(s) and s.at_rest == 0:
             forget_heading(s, p)
             turn_rad = heading_difference(as_quat(s.found_q_nb), q)

@@ -19,6 +19,8 @@ from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import multiply, normalise
 
+ENOUGH_HEADING_RAD: Final = 0.3
+"""A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
 NO_HEADING_VAR: Final = 3.0
 
@@ -77,13 +79,14 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     level_told = math.sqrt(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
     heading_told = math.sqrt(s.P[TILT + 2, TILT + 2])
-    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, dt):
-        if tells_heading(s):
+    bias = math.sqrt(0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1]))
+    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt):
+        if tells_heading(s, ENOUGH_HEADING_RAD):
             turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
             decorrelate(s.P, TILT + 2, s.heading_std * s.heading_std)
             s.heading_known = s.heading_true = 1
         return
-    write_quat(s.q_nb, find(s, as_quat(s.q_nb)))
+    write_quat(s.q_nb, find(s, as_quat(s.q_nb), ENOUGH_HEADING_RAD))
     if s.heading_known == 1:
         s.heading_true = 1
     heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else NO_HEADING_VAR
