@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,8 @@ from gateway.edges.disk.tracker_csv import read_flight
 from gateway.flightlog.table.row import TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import joined_tables
-from gateway.flights.reading import ReadOptions, aircraft_of, open_rows
+from gateway.flights.log_facts import aircraft_for
+from gateway.flights.reading import ReadOptions, open_rows
 from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain, pressure_altitude_m
 from gateway.simulator.recorded import RecordedFlight
@@ -55,14 +57,17 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     OSError
         If it cannot be read at all.
     """
-    if options.columns is None and kind_of(files[0]) is FileKind.FOREIGN:
-        return read_flight(files[0])
+    is_tracker_log = options.columns is None and kind_of(files[0]) is FileKind.FOREIGN
+    own = read_flight(files[0]) if is_tracker_log else None
     table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_of(table, options)
-    columns = np.array(_cells(table.plain_rows, aircraft), float).reshape(-1, len(COLUMNS))
+    aircraft = aircraft_for(files, table, options)
+    cells = [] if is_tracker_log else _cells(table.plain_rows, aircraft)
     for remark in table.remarks:
         log.warning(remark)
     latency_s = aircraft.estimation.reference.gps_latency_s
+    if own is not None:
+        return replace(own, gps_latency_s=latency_s)
+    columns = np.array(cells, float).reshape(-1, len(COLUMNS))
     try:
         return RecordedFlight.from_columns(dict(zip(COLUMNS, columns.T, strict=True)), latency_s)
     except ValueError as error:

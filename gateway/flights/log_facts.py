@@ -1,8 +1,11 @@
-"""GPS latency and declination of a foreign log: from its comments, else from its motion."""
+"""GPS latency and declination of a flight, by one rule for every command that fuses it.
+
+A latency that the user has set is used; else that of the log's comments; else it is estimated from
+the motion; else the default is assumed, with a remark. mavgate's own recordings keep theirs.
+"""
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,14 +16,7 @@ from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
 from gateway.estimation.alignment.gps_latency import estimate_latency
 from gateway.estimation.reference import ReferenceSettings
 from gateway.flights.flight_terms import FlightError
-from gateway.flights.joined import joined_tables
-from gateway.flights.reading import (
-    ReadOptions,
-    RecordedTable,
-    aircraft_of,
-    is_table,
-    open_rows,
-)
+from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, is_table
 from gateway.flights.smoothed import gather_samples
 
 HEAD_LINES: Final = 20
@@ -41,11 +37,12 @@ def aircraft_for(
     files : sequence of Path
         The parts of one flight.
     table : RecordedTable
-        Their rows; not read here. A remark is added if the latency is estimated or assumed.
+        Their rows. Where the latency has to be estimated they are read here, and kept for the
+        next reader; a remark tells what was found.
     options : ReadOptions
         Current settings that differ from the defaults take precedence over the log.
     given_s : float, optional
-        The GPS latency as the user gives it; it is not estimated then.
+        The GPS latency as the user gives it, s.
 
     Returns
     -------
@@ -59,16 +56,16 @@ def aircraft_for(
         If a value in a # line is out of range.
     """
     aircraft = aircraft_of(table, options)
-    if is_table(files[0]):
-        return aircraft
-    facts = facts_of(files[0])
+    facts = {} if is_table(files[0]) else facts_of(files[0])
     aircraft = with_facts(aircraft, facts)
+    if given_s is not None:
+        return with_reference(aircraft, gps_latency_s=given_s)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    known = given_s is not None or "gps_latency_s" in facts
+    known = is_table(files[0]) or "gps_latency_s" in facts
     if known or latency_s != USUAL.gps_latency_s:
         return aircraft
-    quiet = replace(options, progress=None)
-    blocks = joined_tables([open_rows(file, quiet) for file in files]).blocks
+    blocks = list(table.blocks)
+    table.blocks = iter(blocks)
     log, _ = gather_samples(blocks, aircraft)
     if len(log.gps) == 0:
         return aircraft
@@ -78,7 +75,7 @@ def aircraft_for(
     else:
         estimate = f"{found.latency_s:.3f} s +- {found.std_s:.3f} s"
         how = f"{estimate} is estimated from its manoeuvres"
-        aircraft = with_facts(aircraft, {"gps_latency_s": found.latency_s})
+        aircraft = with_reference(aircraft, gps_latency_s=found.latency_s)
     table.remarks.append(f"{files[0]}: gives no GPS latency; {how}; gps_latency_s sets it")
     return aircraft
 
@@ -101,15 +98,20 @@ def facts_of(file: Path) -> dict[str, float]:
 def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftSettings:
     """Replace default settings by values of a log; raises FlightError if one is out of range."""
     reference = aircraft.estimation.reference
+    changes: dict[str, object] = {}
     if "gps_latency_s" in facts and reference.gps_latency_s == USUAL.gps_latency_s:
-        reference = msgspec.structs.replace(reference, gps_latency_s=facts["gps_latency_s"])
+        changes["gps_latency_s"] = facts["gps_latency_s"]
     if "declination_deg" in facts and reference.declination == USUAL.declination:
-        reference = msgspec.structs.replace(
-            reference, declination="fixed", declination_deg=facts["declination_deg"]
-        )
+        changes |= {"declination": "fixed", "declination_deg": facts["declination_deg"]}
     try:
-        msgspec.convert(msgspec.to_builtins(reference), ReferenceSettings)
+        msgspec.convert(msgspec.to_builtins(reference) | changes, ReferenceSettings)
     except msgspec.ValidationError as error:
         raise FlightError(f"its # line has an invalid value: {error}") from error
+    return with_reference(aircraft, **changes)
+
+
+def with_reference(aircraft: AircraftSettings, **changes: object) -> AircraftSettings:
+    """Replace settings of `ReferenceSettings`."""
+    reference = msgspec.structs.replace(aircraft.estimation.reference, **changes)
     estimation = msgspec.structs.replace(aircraft.estimation, reference=reference)
     return msgspec.structs.replace(aircraft, estimation=estimation)

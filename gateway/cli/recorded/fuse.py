@@ -35,7 +35,7 @@ from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for
-from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, open_rows
+from gateway.flights.reading import ReadOptions, RecordedTable, open_rows
 from gateway.flights.refusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
@@ -81,8 +81,9 @@ def fuse_log(
     The columns are those of a recording's table, so every command accepts the file as one.
     Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
     ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
-    Without --config, gps_latency_s and declination_deg in such a file's # lines are used; a
-    latency that is not given there is estimated from its manoeuvres, or assumed, with a message.
+    Where the settings leave them at their defaults, gps_latency_s and declination_deg of such a
+    file's # lines are used; a latency that is not given there either is estimated from its
+    manoeuvres, or the default is assumed, with a message.
     """
     current = read_settings(config)
     with refusing():
@@ -97,11 +98,10 @@ def fuse_log(
             progress=advance,
         )
         table = joined_tables([open_rows(part, options) for part in files])
-        if config is None:
-            aircraft = aircraft_for(files, table, options, gps_latency_s)
-        else:
-            aircraft = aircraft_of(table, options)
-        aircraft = _adjusted(aircraft, estimator, gps_latency_s)
+        aircraft = aircraft_for(files, table, options, gps_latency_s)
+        if estimator is not None:
+            estimation = msgspec.structs.replace(aircraft.estimation, estimator=estimator)
+            aircraft = msgspec.structs.replace(aircraft, estimation=estimation)
         try:
             if smooth:
                 aircraft = with_smoothed_estimator(aircraft)
@@ -138,15 +138,3 @@ def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
         begin = block.comments[:1] if number == 0 else ()
         kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
         yield TableBlock(block.cells, kept)
-
-
-def _adjusted(
-    aircraft: AircraftSettings, estimator: str | None, gps_latency_s: float | None
-) -> AircraftSettings:
-    estimation = aircraft.estimation
-    if estimator is not None:
-        estimation = msgspec.structs.replace(estimation, estimator=estimator)
-    if gps_latency_s is not None:
-        reference = msgspec.structs.replace(estimation.reference, gps_latency_s=gps_latency_s)
-        estimation = msgspec.structs.replace(estimation, reference=reference)
-    return msgspec.structs.replace(aircraft, estimation=estimation)

@@ -128,11 +128,14 @@ def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
 
 @pytest.mark.io
 @pytest.mark.slow
-def test_a_latency_that_a_log_does_not_tell_is_estimated(tmp_path: Path) -> None:
+def test_a_latency_that_neither_log_nor_settings_tell_is_estimated(tmp_path: Path) -> None:
     log, out = tmp_path / "log.csv", tmp_path / "out.csv"
     flight = gzip.decompress((GOLDEN / "take_off.csv.gz").read_bytes()).decode()
     log.write_text(flight.replace("gps_latency_s=0.16", ""))
-    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out)])
+    config = tmp_path / "c.toml"
+    config.write_text('[estimation]\nestimator = "eskf"\n')
+    arguments = ["fuse", str(log), "-o", str(out), "--config", str(config)]
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     words = " ".join(result.output.split())
     told = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
