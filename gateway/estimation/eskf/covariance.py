@@ -108,12 +108,13 @@ def decay(P: FloatArray, k: int, kept: float, steady: float) -> None:
 
 
 @compiled
-def decorrelate(P: FloatArray, k: int, variance: float) -> None:
-    """Give one state a new variance that has nothing to do with the others."""
+def renew(s: EskfState, k: int, variance: float) -> None:
+    """Begin one state anew: with a variance that has nothing to do with the others."""
+    s.renewals[k] += 1.0
     for j in range(STATES):
-        P[k, j] = 0.0
-        P[j, k] = 0.0
-    P[k, k] = variance
+        s.P[k, j] = 0.0
+        s.P[j, k] = 0.0
+    s.P[k, k] = variance
 
 
 @compiled

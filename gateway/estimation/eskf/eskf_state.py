@@ -80,8 +80,8 @@ class EskfState(FilterState):
     fix_vel: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
-    restarts: int
-    """How often a part of the state began anew, and what was before says nothing of it."""
+    renewals: Annotated[FloatArray, (STATES,)]
+    """How often each state began anew: what it was before says nothing of what it is since."""
     off_last_m: float
     """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
     contradiction_m: float

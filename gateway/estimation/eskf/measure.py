@@ -284,7 +284,6 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
 @compiled
 def take_back(s: EskfState) -> None:
     """Undo what the speed of about zero has lately corrected, and be unsure by as much."""
-    s.restarts += 1
     for k in range(6):
         s.dx[TILT + k] = -s.assumed[k]
         s.P[TILT + k, TILT + k] += s.assumed[k] * s.assumed[k]

@@ -12,7 +12,7 @@ from gateway.estimation.alignment.review import (
     tells_heading,
 )
 from gateway.estimation.alignment.wahba import align_by_gravity, heading_difference
-from gateway.estimation.eskf.covariance import decorrelate, propagate
+from gateway.estimation.eskf.covariance import propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
@@ -36,13 +36,12 @@ def raise_bias_variance(s: EskfState, std: float) -> None:
 def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: float) -> None:
     """Begin the covariance of an attitude; place and velocity begin at the next fix."""
     propagate(s, p)
-    decorrelate(s.P, TILT, level_var)
-    decorrelate(s.P, TILT + 1, level_var)
-    decorrelate(s.P, TILT + 2, heading_var)
+    renew(s, TILT, level_var)
+    renew(s, TILT + 1, level_var)
+    renew(s, TILT + 2, heading_var)
     for k in range(3):
-        decorrelate(s.P, VEL + k, p.unaided_var)
+        renew(s, VEL + k, p.unaided_var)
         s.vel_n[k] = 0.0
-    s.restarts += 1
     s.aided = 0
     # The integrals in NED stand in the old attitude.
     s.ring_count = 0
@@ -54,7 +53,7 @@ def turn_heading(s: EskfState, turn_rad: float) -> None:
     half = 0.5 * turn_rad
     turn = (math.cos(half), 0.0, 0.0, math.sin(half))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
-    s.restarts += 1
+    s.renewals[TILT + 2] += 1.0
     # The integrals stand in the old heading.
     s.ring_count = 0
 
@@ -83,7 +82,7 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt):
         if tells_heading(s, ENOUGH_HEADING_RAD):
             turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
-            decorrelate(s.P, TILT + 2, s.heading_std * s.heading_std)
+            renew(s, TILT + 2, s.heading_std * s.heading_std)
             s.heading_known = s.heading_true = 1
         return
     write_quat(s.q_nb, find(s, as_quat(s.q_nb), ENOUGH_HEADING_RAD))

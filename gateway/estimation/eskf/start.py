@@ -6,7 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
-from gateway.estimation.eskf.covariance import decorrelate, propagate
+from gateway.estimation.eskf.covariance import propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -79,7 +79,7 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
 def start_heading_by_compass(s: EskfState, p: EskfGains, turn_rad: float) -> None:
     """Take the heading from the compass."""
     turn_heading(s, turn_rad)
-    decorrelate(s.P, TILT + 2, p.mag_var)
+    renew(s, TILT + 2, p.mag_var)
     s.heading_known = 1
 
 
@@ -96,7 +96,7 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
     if by_compass:
         compass_row(s, as_vec(s.field_n))
     for k in range(3):
-        decorrelate(s.P, MAG_BIAS + k, p.mag_bias_var)
+        renew(s, MAG_BIAS + k, p.mag_bias_var)
         if by_compass:
             share = s.h[MAG_BIAS + k]
             set_covariance(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
@@ -119,11 +119,10 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         Its age, s.
     """
     propagate(s, p)
-    s.restarts += 1
     told = is_sound(vel, FASTEST_MPS)
     vel = vel if told else (0.0, 0.0, 0.0)
     for k in range(3):
-        decorrelate(s.P, VEL + k, FIRST_VELOCITY_VAR if told else NO_VELOCITY_VAR)
+        renew(s, VEL + k, FIRST_VELOCITY_VAR if told else NO_VELOCITY_VAR)
         s.vel_n[k] = vel[k]
     for k in range(2):
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
@@ -138,7 +137,6 @@ def start_height(s: EskfState, p: EskfGains, down_m: float) -> None:
     """Take the height from the first fix that tells one."""
     if s.has_height == 1 or not math.isfinite(down_m):
         return
-    s.restarts += 1
     start_position(s, 2, down_m, p.gps_height_var)
     s.has_height = 1
     if s.baro_known == 1:
@@ -150,6 +148,7 @@ def restart_baro(s: EskfState, p: EskfGains) -> None:
     """Take the barometer's offset from the present height."""
     propagate(s, p)
     s.baro_bias_m = s.pos_n[2] - s.baro_down_m
+    s.renewals[BARO_BIAS] += 1.0
     for j in range(STATES):
         s.P[BARO_BIAS, j] = s.P[POS + 2, j]
         s.P[j, BARO_BIAS] = s.P[j, POS + 2]
@@ -167,8 +166,8 @@ def start_position(s: EskfState, k: int, value: float, noise_var: float) -> None
     """Start one coordinate at a fix: the fix's slow error is then its own, reversed."""
     wander_var = s.wander_var[k]
     s.pos_n[k], s.wander_n[k] = value, 0.0
-    decorrelate(s.P, POS + k, wander_var + noise_var)
-    decorrelate(s.P, WANDER + k, wander_var)
+    renew(s, POS + k, wander_var + noise_var)
+    renew(s, WANDER + k, wander_var)
     set_covariance(s, POS + k, WANDER + k, -wander_var)
 
 
@@ -183,11 +182,10 @@ def relock_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> N
 def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
     """Give position and velocity up; from here on the velocity only keeps the attitude level."""
     propagate(s, p)
-    s.restarts += 1
     s.aided = 0
     s.unaided_sq = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2)
     for k in range(3):
-        decorrelate(s.P, VEL + k, p.unaided_var + s.unaided_sq)
+        renew(s, VEL + k, p.unaided_var + s.unaided_sq)
         s.vel_n[k] = 0.0
 
 
@@ -195,7 +193,6 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
 def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     propagate(s, p)
-    s.restarts += 1
     s.fault = 1
     still = s.at_rest == 1
     rate = silent_rate(s, as_vec(s.gyro_bias_b))
@@ -208,6 +205,8 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
         s.P[TILT + k, TILT + k] += turned * turned
         s.P[VEL + k, VEL + k] += (GAP_ACCEL_MPS2 * dt) ** 2
         s.P[POS + k, POS + k] += (0.5 * GAP_ACCEL_MPS2 * dt * dt) ** 2
+        for first in (TILT, VEL, POS):
+            s.renewals[first + k] += 1.0
     s.ring_count = 0
     s.pair_s = NEVER_S
     s.rest_s = 0.0

@@ -10,10 +10,17 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gateway.compiled import compiled
 from gateway.compiled.entry_point import dispatched
-from gateway.estimation.columns import CLIPPED, imu_vectors
+from gateway.estimation.columns import (
+    CLIPPED,
+    NAV_ATTITUDE_STD,
+    NAV_POS_STD,
+    NAV_VEL_STD,
+    imu_vectors,
+)
 from gateway.estimation.eskf.covariance import apply_transition, propagate
 from gateway.estimation.eskf.eskf_kernels import COVARIANCE_S, KERNELS, move, take_imu
 from gateway.estimation.eskf.eskf_output import write_output, write_place
@@ -34,6 +41,8 @@ from gateway.estimation.eskf.eskf_state import (
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply
+
+BoolArray = NDArray[np.bool_]
 
 take_earlier: Final = KERNELS.earlier
 
@@ -82,6 +91,50 @@ def begin_node(s: EskfState, p: EskfGains, P: FloatArray, F: FloatArray) -> None
 
 
 @compiled
+def end_node(s: EskfState, copy: EskfState, F: FloatArray, foreseen: FloatArray) -> None:
+    """Keep the covariance foreseen; of what began anew the stretch's begin tells nothing.
+
+    Nor does it of a place that follows the fixes, which is no state.
+    """
+    for i in range(STATES):
+        for j in range(STATES):
+            foreseen[i, j] = copy.P[i, j]
+    for i in range(STATES):
+        unfiltered = i in (POS, POS + 1, POS + 2) and min(s.aided, copy.aided) == 0
+        if unfiltered or copy.started == 0 or s.renewals[i] != copy.renewals[i]:
+            for j in range(STATES):
+                F[i, j] = foreseen[i, j] = foreseen[j, i] = 0.0
+            foreseen[i, i] = 1.0
+
+
+@compiled
+def is_renewed(s: EskfState, copy: EskfState) -> bool:
+    """Return whether a part of the filter's state began anew since the copy was made."""
+    for k in range(STATES):
+        if s.renewals[k] != copy.renewals[k]:
+            return True
+    return bool(s.started != copy.started)
+
+
+@compiled
+def keep_unmodelled(s: EskfState, p: EskfGains, row: FloatArray) -> None:
+    """Leave of the standard deviations told only what they hold beyond the covariance.
+
+    Iron that is no state yet, for want of GPS, turns the heading for as long as a flight lasts: the
+    filter's drift outweighs it, but an average over the flight does not.
+    """
+    for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
+        for k in range(3):
+            beyond = row[column + k] ** 2 - s.P[first + k, first + k]
+            # NaN, which is told of what is not known, stays.
+            row[column + k] = 0.0 if beyond < 0.0 else math.sqrt(beyond)
+    level_ut = math.hypot(s.field_n[0], s.field_n[1])
+    if s.iron_search_started == 0 and level_ut > 0.0:
+        iron_rad = math.sqrt(p.mag_bias_var) / level_ut
+        row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], iron_rad)
+
+
+@compiled
 def move_copy(s: EskfState, p: EskfGains, time_us: int, row: FloatArray, F: FloatArray) -> None:
     """Move the copy on by one IMU sample, and by nothing else."""
     dt = (time_us - s.time_us) * 1e-6
@@ -110,7 +163,7 @@ def run_forward(
     F: FloatArray,
     foreseen: FloatArray,
     d: FloatArray,
-    joined: IntArray,
+    anew: BoolArray,
 ) -> None:
     """Run the filter, and a copy of it from each node to the next.
 
@@ -125,13 +178,14 @@ def run_forward(
     imu_time_us, imu, baro_time_us, baro_alt_m, gps_time_us, gps : ndarray
         See `SampleLog`.
     out : ndarray, shape (n, NAV_COLUMNS)
-        Filled with what the copy tells.
+        Filled with what the copy tells; with what the filter tells where that began anew. Of the
+        standard deviations only what is to be added to those of the states.
     P, F, foreseen : ndarray, shape (m, STATES, STATES)
         Filled: the covariance at each node, the transition to the next, the covariance foreseen.
     d : ndarray, shape (m, STATES)
         Filled: what the measurements of each stretch have taught.
-    joined : ndarray of int, shape (m,)
-        Filled: 1 where nothing began anew within the stretch.
+    anew : ndarray of bool, shape (n,)
+        Filled: whether a part of the filter's state began anew in the stretch up to this sample.
     """
     s, copy = states[0], states[1]
     taken = np.zeros(2, np.int64)
@@ -143,14 +197,14 @@ def run_forward(
             take_earlier(s, p, now, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
             take_imu(s, p, now, imu[i])
             move_copy(copy, p, now, imu[i], F[k])
-            write_output(s if s.restarts != copy.restarts else copy, out[i])
+            anew[i] = is_renewed(s, copy)
+            told = s if anew[i] else copy
+            write_output(told, out[i])
             if s.aided == 0:
                 # The place is no state then: it is that of the newest fix.
                 write_place(s, out[i])
+            keep_unmodelled(told, p, out[i])
         propagate(s, p)
         foresee(copy, p, F[k])
-        for i in range(STATES):
-            for j in range(STATES):
-                foreseen[k, i, j] = copy.P[i, j]
+        end_node(s, copy, F[k], foreseen[k])
         learned(s, copy, d[k])
-        joined[k] = 1 if s.restarts == copy.restarts and s.started == copy.started else 0

@@ -2,8 +2,8 @@
 
 Forwards the filter runs as live. Backwards, each node hears from the next by how much the
 measurements from there on have moved it, as far as the two hang together [1]_. An outage is bridged
-from its end as well as from its begin. Where the filter began anew, as after a lost attitude, what
-came later says nothing of what was before.
+from its end as well as from its begin. Of a state that the filter began anew, as an attitude that
+was lost, what came later says nothing of what was before; of the other states it still does.
 
 References
 ----------
@@ -30,11 +30,13 @@ from gateway.estimation.columns import (
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.estimation.smoothing.forward import run_forward
+from gateway.estimation.smoothing.forward import BoolArray, run_forward
 from gateway.geometry.geodesy import radii_m
 
 NODE_S: Final = 0.2
 """From node to node; between them the corrections are interpolated."""
+LASTING_RAD: Final = 0.005
+"""Axes and scales of the sensors are off for a whole flight; averages do not lessen that."""
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Share of its own variance that each state foreseen is blurred by, so that all can be divided."""
@@ -67,14 +69,14 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     count = len(nodes) - 1
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, foreseen = (np.empty((count, STATES, STATES)) for _ in range(3))
-    d, joined = np.empty((count, STATES)), np.zeros(count, np.int64)
+    d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
     run_forward(
         states, estimator.gains, nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
-        out, P, F, foreseen, d, joined,
+        out, P, F, foreseen, d, anew,
     )  # fmt: skip
-    begins, ends = _backward(P, F, foreseen, d, joined, states[0]["P"])
-    _correct(out, log.imu_time_us, nodes, begins, ends, P, joined)
+    begins, ends, variances = _backward(P, F, foreseen, d, states[0]["P"])
+    _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out
 
 
@@ -92,33 +94,34 @@ def _backward(
     F: FloatArray,
     foreseen: FloatArray,
     d: FloatArray,
-    joined: IntArray,
     last_P: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Recurse from the end, whose covariance is `last_P`.
 
     Returns
     -------
-    begins, ends : ndarray, shape (m, STATES)
-        By how much the begin of each stretch is off, and what was foreseen for its end; the
-        smoothed covariance at each node takes the place of `P`.
+    begins : ndarray, shape (m + 1, STATES)
+        By how much the filter is off at each node; zero at the end.
+    ends : ndarray, shape (m, STATES)
+        By how much what was foreseen for the end of each stretch is off.
+    variances : ndarray, shape (m + 1, STATES)
+        Smoothed, at each node.
     """
     count = len(d)
-    begins, ends = np.zeros((count, STATES)), np.zeros((count, STATES))
-    later, later_P = np.zeros(STATES), last_P
+    begins, ends = np.zeros((count + 1, STATES)), np.empty((count, STATES))
+    variances = np.empty((count + 1, STATES))
+    later_P = last_P
+    variances[count] = np.diagonal(later_P)
     for k in range(count - 1, -1, -1):
         if k % BLOCK == BLOCK - 1 or k == count - 1:
             first = k - k % BLOCK
             gains = _gains(P[first : k + 1], F[first : k + 1], foreseen[first : k + 1])
-        if joined[k] == 0:
-            later, later_P = np.zeros(STATES), P[k].copy()
-            continue
         gain = gains[k - first]
-        ends[k] = d[k] + later
-        later = begins[k] = gain @ ends[k]
-        P[k] += gain @ (later_P - foreseen[k]) @ gain.T
-        later_P = P[k].copy()
-    return begins, ends
+        ends[k] = d[k] + begins[k + 1]
+        begins[k] = gain @ ends[k]
+        later_P = P[k] + gain @ (later_P - foreseen[k]) @ gain.T
+        variances[k] = np.diagonal(later_P)
+    return begins, ends, variances
 
 
 def _gains(P: FloatArray, F: FloatArray, foreseen: FloatArray) -> FloatArray:
@@ -135,8 +138,8 @@ def _correct(
     nodes: IntArray,
     begins: FloatArray,
     ends: FloatArray,
-    P: FloatArray,
-    joined: IntArray,
+    variances: FloatArray,
+    anew: BoolArray,
 ) -> None:
     """Move what was foreseen by the corrections between the nodes, and tell the new accuracies."""
     stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
@@ -146,7 +149,11 @@ def _correct(
     start_us = time_us[np.maximum(nodes[:-1] - 1, 0)]
     length = np.maximum(time_us[nodes[1:] - 1] - start_us, 1)
     share = ((time_us - start_us[stretch]) / length[stretch])[:, None]
-    off = (1.0 - share) * begins[stretch] + share * ends[stretch]
+    # Where something began anew there is nothing to interpolate: what is told then is the filter's.
+    cut = np.add.reduceat(anew, nodes[:-1])[stretch] > 0
+    share[cut, 0] = anew[cut]
+    following = np.where(anew[:, None], begins[stretch + 1], ends[stretch])
+    off = (1.0 - share) * begins[stretch] + share * following
     out[:, NAV_QUAT : NAV_QUAT + 4] = _turned(
         off[:, TILT : TILT + 3], out[:, NAV_QUAT : NAV_QUAT + 4]
     )
@@ -159,12 +166,11 @@ def _correct(
         out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
         out[aided, NAV_LON] += np.degrees(off[aided, POS + 1] / parallel_m)
         out[aided, NAV_ALT] -= off[aided, POS + 2]
-    variances = np.diagonal(P, axis1=1, axis2=2)
-    following = variances[np.minimum(stretch + 1, len(variances) - 1)]
-    std = np.sqrt(np.maximum((1.0 - share) * variances[stretch] + share * following, 0.0))
+    variance = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
+    variance[:, TILT : TILT + 3] += LASTING_RAD**2
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
-        told = np.isfinite(out[:, column]) & (joined[stretch] == 1)
-        out[told, column : column + 3] = std[told, first : first + 3]
+        beyond = out[:, column : column + 3]
+        beyond[:] = np.sqrt(beyond**2 + np.maximum(variance[:, first : first + 3], 0.0))
 
 
 def _turned(turn: FloatArray, q: FloatArray) -> FloatArray:
