@@ -86,7 +86,7 @@ def run_smoothed(flight: Flight) -> np.ndarray:
 
 OWN: dict[str, Run] = {"paper": run_paper, "complementary": run_complementary, "eskf": run_eskf}
 SMOOTHED: dict[str, Run] = {"smoothed": run_smoothed}
-TELLING = ("eskf", "smoothed")
+TELLING = ("complementary", "eskf", "smoothed")
 """These tell how accurate they are."""
 
 

@@ -266,8 +266,9 @@ class TestNonsense:
         assert NavFlags.GPS_REJECTED not in state.flags
 
 
-def test_a_contradicting_fix_widens_what_is_told_only_when_repeated() -> None:
-    """The Kalman filter's place and lasting other fixes may both be wrong: it says so."""
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_contradicting_fix_widens_what_is_told_only_when_repeated(name: str) -> None:
+    """The filter's place and lasting other fixes may both be wrong: it says so."""
 
     def stds(offsets: dict[int, float]) -> dict[int, float]:
         items: Items = []
@@ -276,7 +277,7 @@ def test_a_contradicting_fix_widens_what_is_told_only_when_repeated() -> None:
             if t % 200_000 == 0 and t > 1_000_000:
                 items.append(fix(t, north_m=offsets.get(t, 0.0)))
             items.append(sample)
-        states = feed(make_estimator(EstimationSettings(estimator="eskf")), items)
+        states = feed(make_estimator(EstimationSettings(estimator=name)), items)
         return {s.time_us: s.pos_std_m[0] for s in states}
 
     once = stds({8_000_000: 300.0})

@@ -7,11 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import GYRO, NAV_ATTITUDE_STD, NAV_FLAGS, NAV_LAT
+from gateway.estimation.columns import (
+    GYRO,
+    NAV_ATTITUDE_STD,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_POS_STD,
+)
 from gateway.records import NavFlags
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
     attitude_scores,
+    outages,
     position_errors_m,
     run_complementary,
     run_eskf,
@@ -101,6 +108,24 @@ def test_nothing_is_told_that_is_not_known(flight: Flight, name: str) -> None:
     assert attitude_scores(said, out[:, :4])["total"] < 12.0
     late = spoilt.flight.log.imu_time_us * 1e-6 > spoilt.ends_s + RECOVERY_S
     assert (flags[late] & int(NavFlags.HEADING_VALID | NavFlags.ATTITUDE_VALID)).all()
+
+
+def test_errors_are_within_what_complementary_tells(flight: Flight) -> None:
+    """With fixes, and in outages of 10 s, where the place runs away."""
+    within = two_sigma(flight, run_complementary(flight))
+    assert min(map(share, within.values())) > 0.9
+    out, inside, _ = next(outages(flight, run_complementary, 10.0))
+    assert np.nanmedian(out[inside, NAV_POS_STD]) > 2.0
+    for values in two_sigma(flight, out).values():
+        assert share(values[inside]) > 0.9
+
+
+def test_real_errors_are_within_what_complementary_tells(data_dir: Path) -> None:
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    out = run_complementary(flight)
+    assert min(map(share, two_sigma(flight, out).values())) > 0.88
+    told_deg = np.degrees(np.nanmedian(out[flight.counts, NAV_ATTITUDE_STD + 2]))
+    assert told_deg < 2.0
 
 
 @pytest.mark.parametrize("name", RUNS)

@@ -6,6 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
+from gateway.estimation.complementary.accuracy import watch_accuracy
 from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
     write_output,
@@ -69,13 +70,14 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     for k in range(3):
         s.rate_b[k] = NAN
     begin_drift(s, p)
-    s.declination_rad = NAN
+    s.declination_rad = p.declination_rad
     forget_times(s)
 
 
 @compiled
 def forget_times(s: ComplementaryState) -> None:
     """Drop all that is tied to the clock."""
+    s.accuracy_s = NEVER_S
     s.mag_s = s.fix_s = s.fix_valid_s = s.pair_s = s.baro_s = NEVER_S
     s.reject_last[0] = NEVER_S
     s.reject_s = s.rest_s = s.epoch_s = 0.0
@@ -176,6 +178,7 @@ def advance(
     if s.at_rest == 1 and since_fix > FRESH_GPS_S:
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
+    watch_accuracy(s, p)
 
 
 @compiled

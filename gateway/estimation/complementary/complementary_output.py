@@ -9,12 +9,13 @@ from gateway.estimation.columns import (
     NAV_FLAGS,
     NAV_LAT,
     NAV_LON,
+    NAV_POS_STD,
     NAV_QUAT,
     NAV_RATE,
     NAV_VEL,
+    NAV_VEL_STD,
 )
 from gateway.estimation.complementary.complementary_state import ComplementaryState
-from gateway.estimation.complementary.heading import is_heading_good
 from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
@@ -29,6 +30,8 @@ from gateway.records import NAN
 
 DEAD_RECKONING_MAX_S: Final = 60.0
 """Dead reckoning longer than this is no position any more."""
+VALID_RAD: Final = 0.26
+"""Up to this standard deviation, tilt and heading are told as valid."""
 
 
 @compiled
@@ -40,11 +43,13 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
     s : ComplementaryState
         Unchanged.
     row : ndarray, shape (NAV_COLUMNS,)
-        Filled; standard deviations are not known to this estimator.
+        Filled; standard deviations of height and climb are not known to this estimator.
     """
     write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
     write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
+    if s.started == 1:
+        write_vec(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], as_vec(s.told_std))
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
     row[NAV_FLAGS] = float(flags_of(s))
     if s.has_origin == 0:
@@ -54,15 +59,18 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
     write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+    row[NAV_VEL_STD] = row[NAV_VEL_STD + 1] = s.told_speed_mps
+    row[NAV_POS_STD] = row[NAV_POS_STD + 1] = s.told_place_m
 
 
 @compiled
 def flags_of(s: ComplementaryState) -> int:
     """Put the flags together."""
     flags = sensor_flags(s)
-    if s.started == 1 and s.lost == 0:
+    north, east, heading = as_vec(s.told_std)
+    if s.started == 1 and s.lost == 0 and max(north, east) < VALID_RAD:
         flags |= ATTITUDE_VALID
-    if s.heading_known == 1 and s.heading_true == 1 and is_heading_good(s):
+    if s.heading_known == 1 and s.heading_true == 1 and heading < VALID_RAD:
         flags |= HEADING_VALID
     if s.has_height == 1:
         flags |= ALTITUDE_VALID

@@ -185,6 +185,21 @@ class ComplementaryState(FilterState):
     """When the last accepted fix was valid."""
     fix_vel: Annotated[FloatArray, (3,)]
     fix_force_i: Annotated[FloatArray, (3,)]
+    told_std: Annotated[FloatArray, (3,)]
+    """Standard deviations of the attitude about north, east and down, rad."""
+    told_place_m: float
+    told_speed_mps: float
+    """The same of place and speed, along one level axis."""
+    fix_place_m: float
+    fix_speed_mps: float
+    """What they were after the last fix."""
+    pushed_place_m: float
+    pushed_speed_mps: float
+    """What the error of the acceleration has added since."""
+    accuracy_s: float
+    """When all that was carried on last."""
+    accuracy_force_i: Annotated[FloatArray, (3,)]
+    """Integral of the specific force then."""
 
 
 def make_gains(

@@ -12,6 +12,7 @@ from gateway.estimation.alignment.gps_velocity import (
 )
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.columns import GPS_DECLINATION
+from gateway.estimation.complementary.accuracy import settle_place
 from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
@@ -114,6 +115,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
         told = velocity_from_position(s, pos, past)
     if not blend_or_restart(s, p, row, pos, told, past, lag):
         return
+    settle_place(s, p, row, noise_mps)
     accept_fix(s)
     if is_sound(vel, FASTEST_MPS) and s.lost == 0:
         at_s = look_back(s, at_s)
@@ -172,4 +174,7 @@ def blend_or_restart(
         s.fix_valid_s = NEVER_S
         restart_at(s, pos, vel, lag)
         return True
+    if s.reject_s > 0.0:
+        # They agree with one another: either may be wrong.
+        s.fix_place_m = max(s.fix_place_m, off_m)
     return False

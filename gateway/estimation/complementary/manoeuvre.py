@@ -145,12 +145,25 @@ def match_force(
     variance : float
         Of the difference along an axis, m2/s4.
     """
-    q_eb, b = as_quat(s.q_eb), s.accel_bias_b
-    raw, bias = rotate(as_quat(s.q_ei), mean_i), rotate(q_eb, (b[0], b[1], b[2]))
-    f = (raw[0] - bias[0], raw[1] - bias[1], raw[2] - bias[2])
+    f = unbiased_force(s, mean_i)
     half = -0.5 * s.heading_rad
     accel_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel_n)
     gravity = STANDARD_GRAVITY_MPS2 if axis == 2 else 0.0
+    write_force_row(s, axis, f)
+    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA)
+
+
+@compiled
+def unbiased_force(s: ComplementaryState, force_i: Vec3) -> Vec3:
+    """Turn a force in the inertial frame into the level frame, less the accelerometer's bias."""
+    b = s.accel_bias_b
+    raw, bias = rotate(as_quat(s.q_ei), force_i), rotate(as_quat(s.q_eb), (b[0], b[1], b[2]))
+    return (raw[0] - bias[0], raw[1] - bias[1], raw[2] - bias[2])
+
+
+@compiled
+def write_force_row(s: ComplementaryState, axis: int, f: Vec3) -> None:
+    """Write how one axis of a force `f` in the level frame depends on the states."""
     row = cleared_row(s)
     if axis == 0:
         row[TILT + 1], row[HEADING] = f[2], -f[1]
@@ -159,7 +172,6 @@ def match_force(
     else:
         row[TILT], row[TILT + 1] = f[1], -f[0]
     level = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
-    in_b = rotate_inverse(q_eb, level)
+    in_b = rotate_inverse(as_quat(s.q_eb), level)
     for k in range(3):
         row[FORCE + k] = -in_b[k]
-    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA)

@@ -5,7 +5,7 @@ from typing import Annotated
 from gateway.estimation.filtering.filter_state import FilterGains, filter_gains
 from gateway.estimation.kernel_record import filled_record
 from gateway.estimation.magfield import CompassSettings
-from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
@@ -165,8 +165,6 @@ class EskfGains(FilterGains):
     dead_reckoning_s: float
     gate_sq: float
     gate_m: float
-    declination_rad: float
-    """NaN where it is looked up at the place of a fix."""
 
 
 def make_gains(
@@ -222,6 +220,5 @@ def make_gains(
         "dead_reckoning_s": s.dead_reckoning_s,
         "gate_m": s.gate_m,
         "gate_sq": s.gate_sigma**2,
-        "declination_rad": EarthField(reference).declination_rad,
     }
     return filled_record(EskfGains, values | filter_gains(reference, rest, compass))

@@ -19,7 +19,7 @@ from gateway.estimation.magfield import (
     FieldState,
     field_gains,
 )
-from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
 from gateway.estimation.sensor_faults import HealthState
 
@@ -29,6 +29,8 @@ class FilterGains(RestGains, FieldGains):
 
     gps_latency_s: float
     gps_relock_s: float
+    declination_rad: float
+    """NaN where it is looked up at the place of a fix."""
 
 
 def filter_gains(
@@ -38,6 +40,7 @@ def filter_gains(
     return {
         "gps_latency_s": reference.gps_latency_s,
         "gps_relock_s": reference.gps_relock_s,
+        "declination_rad": EarthField(reference).declination_rad,
         **rest_gains(rest),
         **field_gains(compass),
     }
