@@ -10,7 +10,6 @@ whole time, is a loop that only wakes up.
 
 import argparse
 import asyncio
-import gc
 import os
 import socket
 import subprocess
@@ -25,8 +24,8 @@ from msgspec.structs import replace
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.cli.live.demo import calibrated_aircraft
+from gateway.cli.live.run import loop_comes_first
 from gateway.cli.support.warm_up import make_ready
-from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
@@ -74,10 +73,8 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
     """Run the daemon as `mavgate demo` does."""
     line = simulate(settings.simulator, unix_time_us()).frames()
     daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
-    gc.collect()
-    gc.freeze()
     watch.install()
-    with nothing_compiled():
+    with loop_comes_first():
         daemon.start()
         watch.restart()
         try:

@@ -39,6 +39,7 @@ IMU_AHEAD_S: Final = 0.5
 GPS_AHEAD_S: Final = 2.0
 """How far samples are generated ahead: few at once cost as much as many, but too many at once
 would block an event loop."""
+PHASES: Final = 4
 
 IMU_SENSORS: Final = 0b0111
 GPS_SENSORS: Final = 0b1000
@@ -102,7 +103,11 @@ class Node(ABC):
         """Return every payload passed to the radio before a true time, in order."""
         made = [*self._waiting, *self._report(until_s)]
         if until_s > self._made_s:
-            self._made_s = until_s + self._ahead_s
+            ahead_s = self._ahead_s
+            if not self._made_s:
+                # Begin at different phases, so that the aircraft do not take the loop all at once.
+                ahead_s *= self.node_id.vehicle_id % PHASES / PHASES
+            self._made_s = until_s + ahead_s
             made += self._make(self._made_s)
         # Stable: a fix stays after the quality payload of the same time.
         made.sort(key=attrgetter("time_s"))

@@ -1,11 +1,14 @@
 """Payloads carry what the sensors read, at their moments."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import SimulatedAircraft, fly
 from gateway.simulator.node import GpsNode, ImuNode, Sent, nodes_of
+from gateway.simulator.receiver import PIECE_S
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
     BaroPayload,
@@ -101,6 +104,24 @@ def test_pieces_equal_the_whole_and_stay_in_order(index: int) -> None:
     assert pieces == whole
     times = [sent.time_s for sent in whole]
     assert times == sorted(times)
+
+
+def test_two_aircraft_are_not_made_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[int, int]] = []
+    imu = ImuNode._make
+
+    def make(node: ImuNode, until_s: float) -> Iterator[Sent]:
+        made.append((piece, node.node_id.vehicle_id))
+        return imu(node, until_s)
+
+    monkeypatch.setattr(ImuNode, "_make", make)
+    aircraft = [nodes_of(SimulatedAircraft(SETTINGS, index), SETTINGS)[0] for index in range(2)]
+    for piece in range(1, 30):
+        for node in aircraft:
+            node.take(piece * PIECE_S)
+    later = [piece for piece, _ in made if piece > 1]
+    assert len(later) > 8
+    assert len(set(later)) == len(later)
 
 
 def test_every_payload_fits_the_radio(imu_sent: list[Sent], gps_sent: list[Sent]) -> None:

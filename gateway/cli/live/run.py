@@ -5,7 +5,8 @@ import gc
 import logging
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
@@ -34,6 +35,7 @@ log = logging.getLogger(__name__)
 VIEW_INTERVAL_S: Final = 0.5
 """Twice a second: drawing takes some milliseconds, during which no frame is sent."""
 LOG_INTERVAL_S: Final = 10.0
+SWITCH_S: Final = 0.0005
 
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
 EndpointOption = Annotated[
@@ -106,11 +108,8 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
-    # Freeze what exists by now: a full garbage collection of it stops telemetry for 0.1 s.
-    gc.collect()
-    gc.freeze()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
-    with nothing_compiled():
+    with loop_comes_first():
         daemon.start()
         if panel is not None:
             panel.start(daemon.control_socket)
@@ -123,6 +122,22 @@ async def serve(
             if panel is not None:
                 panel.close()
             daemon.close()
+
+
+@contextmanager
+def loop_comes_first() -> Iterator[None]:
+    """Prevent what would stop the event loop, once all that it needs is there."""
+    # Freeze what exists by now: a full garbage collection of it stops telemetry for 0.1 s.
+    gc.collect()
+    gc.freeze()
+    # The disk's thread may keep the interpreter for so long; the default is 5 ms.
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        with nothing_compiled():
+            yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def _open_view() -> "LiveView":
