@@ -181,13 +181,16 @@ class Pipeline:
         """Return the signing time stamps of all aircraft, for a clean shutdown."""
         return {key: found for key, book in self._stamps.items() if (found := book.exact())}
 
-    def seal(self, frame: bytes, sequence: int, now_us: int) -> bytes:
-        """Set a leaving frame's sequence number, and sign it if its aircraft signs."""
+    def seal(self, frame: bytes, sequence: int, now_us: Callable[[], int]) -> bytes:
+        """Set a leaving frame's sequence number, and sign it if its aircraft signs.
+
+        `now_us` is the gateway clock, asked for a signature alone.
+        """
         aircraft = self.aircraft.get(origin_of(frame)[0])
         key = None if aircraft is None else aircraft.vehicle.signing_key
         if key is None:
             return restamp(frame, sequence)
-        return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us))
+        return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us()))
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; partly received data is dropped."""

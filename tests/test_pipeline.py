@@ -237,7 +237,7 @@ def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None
             actions += pipeline.handle(incoming, time_us)
         for action in actions:
             if isinstance(action, Outgoing):
-                signed = pipeline.seal(action.frame, action.frame[4], time_us)
+                signed = pipeline.seal(action.frame, action.frame[4], lambda now_us=time_us: now_us)
                 # It steps over the signatures of messages that it does not know.
                 assert receiver.decode(bytearray(signed)) is not None
                 assert signed[2] & 1
@@ -289,7 +289,7 @@ def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipe
         for tracker in trackers.values():
             actions += pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
         frames = [a.frame for a in actions if isinstance(a, Outgoing)]
-        sealed = [pipeline.seal(frame, frame[4], time_us) for frame in frames]
+        sealed = [pipeline.seal(frame, frame[4], lambda now_us=time_us: now_us) for frame in frames]
         return {frame[5]: bool(frame[2] & 1) for frame in sealed}
 
     pipeline.feed(trackers[1].frame(0, LEVEL), 0)

@@ -119,7 +119,7 @@ def is_frame(data: bytes) -> bool:
     extra = CRC_EXTRA.get(data[7] | data[8] << 8 | data[9] << 16)
     if extra is None:
         return False
-    crc: int = mcrf4xx(extra, mcrf4xx(data[1:-2]))
+    crc: int = mcrf4xx(data[1:-2] + extra)
     return crc == data[-2] | data[-1] << 8
 
 
@@ -203,7 +203,7 @@ def restamp(frame: bytes, sequence: int) -> bytes:
     if extra is None or is_signed(frame):
         return frame
     body = frame[1:at] + bytes((sequence,)) + frame[at + 1 : -2]
-    return frame[:1] + body + mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
+    return frame[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
 
 
 def _split(data: bytes, *, final: bool) -> tuple[list[bytes | SplitFault], int]:
@@ -266,5 +266,5 @@ def _is_genuine(data: bytes, begin: int, checked: int, size: int) -> bool:
         end = begin + size
         return end == len(data) or data[end] in (START_V1, START_V2)
     end = begin + checked
-    crc: int = mcrf4xx(extra, mcrf4xx(data[begin + 1 : end - 2]))
+    crc: int = mcrf4xx(data[begin + 1 : end - 2] + extra)
     return crc == data[end - 2] | data[end - 1] << 8

@@ -82,7 +82,9 @@ class ClockTracker:
         """
         remote_us = self._unwrap(remote_u32, arrival_us)
         local_us = self._to_local(remote_us) if self._buckets else arrival_us
-        if self._is_doubtful(arrival_us - remote_us, local_us - arrival_us):
+        if local_us - arrival_us <= AHEAD_US:
+            self._suspect_us = None
+        elif self._is_doubtful(arrival_us - remote_us):
             return arrival_us
         if self._last_remote_us is None or remote_us > self._last_remote_us:
             self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
@@ -90,11 +92,9 @@ class ClockTracker:
             local_us = self._to_local(remote_us)
         return min(local_us, arrival_us)
 
-    def _is_doubtful(self, delta_us: int, ahead_us: int) -> bool:
-        """Return whether a packet is far too early, and no other says so too."""
+    def _is_doubtful(self, delta_us: int) -> bool:
+        """Return whether of packets that are far too early this is the first that says so."""
         before_us, self._suspect_us = self._suspect_us, None
-        if ahead_us <= AHEAD_US:
-            return False
         if before_us is not None and abs(before_us - delta_us) <= AHEAD_US:
             return False
         self._suspect_us = delta_us

@@ -211,13 +211,13 @@ class SerialPort:
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
         self._on_open(device)
-        asyncio.get_running_loop().add_reader(self._port.fileno(), self._read)
+        file = self._port.fileno()
+        asyncio.get_running_loop().add_reader(file, self._read, file)
 
-    def _read(self) -> None:
-        assert self._port is not None
+    def _read(self, file: int) -> None:
         try:
             # pyserial's own read makes two more system calls, for every sample.
-            data = os.read(self._port.fileno(), READ_SIZE)
+            data = os.read(file, READ_SIZE)
         except BlockingIOError:
             return
         except OSError as error:

@@ -35,14 +35,29 @@ def interval_us(rate_hz: float) -> int:
     return round(US_PER_S / rate_hz) if rate_hz > 0.0 else OFF
 
 
+class Pace:
+    """How far apart samples come, on average over the last few."""
+
+    def __init__(self) -> None:
+        self._last_us: int | None = None
+        self._period_us = 0
+
+    def take(self, time_us: int) -> int:
+        """Take in the time of a sample, and return the present period in us; 0 at the first."""
+        last_us, self._last_us = self._last_us, time_us
+        if last_us is not None and 0 < (gap_us := time_us - last_us) <= MAX_PERIOD_US:
+            period_us = self._period_us or gap_us
+            self._period_us = period_us + (gap_us - period_us) // PACE_WEIGHT
+        return self._period_us
+
+
 class Stream:
     """One message's schedule."""
 
     def __init__(self, interval: int) -> None:
         self.interval_us = interval
         self._due_us: int | None = None
-        self._last_us: int | None = None
-        self._period_us = 0
+        self._pace = Pace()
 
     @property
     def due_us(self) -> int | None:
@@ -66,12 +81,10 @@ class Stream:
         -------
         bool
         """
-        last_us, self._last_us = self._last_us, time_us
-        period_us = self._period_us
-        if last_us is not None and 0 < (gap_us := time_us - last_us) <= MAX_PERIOD_US:
-            period_us = period_us or gap_us
-            period_us += (gap_us - period_us) // PACE_WEIGHT
-            self._period_us = period_us
+        return self.offer_paced(time_us, self._pace.take(time_us))
+
+    def offer_paced(self, time_us: int, period_us: int) -> bool:
+        """Do the same where several streams are carried by the same samples, of a known pace."""
         if self.interval_us == OFF:
             return False
         late = 0 if self._due_us is None else time_us - self._due_us

@@ -18,7 +18,7 @@ from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecor
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.high_latency import high_latency2
 from gateway.vehicle.telemetry.motion import IN_AIR, Motion
-from gateway.vehicle.telemetry.streams import Stream, interval_us
+from gateway.vehicle.telemetry.streams import Pace, Stream, interval_us
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 STATE_MESSAGES: Final = (
@@ -70,7 +70,18 @@ class Telemetry:
         self._batteries: dict[int, Stream] = {}
         self._unix_offset_us: int | None = None
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
-        self._builders: dict[int, Builder] = {
+        self._pace = Pace()
+        """Of the IMU samples."""
+        self._state_streams = [
+            (message_id, self.streams[message_id]) for message_id in STATE_MESSAGES
+        ]
+        self._builders = self._own_builders()
+        self._timed = [*TIMED_MESSAGES]
+        self._take_added()
+
+    def _own_builders(self) -> dict[int, Builder]:
+        health = self.health
+        return {
             mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_state(
                 messages.attitude_quaternion
             ),
@@ -90,8 +101,6 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
         }
-        self._timed = [*TIMED_MESSAGES]
-        self._take_added()
 
     def add(self, message_id: int, builder: Builder) -> None:
         """Add a timed message that another service builds."""
@@ -139,8 +148,10 @@ class Telemetry:
         if self._reference_alt_m != self._reference_alt_m and messages.has_position(state):
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
-        due = [m for m in STATE_MESSAGES if self.streams[m].offer(state.time_us)]
-        return self._build_all(due, state.time_us) if due else []
+        time_us = state.time_us
+        period_us = self._pace.take(time_us)
+        due = [m for m, stream in self._state_streams if stream.offer_paced(time_us, period_us)]
+        return self._build_all(due, time_us) if due else []
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
         """Take in a barometer sample, and return its message if due."""
