@@ -13,13 +13,16 @@ import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
-from gateway.estimation.alignment.gps_latency import estimate_latency
+from gateway.estimation.alignment.gps_latency import GpsLatency, estimate_latency
+from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, is_table
 from gateway.flights.smoothed import gather_samples
 
 HEAD_LINES: Final = 20
+DOUBTFUL_S: Final = 0.03
+"""A position may be so much later than the velocity of the same fix, which alone is compared."""
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 USUAL: Final = ReferenceSettings()
 
@@ -64,20 +67,48 @@ def aircraft_for(
     known = is_table(files[0]) or "gps_latency_s" in facts
     if known or latency_s != USUAL.gps_latency_s:
         return aircraft
-    blocks = list(table.blocks)
-    table.blocks = iter(blocks)
-    log, _ = gather_samples(blocks, aircraft)
+    log = _samples_of(table, aircraft)
     if len(log.gps) == 0:
         return aircraft
     found = estimate_latency(log)
     if found is None:
         how = f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
     else:
-        estimate = f"{found.latency_s:.3f} s +- {found.std_s:.3f} s"
-        how = f"{estimate} is estimated from its manoeuvres"
+        how = f"{_in_words(found)} is estimated from its manoeuvres"
         aircraft = with_reference(aircraft, gps_latency_s=found.latency_s)
     table.remarks.append(f"{files[0]}: gives no GPS latency; {how}; gps_latency_s sets it")
     return aircraft
+
+
+def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) -> None:
+    """Add a remark where the motion of a recording speaks against the latency that is set.
+
+    Parameters
+    ----------
+    file : Path
+        For the remark.
+    table : RecordedTable
+        One of mavgate's own; its rows are read here, and kept for the next reader.
+    aircraft : AircraftSettings
+        What it is fused with; it is not changed, since the setting is the user's.
+    """
+    set_s = aircraft.estimation.reference.gps_latency_s
+    found = estimate_latency(_samples_of(table, aircraft))
+    if found is not None and abs(found.latency_s - set_s) > max(DOUBTFUL_S, 3.0 * found.std_s):
+        table.remarks.append(
+            f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
+            f"but gps_latency_s is {set_s:.2f} s"
+        )
+
+
+def _samples_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:
+    blocks = list(table.blocks)
+    table.blocks = iter(blocks)
+    return gather_samples(blocks, aircraft)[0]
+
+
+def _in_words(latency: GpsLatency) -> str:
+    return f"{latency.latency_s:.3f} s +- {latency.std_s:.3f} s"
 
 
 def facts_of(file: Path) -> dict[str, float]:

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from typer.testing import CliRunner
 
+from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.flights.flown import open_flown
@@ -50,6 +52,19 @@ def test_the_rows_are_read_once(untold: Path) -> None:
     table, again = open_rows(untold, OPTIONS), open_rows(untold, OPTIONS)
     aircraft_for([untold], table, OPTIONS)
     assert sum(map(len, table.blocks)) == sum(map(len, again.blocks)) > 0
+
+
+@pytest.mark.parametrize("set_s", [0.16, 0.4])
+def test_a_recording_that_was_fused_with_another_latency_is_told(
+    untold: Path, tmp_path: Path, set_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, config = tmp_path / "own.csv", tmp_path / "c.toml"
+    config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
+    convert = ["convert", str(untold), "-o", str(own), "--fuse", "--config", str(config)]
+    assert CliRunner().invoke(app, convert).exit_code == 0
+    assert load_flight(own, Loading(GatewaySettings())).latency_s == set_s
+    words = " ".join(capsys.readouterr().err.split())
+    assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
 
 
 def test_what_the_log_the_user_or_the_settings_tell_is_taken(untold: Path) -> None:

@@ -52,6 +52,10 @@ class ReportTable:
         """Write the cells as text."""
         return [[self._text(value) for value in row] for row in self.frame.itertuples(index=False)]
 
+    def is_text(self, column: int) -> bool:
+        """Return whether a column holds words, which begin at the left."""
+        return any(isinstance(value, str) for value in self.frame.iloc[:, column])
+
     def _text(self, value: object) -> str:
         if isinstance(value, float):
             return "–" if value != value else f"{value:z.{self.digits}f}"

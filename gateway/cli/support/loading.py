@@ -23,7 +23,7 @@ from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.joined import joined_tables
-from gateway.flights.log_facts import aircraft_for
+from gateway.flights.log_facts import aircraft_for, check_latency
 from gateway.flights.reading import ReadOptions, is_table, open_rows
 
 FlightArgument = Annotated[
@@ -81,6 +81,8 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         options = _read_options(loading, advance)
         table = joined_tables([open_rows(part, options) for part in parts])
         aircraft = aircraft_for(parts, table, options)
+        if is_table(parts[0]):
+            check_latency(parts[0], table, aircraft)
         fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:

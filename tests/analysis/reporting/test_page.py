@@ -98,6 +98,7 @@ def test_numbers_are_shown_short_and_unknown_ones_as_a_dash() -> None:
         "t", pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]}), "", digits=1
     )
     assert table.rows() == [["1.2", "x"], ["–", "y"]]
+    assert [table.is_text(0), table.is_text(1)] == [False, True]
 
 
 def test_prose_is_escaped() -> None:

@@ -25,6 +25,10 @@ SMOOTHED_STORY: Final = (
     " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
     "recording can be."
 )
+OWN_GPS: Final = (
+    "its own interpolated GPS, which is not independent: what follows the fixes' own errors agrees "
+    "best"
+)
 OTHER: Final = style.GREEN
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
@@ -50,11 +54,7 @@ def estimators(case: Case) -> Section | None:
                 "estimator_errors",
                 lambda width: _draw_errors(case, reference, width),
                 "Error of each estimator over the flight. "
-                + (
-                    "Tilt is the part of the attitude error about a horizontal axis. "
-                    if turns
-                    else ""
-                )
+                + (TILT if turns else "")
                 + "Without GPS the position drifts until it is back; its scale is logarithmic. "
                 "The first seconds, in which every estimator converges, do not count.",
             )
@@ -116,7 +116,7 @@ def _reference(case: Case) -> Reference | None:
     if case.frame is None:
         return None
     track = interpolate(fixes_of(case.flight), case.flight.time_us)
-    return Reference(track, is_exact=False, story="its own interpolated GPS, so not independent")
+    return Reference(track, is_exact=False, story=OWN_GPS)
 
 
 def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:

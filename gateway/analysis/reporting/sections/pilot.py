@@ -87,23 +87,34 @@ def _sum_text(gaps: tuple[tuple[float, float], ...]) -> str:
 
 
 def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
-    longest = max((end - begin for begin, end in figures.gps_outages_s), default=0.0)
+    outages = figures.gps_outages_s
+    longest = f"longest {max(end - begin for begin, end in outages):.1f} s" if outages else ""
     rows = [
         ("recorded", case.flight.duration_s, "s", ""),
         ("in the air", figures.airborne_s, "s", ""),
         ("distance over ground", figures.distance_m, "m", ""),
         ("highest above the first fix", figures.highest_m, "m", _feet(figures.highest_m)),
         ("fastest over ground", figures.fastest_mps, "m/s", _knots(figures.fastest_mps)),
-        ("fastest climb over a second", figures.climb_mps, "m/s", _feet(60 * figures.climb_mps)),
+        (
+            "fastest climb over a second",
+            figures.climb_mps,
+            "m/s",
+            _feet_a_minute(figures.climb_mps),
+        ),
         ("farthest from the first fix", figures.farthest_m, "m", ""),
-        ("GPS outages", float(len(figures.gps_outages_s)), "", f"longest {longest:.1f} s"),
-        ("link losses", float(len(figures.link_losses_s)), "", ""),
+        ("GPS outages", len(outages), "", longest),
+        ("link losses", len(figures.link_losses_s), "", ""),
     ]
-    return pd.DataFrame(rows, columns=["figure", "value", "unit", "also"])
+    # As objects, the counts stay whole numbers.
+    return pd.DataFrame(rows, columns=["figure", "value", "unit", "also"], dtype=object)
 
 
 def _feet(metres: float) -> str:
     return f"{metres * FEET_PER_M:.0f} ft"
+
+
+def _feet_a_minute(mps: float) -> str:
+    return f"{_feet(60 * mps)}/min"
 
 
 def _knots(mps: float) -> str:
