@@ -9,11 +9,13 @@ import pytest
 
 from gateway.estimation.columns import (
     GYRO,
+    MAG,
     NAV_ATTITUDE_STD,
     NAV_FLAGS,
     NAV_LAT,
     NAV_POS_STD,
 )
+from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
@@ -86,6 +88,31 @@ def test_real_car(data_dir: Path, how: str) -> None:
     assert tilt_deg < LIMIT_DEG
     assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
+
+
+@pytest.mark.parametrize("how", ["zero_rows", "no_height", "no_baro", "silence"])
+def test_real_quadrotor(data_dir: Path, how: str) -> None:
+    """Its compass carries iron, which the field's strength tells in the first turns."""
+    tilt_deg, heading_deg, place_m = off(
+        read_flight(data_dir / "px4_f450_glitch.csv.gz"), "eskf", how
+    )
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < LIMIT_DEG
+    assert place_m < PLACE_M
+
+
+def test_iron_that_the_compass_carries_is_found_by_the_strength_of_the_field(
+    flight: Flight,
+) -> None:
+    imu, iron = flight.log.imu.copy(), (8.0, -6.0, 3.0)
+    imu[:, MAG : MAG + 3] += iron
+    carried = replace(flight, log=replace(flight.log, imu=imu))
+    settings = EstimationSettings(estimator="eskf", reference=flight.reference)
+    estimator = make_estimator(settings)
+    out = estimator.run(carried.log)
+    np.testing.assert_allclose(estimator.state.mag_bias_b, iron, atol=0.5)
+    late = carried.log.imu_time_us * 1e-6 > 120.0
+    assert attitude_scores(replace(carried, counts=late), out[:, :4])["heading"] < 1.5
 
 
 def test_a_heading_that_nothing_tells_is_not_vouched_for(data_dir: Path) -> None:

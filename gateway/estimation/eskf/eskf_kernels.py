@@ -12,6 +12,7 @@ from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.iron import follow_field, look_for_iron
 from gateway.estimation.eskf.measure import (
     UNAIDED_CORRELATION_S,
     lag_integrals,
@@ -331,6 +332,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     """
     if s.lost == 1:
         return
+    look_for_iron(s, p, mag_b, s.time_s - s.mag_s)
     b = s.mag_bias_b
     mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
     field = rotate(as_quat(s.q_nb), mag_b)
@@ -338,8 +340,9 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     norm = math.hypot(level, field[2])
     if norm < MIN_FIELD_UT or level < 0.05 * norm or s.time_s <= s.mag_s:
         return
-    weight = take_field(s, p, norm, field[2])
-    weight *= field_similarity(s, norm, math.asin(field[2] / norm))
+    dip = math.asin(field[2] / norm)
+    follow_field(s, dip, s.time_s - s.mag_s)
+    weight = take_field(s, p, norm, field[2]) * field_similarity(s, norm, dip)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:

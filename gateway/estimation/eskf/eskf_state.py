@@ -63,6 +63,16 @@ class EskfState(FilterState):
     """The field that the compass was last used with, NED, uT; all zero before."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
+    iron_norm: float
+    """Mean strength of the field in flight, its iron in, uT."""
+    iron_along: Annotated[FloatArray, (3,)]
+    """Mean of how each axis of the iron adds to that."""
+    iron_s: float
+    """Over which time."""
+    iron_misfit: float
+    """Mean square by which the strength differs from what the known iron explains, uT2."""
+    iron_doubted: int
+    """1 once that was more than noise."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
     unaided_sq: float

@@ -1,0 +1,93 @@
+"""Iron that a compass carries along: the field's strength tells it, whatever the attitude is.
+
+A field that grows and shrinks as the aircraft turns has a part that turns along. With `B` the
+Earth's strength and `b` that part, `|m|^2 - |m - b|^2 = b . (2 m - b)` makes the strength of the
+raw field `|m| = B + b . d` with `d = (2 m - b) / (|m| + |m - b|)`. `B` goes out with the means of
+both sides.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.covariance import clear, inject, propagate, update_scalar
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import MAG_BIAS, TILT, EskfState
+from gateway.estimation.eskf.measure import COMPASS_CORRELATION_S, compass_row
+from gateway.estimation.kernel_record import as_vec
+from gateway.estimation.magfield import FIELD_TAU_S, STALE_MAG_S
+from gateway.records import Vec3
+
+MEAN_S: Final = 60.0
+"""The strength of the field itself stays the same over this time."""
+STRENGTH_NOISE: Final = 0.03
+"""Share by which the strength varies with no iron to find: soft iron, scale, currents."""
+MISFIT_S: Final = 20.0
+"""A strength that has varied for so long beyond its noise is that of unknown iron."""
+
+
+@compiled
+def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
+    """Compare the strength of a field with its mean, in flight.
+
+    Parameters
+    ----------
+    s : EskfState
+        Changed in place.
+    p : EskfGains
+        Constants.
+    raw : tuple of 3 floats
+        Field in body FRD with the iron still in, uT.
+    dt : float
+        Time since the field before, s.
+    """
+    if s.iron_search_started == 0 or s.at_rest == 1 or s.aided == 0:
+        return
+    b = s.mag_bias_b
+    c0, c1, c2 = raw[0] - b[0], raw[1] - b[1], raw[2] - b[2]
+    norm = math.sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2])
+    total = norm + math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+    along = ((raw[0] + c0) / total, (raw[1] + c1) / total, (raw[2] + c2) / total)
+    dt = min(dt, STALE_MAG_S)
+    s.iron_s += dt
+    share = dt / min(s.iron_s, MEAN_S)
+    s.iron_norm += share * (norm - s.iron_norm)
+    off = norm - s.iron_norm
+    for k in range(3):
+        s.iron_along[k] += share * (along[k] - s.iron_along[k])
+        off -= (along[k] - s.iron_along[k]) * b[k]
+    noise = (STRENGTH_NOISE * s.iron_norm) ** 2
+    s.iron_misfit += dt / MISFIT_S * (off * off - s.iron_misfit)
+    if s.iron_misfit > noise:
+        s.iron_doubted = 1
+        doubt_iron(s, (s.iron_misfit - noise) * dt / MISFIT_S)
+    if s.iron_doubted == 1:
+        propagate(s, p)
+        clear(s)
+        for k in range(3):
+            s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
+        update_scalar(s, off, noise * max(1.0, COMPASS_CORRELATION_S / dt), p.gate_sq)
+        inject(s)
+
+
+@compiled
+def follow_field(s: EskfState, dip: float, dt: float) -> None:
+    """Take for the usual field what is left of it without the iron that is just being found."""
+    if s.iron_doubted == 0 or s.mag_norm_ref == 0.0:
+        return
+    b = s.mag_bias_b
+    turned = s.iron_along[0] * b[0] + s.iron_along[1] * b[1] + s.iron_along[2] * b[2]
+    s.mag_norm_ref = s.iron_norm - turned
+    s.mag_dip_ref += min(dt, STALE_MAG_S) / FIELD_TAU_S * (dip - s.mag_dip_ref)
+
+
+@compiled
+def doubt_iron(s: EskfState, variance: float) -> None:
+    """Add to the variance of the iron, and to that of a heading which has followed the compass."""
+    compass_row(s, as_vec(s.field_n))
+    for k in range(MAG_BIAS, MAG_BIAS + 3):
+        turned = s.h[k] * variance
+        s.P[k, k] += variance
+        s.P[TILT + 2, k] -= turned
+        s.P[k, TILT + 2] -= turned
+        s.P[TILT + 2, TILT + 2] += s.h[k] * turned
