@@ -128,6 +128,8 @@ class FleetRun:
     lost: int
     lost_before: int
     """Of these, those that the fleet itself has missed by their numbers."""
+    shed: int
+    """Of these, those that the fleet could not take in time, and has counted."""
     p50_us: float
     p99_us: float
     router_cpu_percent: float
@@ -283,6 +285,7 @@ def _measure(
     while station.read(0.3):
         pass
     sent = round(expected)
+    missed, shed = np.sum([(0, 0), *map(lost_in, processes.sockets)], axis=0).tolist()
     shares = [100 * ns / elapsed_ns for ns in used]
     memory = [resident_kib(process.pid) for process in watched]
     if not processes.sockets:
@@ -292,7 +295,8 @@ def _measure(
         way=way,
         sent=sent,
         lost=sent - len(station.late_us),
-        lost_before=sum(missed(socket) for socket in processes.sockets),
+        lost_before=missed,
+        shed=shed,
         p50_us=float(np.percentile(station.late_us, 50)),
         p99_us=float(np.percentile(station.late_us, 99)),
         router_cpu_percent=shares[0],
@@ -302,18 +306,18 @@ def _measure(
     )
 
 
-def missed(path: Path) -> int:
-    """Ask a fleet what it has not got, or got and could not take."""
+def lost_in(path: Path) -> tuple[int, int]:
+    """Ask a fleet what it missed by the numbers, and how much of that it could not take in time."""
     status = request(path, "fleet.status")
     lost = [vehicle["lost"] for site in status["sites"] for vehicle in site["vehicles"]]
-    return sum(lost)
+    return sum(lost), status["overflowed"]
 
 
 def show(runs: list[FleetRun], rate_hz: int) -> None:
     """Print the figures."""
     table = Table(title=f"Sites at {rate_hz} messages/s each, loopback", box=box.SIMPLE_HEAD)
     for column in (
-        "sites", "way", "sent", "lost", "before", "p50 µs", "p99 µs", "router CPU %",
+        "sites", "way", "sent", "lost", "before", "shed", "p50 µs", "p99 µs", "router CPU %",
         "fleet CPU %",
         "router MiB", "fleet MiB",
     ):  # fmt: skip
@@ -325,6 +329,7 @@ def show(runs: list[FleetRun], rate_hz: int) -> None:
             f"{each.sent:,}",
             str(each.lost),
             str(each.lost_before),
+            str(each.shed),
             f"{each.p50_us:,.0f}",
             f"{each.p99_us:,.0f}",
             f"{each.router_cpu_percent:.1f}",

@@ -3,6 +3,7 @@
 import logging
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -10,6 +11,7 @@ from gateway.edges.hub.fleet_link.site_keys import OWN, out_key, ping_key, prese
 from gateway.edges.hub.fleet_link.zenoh_session import (
     Inlet,
     Outlets,
+    Reader,
     end_session,
     open_session,
     session_config,
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PATTERN: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}")
+MAX_KEYS: Final = 4096
+"""More than there are vehicles that can have an id."""
 PING_TIMEOUT_S: Final = 5.0
 """An answer that takes longer tells nothing of the link."""
 
@@ -83,6 +87,9 @@ class FleetSession:
         self._session: zenoh.Session | None = None
         self.outlets: Outlets | None = None
         self._inlets: list[Inlet[Any]] = []
+        self._readers: list[Reader] = []
+        self._keys: dict[str, zenoh.KeyExpr | None] = {}
+        """Those that are declared, for as long as they are kept."""
         self._declared: list[object] = []
         self._trouble = ""
 
@@ -100,7 +107,7 @@ class FleetSession:
     @property
     def overflowed(self) -> int:
         """Messages that came faster than they could be taken."""
-        return sum(inlet.dropped for inlet in self._inlets)
+        return sum(reader.dropped for reader in self._readers)
 
     async def open(self) -> None:
         """Open the session if it is not open, and declare what is wanted; trouble is told once."""
@@ -121,6 +128,8 @@ class FleetSession:
         """End the session; it says good-bye by itself, which may take a moment."""
         for inlet in self._inlets:
             inlet.close()
+        for reader in self._readers:
+            reader.close()
         if self.outlets is not None:
             self.outlets.close()
         if self._session is not None:
@@ -181,21 +190,15 @@ class FleetSession:
         import zenoh
 
         events = self._events
-        frames: Inlet[tuple[str, bytes, bool]] = Inlet(
-            lambda sample: events.frames(site_of(sample[0]), *sample[1:])
-        )
         presence: Inlet[tuple[str, bool]] = Inlet(self._note_token)
         trips: Inlet[tuple[str, int]] = Inlet(lambda item: events.round_trip(*item))
-        self._inlets = [frames, presence, trips]
+        self._inlets = [presence, trips]
         here = zenoh.SampleKind.PUT
         for pattern in self.patterns:
+            reader = Reader(session, out_key(pattern, "*"), self._take)
+            self._readers.append(reader)
             self._declared += [
-                session.declare_subscriber(
-                    out_key(pattern, "*"),
-                    lambda sample: frames.put(
-                        (str(sample.key_expr), sample.payload.to_bytes(), _is_own(sample))
-                    ),
-                ),
+                reader,
                 session.liveliness().declare_subscriber(
                     presence_key(pattern, "*"),
                     lambda sample: presence.put((str(sample.key_expr), sample.kind == here)),
@@ -203,14 +206,27 @@ class FleetSession:
                 ),
             ]
 
+    def _take(self, sample: "zenoh.Sample") -> None:
+        key, mark = str(sample.key_expr), sample.attachment
+        if key not in self._keys and len(self._keys) < MAX_KEYS:
+            self._keys[key] = None
+            off_loop(_declare_key, self._session, key, self._keys)
+        is_own = mark is not None and mark.to_bytes() == OWN
+        self._events.frames(site_of(key), sample.payload.to_bytes(), is_own)
+
     def _note_token(self, news: tuple[str, bool]) -> None:
         key, is_here = news
         self._events.presence(site_of(key), key.rpartition("/")[2], is_here)
 
 
-def _is_own(sample: "zenoh.Sample") -> bool:
-    mark = sample.attachment
-    return mark is not None and mark.to_bytes() == OWN
+def _declare_key(
+    session: "zenoh.Session", key: str, declared: "dict[str, zenoh.KeyExpr | None]"
+) -> None:
+    """Have Zenoh find once who takes a key: it would look at the tokens of all sites a message."""
+    import zenoh
+
+    with suppress(zenoh.ZError):
+        declared[key] = session.declare_keyexpr(key)
 
 
 def key_pattern(site: str) -> str:

@@ -8,7 +8,9 @@ nothing before a whole run of its frames had been here. What a site has marked a
 gateway is not asked about at all.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
+
+import msgspec
 
 from gateway.fleet.id_map import Vehicle
 from gateway.routing.routing_table import FrameMemory
@@ -27,7 +29,7 @@ NO_SITE: Final = ""
 """Stations here belong to none."""
 
 
-class _Given(NamedTuple):
+class _Given(msgspec.Struct, frozen=True, gc=False):
     """A frame that was given out."""
 
     time_us: int

@@ -9,7 +9,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import PATIENT_IDS, Outlets
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.routing.endpoint import Endpoint
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import SplitFault, split_datagram
+from gateway.wire.mavlink_splitter import SplitFault, key_of, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
 """No message has this number. One site's telemetry is none of another's: a site gets what addresses
@@ -29,6 +29,11 @@ class SiteClient(Client):
         """Whether a session of it is there."""
         return bool(self.tokens)
 
+    @property
+    def has_fast_path(self) -> bool:
+        """Whether it looks into `express` for what it has received."""
+        return True
+
     def set_up(
         self, translation: FrameTranslation, outlets: Callable[[], Outlets | None]
     ) -> "SiteClient":
@@ -42,15 +47,20 @@ class SiteClient(Client):
     def take(self, data: bytes, *, is_own: bool) -> None:
         """Take what the site has published; of its gateway's own vehicles, or of its clients."""
         now_us = self.context.now_us()
-        events: list[bytes | SplitFault] = []
-        for event in split_datagram(data):
-            if isinstance(event, SplitFault):
-                events.append(event)
-            elif (frame := self.translation.from_site(event, now_us, is_own=is_own)) is not None:
-                events.append(frame)
         if self.state != "open":
             self.become("open")
-        self.receive(events, len(data), now_us)
+        for event in split_datagram(data):
+            if isinstance(event, SplitFault):
+                self.receive([event], event.size, now_us)
+                continue
+            frame = self.translation.from_site(event, now_us, is_own=is_own)
+            if frame is None:
+                continue
+            if express := self.express.get(key_of(frame)):
+                self.heard_us = now_us
+                express.send(frame)
+            else:
+                self.receive([frame], len(frame), now_us)
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Publish a frame for a vehicle of the site."""

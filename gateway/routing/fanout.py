@@ -292,15 +292,13 @@ class Fanout:
         origin = origin_of(frame)
         plan = _Plan(message_id_of(frame), origin, is_ours)
         for outlet in self._outlets.values():
-            stamp = outlet.stamp_of(origin)
             interval_us = outlet.interval_us(key_of(frame), plan)
-            lane = _Lane(outlet.client_id, outlet.transmit, stamp, interval_us)
             if interval_us == NO_MESSAGES:
-                plan.closed.append(stamp)
-            elif interval_us:
-                plan.limited.append(lane)
-            else:
-                plan.open.append(lane)
+                if is_ours:
+                    plan.closed.append(outlet.stamp_of(origin))
+                continue
+            lane = _Lane(outlet.client_id, outlet.transmit, outlet.stamp_of(origin), interval_us)
+            (plan.limited if interval_us else plan.open).append(lane)
         self._plans[key_of(frame)] = plan
         return plan
 

@@ -113,4 +113,3 @@ async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
     for close in rig.closing:
         close()
     rig.closing.clear()
-    await asyncio.sleep(0.1)

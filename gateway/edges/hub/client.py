@@ -94,6 +94,11 @@ class Client:
         """Whether a frame may be passed to `write` directly."""
         return False
 
+    @property
+    def has_fast_path(self) -> bool:
+        """Whether it looks into `express` for what it has received."""
+        return self.is_direct
+
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
         """Handle a failed `write` whose frame will still be counted as sent."""
         raise NotImplementedError

@@ -241,7 +241,7 @@ class Router:
             self._fanout.deliver(frame, self._table.ways_to_vehicles(client.client_id))
             return
         self._fanout.forward(frame, client.client_id, now_us)
-        if telemetry and client.is_direct:
+        if telemetry and client.has_fast_path:
             self._open_express(client, frame, now_us)
 
     def _open_express(self, client: Client, frame: bytes, now_us: int) -> None:

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ import zenoh
 
 from gateway.edges.hub.fleet_link import zenoh_session
 from gateway.edges.hub.fleet_link.site_keys import OWN
-from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inlet
+from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inlet, Reader
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.edges.hub.conftest import Rig
 
@@ -320,6 +321,52 @@ class TestInlet:
         inlet.put(0)
         await asyncio.sleep(0)
         assert len(taken) == MAX_WAITING
+
+
+class TestReader:
+    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest_telemetry_of_all_alike(
+        self, router: Router, visit: Callable[..., Far], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(zenoh_session, "MAX_WAITING", 100)
+        monkeypatch.setattr(zenoh_session, "AT_ONCE", 10)
+        far, near = visit(), visit()
+        taken: list[tuple[str, bytes]] = []
+        all_sent = threading.Event()
+        reader = Reader(
+            near.session,
+            "flood/*",
+            lambda sample: taken.append((str(sample.key_expr), sample.payload.to_bytes())),
+        )
+        end = near.session.declare_subscriber("end", lambda _: all_sent.set())
+        async with asyncio.timeout(10):
+            while not taken:
+                far.session.put("flood/a", b"begin")
+                await asyncio.sleep(0.01)
+            far.session.put("flood/a", b"last")
+            while taken[-1][1] != b"last":
+                await asyncio.sleep(0.01)
+        high = zenoh.Priority.INTERACTIVE_HIGH
+        for number in range(3):
+            far.session.put("flood/a", b"%d" % number, priority=high)
+        for number in range(80):
+            for site in "ab":
+                far.session.put(f"flood/{site}", b"%d" % number)
+        far.session.put("end", b"")
+        assert all_sent.wait(10), "the loop stands still meanwhile"
+        del taken[:]
+        most = 0
+        while len(taken) < 103:
+            before = len(taken)
+            await asyncio.sleep(0)
+            most = max(most, len(taken) - before)
+        assert taken[:3] == [("flood/a", b"%d" % number) for number in range(3)]
+        newest = [(f"flood/{site}", b"%d" % number) for number in range(30, 80) for site in "ab"]
+        assert taken[3:] == newest
+        assert reader.dropped == 60
+        assert most <= 3 + 2 * 10
+        end.undeclare()
+        reader.close()
+        reader.undeclare()
 
 
 SITE = """

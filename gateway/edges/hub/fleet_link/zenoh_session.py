@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HOW_TO_ADD: Final = "the fleet is an extra: pip install 'mavgate[fleet]'"
-MAX_WAITING: Final = 8192
-"""What has come and was not taken yet: more than a second of a hundred aircraft."""
+MAX_WAITING: Final = 4096
+"""What has come and was not taken yet: a third of a second of two hundred aircraft."""
 AT_ONCE: Final = 64
 """Taken in one turn of the loop, so that a flood cannot starve the others."""
 MAX_PATIENT: Final = 1024
@@ -163,6 +163,82 @@ class Inlet(Generic[Item]):
         if self._waiting and not self._is_due:
             self._is_due = True
             self._loop.call_soon(self._drain)
+
+
+class Reader:
+    """Hands what a subscription brings to the loop, in order; when too much waits the oldest go.
+
+    Zenoh would call back once a message on a thread of its own, and each call would wait until the
+    loop's thread lets go of Python: at thousands of messages a second that costs more than all that
+    is done with them. Here a thread waits for the first message, wakes the loop, and sleeps until
+    the loop has taken all that has come meanwhile.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        An open session.
+    key : str
+        What is subscribed to.
+    take : callable
+        Called on the loop with each message.
+    """
+
+    def __init__(
+        self, session: "zenoh.Session", key: str, take: Callable[["zenoh.Sample"], None]
+    ) -> None:
+        import zenoh
+
+        self._take = take
+        self._usual = zenoh.Priority.DATA
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[zenoh.Sample] = deque()
+        self._all_taken = threading.Event()
+        self._is_closed = False
+        # Twice, so that what the loop could not take is dropped and counted here, not in there.
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(2 * MAX_WAITING)
+        self._subscriber: Any = session.declare_subscriber(key, ring)
+        self.dropped = 0
+        threading.Thread(target=self._wait, name=key, daemon=True).start()
+
+    def close(self) -> None:
+        """Take nothing more."""
+        self._is_closed = True
+        self._all_taken.set()
+
+    def undeclare(self) -> None:
+        """End the subscription."""
+        self._subscriber.undeclare()
+
+    def _wait(self) -> None:
+        for sample in self._subscriber:
+            self._all_taken.clear()
+            try:
+                self._loop.call_soon_threadsafe(self._drain, sample)
+            except RuntimeError:
+                # The loop has ended meanwhile.
+                return
+            if self._is_closed:
+                return
+            self._all_taken.wait()
+
+    def _drain(self, sample: "zenoh.Sample | None" = None) -> None:
+        waiting = self._waiting
+        while not self._is_closed and (sample := sample or self._subscriber.try_recv()) is not None:
+            waiting.append(sample)
+            sample = None
+        for _ in range(len(waiting) - MAX_WAITING):
+            oldest = waiting.popleft()
+            if oldest.priority == self._usual:
+                self.dropped += 1
+            else:
+                # Commands, parameters, missions, texts: none of them comes again.
+                self._take(oldest)
+        for _ in range(min(AT_ONCE, len(waiting))):
+            self._take(waiting.popleft())
+        if waiting:
+            self._loop.call_soon(self._drain)
+        else:
+            self._all_taken.set()
 
 
 class Outlets:
