@@ -228,5 +228,15 @@ def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(data_dir: Path, n
     assert heading_deg < 8.0
 
 
+@pytest.mark.parametrize(
+    "name", ["broad_02_undisturbed_slow_rotation_B", "broad_15_undisturbed_fast_translation_A"]
+)
+def test_a_heading_by_compass_alone_is_as_unsure_as_the_iron_left(
+    data_dir: Path, name: str
+) -> None:
+    flight = read_flight(data_dir / f"{name}.csv.gz")
+    assert share(two_sigma(flight, run_eskf(flight))["heading"]) > 0.95
+
+
 def test_every_way_of_spoiling_applies_to_a_whole_flight(flight: Flight) -> None:
     assert all(applies(how, flight) for how in SPOILS)

@@ -60,6 +60,11 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3] = NAN
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
+        level_ut = math.hypot(s.field_n[0], s.field_n[1])
+        if s.iron_search_started == 0 and level_ut > 0.0:
+            # Iron that nothing tells from the heading yet turns it for as long as a flight lasts.
+            std_rad = math.hypot(row[NAV_ATTITUDE_STD + 2], s.left_iron_ut / level_ut)
+            row[NAV_ATTITUDE_STD + 2] = std_rad
         if s.heading_known == 1 and s.heading_true == 0:
             row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], DECLINATION_RAD)
     write_place(s, row)

@@ -61,6 +61,8 @@ class EskfState(FilterState):
     mag_used_s: float
     field_n: Annotated[FloatArray, (3,)]
     """The field that the compass was last used with, NED, uT; all zero before."""
+    left_iron_ut: float
+    """Standard deviation per axis of the iron that the calibration left."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
     iron_norm: float

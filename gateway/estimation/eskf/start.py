@@ -49,6 +49,7 @@ def start(s: EskfState, p: EskfGains) -> None:
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
         s.rate_b[k] = NAN
     s.declination_rad = p.declination_rad
+    s.left_iron_ut = math.sqrt(p.mag_bias_var)
     forget_times(s)
 
 

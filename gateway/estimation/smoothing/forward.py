@@ -117,21 +117,13 @@ def is_renewed(s: EskfState, copy: EskfState) -> bool:
 
 
 @compiled
-def keep_unmodelled(s: EskfState, p: EskfGains, row: FloatArray) -> None:
-    """Leave of the standard deviations told only what they hold beyond the covariance.
-
-    Iron that is no state yet, for want of GPS, turns the heading for as long as a flight lasts: the
-    filter's drift outweighs it, but an average over the flight does not.
-    """
+def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
+    """Leave of the standard deviations told only what they hold beyond the covariance."""
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         for k in range(3):
             beyond = row[column + k] ** 2 - s.P[first + k, first + k]
             # NaN, which is told of what is not known, stays.
             row[column + k] = 0.0 if beyond < 0.0 else math.sqrt(beyond)
-    level_ut = math.hypot(s.field_n[0], s.field_n[1])
-    if s.iron_search_started == 0 and level_ut > 0.0:
-        iron_rad = math.sqrt(p.mag_bias_var) / level_ut
-        row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], iron_rad)
 
 
 @compiled
@@ -203,7 +195,7 @@ def run_forward(
             if s.aided == 0:
                 # The place is no state then: it is that of the newest fix.
                 write_place(s, out[i])
-            keep_unmodelled(told, p, out[i])
+            keep_unmodelled(told, out[i])
         propagate(s, p)
         foresee(copy, p, F[k])
         end_node(s, copy, F[k], foreseen[k])
