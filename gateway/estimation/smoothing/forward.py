@@ -44,6 +44,8 @@ from gateway.geometry.quaternion import multiply
 
 BoolArray = NDArray[np.bool_]
 
+SHOWN: Final = 2
+
 take_earlier: Final = KERNELS.earlier
 
 
@@ -156,6 +158,7 @@ def run_forward(
     foreseen: FloatArray,
     d: FloatArray,
     anew: BoolArray,
+    shown: FloatArray,
 ) -> None:
     """Run the filter, and a copy of it from each node to the next.
 
@@ -178,10 +181,15 @@ def run_forward(
         Filled: what the measurements of each stretch have taught.
     anew : ndarray of bool, shape (n,)
         Filled: whether a part of the filter's state began anew in the stretch up to this sample.
+    shown : ndarray, shape (m, SHOWN)
+        What is known beforehand of flight without GPS, by stretch: `unaided_sq` and `flies`. Filled
+        with what this pass has shown.
     """
     s, copy = states[0], states[1]
     taken = np.zeros(2, np.int64)
     for k in range(nodes.shape[0] - 1):
+        s.unaided_sq = max(s.unaided_sq, shown[k, 0])
+        s.flies = max(s.flies, int(shown[k, 1]))
         begin_node(s, p, P[k], F[k])
         states[1] = states[0]
         for i in range(nodes[k], nodes[k + 1]):
@@ -200,3 +208,6 @@ def run_forward(
         foresee(copy, p, F[k])
         end_node(s, copy, F[k], foreseen[k])
         learned(s, copy, d[k])
+        flown = s.aided == 0 and s.at_rest == 0
+        shown[k, 0] = s.unaided_sq if flown else 0.0
+        shown[k, 1] = s.flies if flown else 0.0

@@ -5,6 +5,9 @@ measurements from there on have moved it, as far as the two hang together [1]_. 
 from its end as well as from its begin. Of a state that the filter began anew, as an attitude that
 was lost, what came later says nothing of what was before; of the other states it still does.
 
+A flight without GPS surprises the filter, which took it for rest or for a hand's motion up to then.
+So it is run over once more, knowing of the flight beforehand.
+
 References
 ----------
 .. [1] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic
@@ -27,10 +30,11 @@ from gateway.estimation.columns import (
     NAV_VEL,
     NAV_VEL_STD,
 )
+from gateway.estimation.eskf.eskf_kernels import FLOWN_S, WAY_S
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.estimation.smoothing.forward import BoolArray, run_forward
+from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
 from gateway.geometry.geodesy import radii_m
 
 NODE_S: Final = 0.2
@@ -70,11 +74,17 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, foreseen = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
-    run_forward(
+    shown = np.zeros((count, SHOWN))
+    arguments = (
         states, estimator.gains, nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
-        out, P, F, foreseen, d, anew,
+        out, P, F, foreseen, d, anew, shown,
     )  # fmt: skip
+    run_forward(*arguments)
+    if shown.any():
+        shown[:] = _hindsight(shown)
+        states[0] = state
+        run_forward(*arguments)
     begins, ends, variances = _backward(P, F, foreseen, d, states[0]["P"])
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out
@@ -87,6 +97,29 @@ def _nodes(time_us: IntArray) -> IntArray:
     slot = (time_us - time_us[0]) // round(NODE_S * 1e6)
     firsts = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1) != 0)
     return np.append(firsts, len(time_us)).astype(np.int64)
+
+
+def _hindsight(shown: FloatArray) -> FloatArray:
+    """Expect the speed of a flight without GPS as long before it showed as after.
+
+    Parameters
+    ----------
+    shown : ndarray, shape (m, SHOWN)
+        See `run_forward`.
+
+    Returns
+    -------
+    ndarray, shape (m, SHOWN)
+        For a second pass.
+    """
+    known = shown.copy()
+    kept = math.exp(-NODE_S / FLOWN_S)
+    for k in range(len(known) - 2, -1, -1):
+        known[k, 0] = max(known[k, 0], kept * known[k + 1, 0])
+    # What shows a flight is the way of the last seconds.
+    for _ in range(round(WAY_S / NODE_S)):
+        known[:-1, 1] = np.maximum(known[:-1, 1], known[1:, 1])
+    return known
 
 
 def _backward(
