@@ -88,7 +88,9 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
     """Fly, with stations beside it."""
     ports = free_ports(4)
     settings = settings_in(folder, options.vehicles, ports)
-    make_ready(settings.estimation.estimator)
+    compiling = make_ready(settings.estimation.estimator)
+    while compiling is not None and compiling.take_one():
+        pass
     watch = TurnWatch()
     visitors = subprocess.Popen(
         [sys.executable, Path(__file__).with_name("visitors.py"), *map(str, ports)],

@@ -3,15 +3,12 @@
 import multiprocessing
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.pool import Pool
 from typing import Any, Final
 
 START: Final = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-
-WAIT_S: Final = 0.2
-"""Between two looks at whether processes have ended."""
 
 
 def cores() -> int:
@@ -41,26 +38,6 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
         pool = multiprocessing.get_context(START).Pool(count, begin, arguments)
     with pool:
         yield pool
-
-
-def run_copies(
-    work: Callable[[Any], None],
-    arguments: Iterable[Any],
-    while_waiting: Callable[[], None] = lambda: None,
-) -> None:
-    """Call a function in one process per argument, and wait; a killed one is not waited for.
-
-    Unlike those of a pool, they end by themselves if this process is killed. `while_waiting` is
-    called some times a second.
-    """
-    processes = [multiprocessing.Process(target=work, args=(a,), daemon=True) for a in arguments]
-    with no_warning_of_threads():
-        for process in processes:
-            process.start()
-    for process in processes:
-        while process.exitcode is None:
-            process.join(WAIT_S)
-            while_waiting()
 
 
 def begin_copy(work: Callable[[Any], None], argument: Any) -> None:

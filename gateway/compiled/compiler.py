@@ -20,7 +20,7 @@ from numba import carray, types  # type: ignore[attr-defined]
 from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic, overload, typeof_impl
 
-from gateway.compiled import array_at, digest_of, is_compiled
+from gateway.compiled import array_at, digest_of, is_compiled, record_at
 from gateway.compiled.machine_code import ENTRY, MachineCode
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
@@ -165,5 +165,13 @@ _pointer_to: Any = intrinsic(_make_pointer)
 def _array_at(address: Any, shape: Any, kind: Any) -> Any:  # noqa: ARG001
     def see(address: Any, shape: Any, kind: Any) -> Any:
         return carray(_pointer_to(address), shape, kind)
+
+    return see
+
+
+@overload(record_at)
+def _record_at(address: Any, layout: Any) -> Any:  # noqa: ARG001
+    def see(address: Any, layout: Any) -> Any:
+        return carray(_pointer_to(address), 1, layout)[0]
 
     return see

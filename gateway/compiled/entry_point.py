@@ -3,13 +3,13 @@
 import ctypes
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import update_wrapper
 from inspect import signature
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 from gateway.compiled import compiled, digest_of
-from gateway.compiled.machine_code import keep_code, kept_code, load_code
+from gateway.compiled.machine_code import MachineCode, keep_code, kept_code, load_code
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -59,12 +59,20 @@ class EntryPoint(Generic[Parameters]):
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         """Call it."""
         if self._loaded is None:
-            self._loaded = self._load()
+            self._loaded = self._load(self.code())
         self._loaded(*args, **kwargs)
 
     def prepare(self) -> None:
         """Load or compile it before it is called."""
-        self._loaded = self._loaded or self._load()
+        self._loaded = self._loaded or self._load(self.code())
+
+    def interpret(self) -> None:
+        """Run it as Python until `take`, unless it is loaded; that is much slower."""
+        self._loaded = self._loaded or self._run_as_python
+
+    def take(self, code: MachineCode) -> None:
+        """Load machine code that another process has got by `code`."""
+        self._loaded = self._load(code)
 
     @property
     def is_kept(self) -> bool:
@@ -73,7 +81,14 @@ class EntryPoint(Generic[Parameters]):
             return True
         return kept_code(self._name, digest_of(self._function)) is not None
 
-    def _load(self) -> Callable[..., None]:
+    def code(self) -> MachineCode:
+        """Read its machine code from the cache, or compile it and cache it.
+
+        Raises
+        ------
+        NotCompiledError
+            If it is not there and `nothing_compiled` holds.
+        """
         name, digest = self._name, digest_of(self._function)
         code = kept_code(name, digest)
         if code is None:
@@ -84,9 +99,18 @@ class EntryPoint(Generic[Parameters]):
 
             code = compile_entry(self._function)
             keep_code(name, digest, code)
+        return code
+
+    def _load(self, code: MachineCode) -> Callable[..., None]:
         parameters = signature(self._function).parameters.values()
         prototype = ctypes.PYFUNCTYPE(None, *(C_TYPES[p.annotation] for p in parameters))
         return prototype(load_code(code))
+
+    def _run_as_python(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        # Python raises where machine code goes on with NaN. Then the rest of the call is left out:
+        # no number of a sensor may stop the telemetry.
+        with suppress(ArithmeticError, ValueError):
+            self._function(*args, **kwargs)
 
 
 class _Dispatched(Generic[Parameters, Result]):

@@ -1,91 +1,113 @@
-"""What the first start shows, and what helps at the prompt."""
+"""What runs before everything is compiled, and what helps at the prompt."""
 
-import io
+import asyncio
+import math
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from pathlib import Path
 
+import numpy as np
 import pytest
-from rich.console import Console
 
 from gateway.cli.app import app
 from gateway.cli.support import warm_up
 from gateway.cli.support.warm_up import ENTRY_POINTS, SCANNER, make_ready
+from gateway.compiled import address_of, array_at, compiled_with
 from gateway.compiled.entry_point import EntryPoint
 
 pytestmark = pytest.mark.io
 
 
-class Compiler:
-    """A compiler that takes no time, and what it was asked for: where, and of which estimator."""
+FLOAT = np.dtype(np.float64)
 
-    def __init__(self, kept: set[str]) -> None:
-        self.kept = kept
-        self.asked: list[tuple[str, str]] = []
 
-    def is_kept(self, name: str) -> bool:
-        return name in self.kept
+def divide(numbers: int) -> None:
+    """Python raises at zero, machine code writes infinity."""
+    two = array_at(numbers, (2,), FLOAT)
+    two[0] = two[0] / two[1]
 
-    def apart(
-        self,
-        _work: object,
-        shares: Iterable[Iterable[EntryPoint[...]]],
-        while_waiting: Callable[[], None],
-    ) -> None:
-        while_waiting()
-        entry_points = [entry_point for share in shares for entry_point in share]
-        names = [n for n, known in ENTRY_POINTS.items() if set(known) <= set(entry_points)]
-        assert {point for n in names for point in ENTRY_POINTS[n]} == set(entry_points)
-        self.asked += [("apart", name) for name in names]
-        self.kept.update(names)
 
-    def behind(self, _work: object, names: Iterable[str]) -> None:
-        self.asked += [("behind", name) for name in names]
-
-    def here(self, name: str) -> None:
-        assert name in self.kept, "telemetry would wait for the compiler in this process"
-        self.asked.append(("here", name))
+def quotient(entry_point: EntryPoint[int], one: float, other: float) -> float:
+    numbers = np.array([one, other])
+    entry_point(address_of(numbers))
+    return float(numbers[0])
 
 
 @pytest.fixture
-def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
-    found = Compiler(set())
-    monkeypatch.setattr(warm_up, "is_kept", found.is_kept)
-    monkeypatch.setattr(warm_up, "run_copies", found.apart)
-    monkeypatch.setattr(warm_up, "begin_copy", found.behind)
-    monkeypatch.setattr(warm_up, "_rehearse", found.here)
+def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, EntryPoint[int]]:
+    """Stand for what a gateway needs, with nothing cached."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    found = {
+        name: EntryPoint(compiled_with(divide, {}, str(k))) for k, name in enumerate(ENTRY_POINTS)
+    }
+    monkeypatch.setattr(warm_up, "ENTRY_POINTS", {name: (one,) for name, one in found.items()})
+    monkeypatch.setattr(warm_up, "_rehearse", lambda _: None)
     return found
 
 
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_the_first_start_waits_for_the_chosen_estimator_alone(
-    compiler: Compiler, monkeypatch: pytest.MonkeyPatch, is_terminal: bool
+@pytest.fixture
+def compiled_names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names that are compiled, in their order."""
+    names: list[str] = []
+    monkeypatch.setattr(warm_up, "Compilation", names.extend)
+    return names
+
+
+def test_the_first_start_runs_as_python_until_the_machine_code_comes(
+    points: dict[str, EntryPoint[int]],
 ) -> None:
-    shown = io.StringIO()
-    console = Console(file=shown, force_terminal=is_terminal, width=100)
-    monkeypatch.setattr(warm_up, "console_of", lambda **_: console)
-    make_ready("eskf")
-    first = [(where, name) for where in ("apart", "here") for name in ("eskf", SCANNER)]
-    others = [("behind", name) for name in ENTRY_POINTS if name not in ("eskf", SCANNER)]
-    assert compiler.asked == [*first, *others]
-    assert ("compiling the estimator" in shown.getvalue()) == is_terminal
+    compiling = make_ready("eskf")
+    assert compiling is not None
+    for point in points.values():
+        assert quotient(point, 7.0, 2.0) == 3.5
+        assert quotient(point, 1.0, 0.0) == 1.0, "what Python refuses is left out"
+    machine = []
+    while compiling.take_one():
+        machine.append([name for name, p in points.items() if quotient(p, 1.0, 0.0) == math.inf])
+    assert [len(names) for names in machine] == [1, 2, 3, 4]
+    assert machine[0] == [SCANNER]
+    assert set(machine[1]) == {SCANNER, "eskf"}
+    assert make_ready("eskf") is None, "all of it is cached"
 
 
-def test_others_that_are_missing_are_not_waited_for(compiler: Compiler) -> None:
-    compiler.kept.update({"complementary", "paper", SCANNER})
+async def test_the_event_loop_takes_the_machine_code(points: dict[str, EntryPoint[int]]) -> None:
+    compiling = make_ready("paper")
+    assert compiling is not None
+    compiling.watch()
+    async with asyncio.timeout(60.0):
+        while any(quotient(point, 1.0, 0.0) == 1.0 for point in points.values()):
+            await asyncio.sleep(0.01)
+
+
+def test_without_a_compiler_it_goes_on_as_python(
+    points: dict[str, EntryPoint[int]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(warm_up, "_compile", lambda _: os.kill(os.getpid(), signal.SIGKILL))
+    compiling = make_ready("paper")
+    assert compiling is not None
+    assert not compiling.take_one()
+    assert "the compiler has failed" in caplog.text
+    assert quotient(points["paper"], 7.0, 2.0) == 3.5
+
+
+def test_the_chosen_estimators_are_compiled_first(
+    points: dict[str, EntryPoint[int]], compiled_names: list[str]
+) -> None:
+    make_ready("eskf", "complementary")
+    assert compiled_names == [SCANNER, "eskf", "complementary", "paper"]
+
+
+def test_what_is_cached_is_not_compiled(
+    points: dict[str, EntryPoint[int]], compiled_names: list[str]
+) -> None:
+    for name in ("paper", SCANNER):
+        points[name].prepare()
     make_ready("complementary")
-    here = [("here", name) for name in ("complementary", SCANNER)]
-    assert compiler.asked == [*here, ("behind", "eskf")]
-
-
-def test_every_aircraft_with_an_estimator_of_its_own_has_it_at_the_start(
-    compiler: Compiler,
-) -> None:
-    make_ready("complementary", "eskf")
-    chosen = {"complementary", "eskf", SCANNER}
-    assert {name for where, name in compiler.asked if where == "apart"} == chosen
-    assert {name for where, name in compiler.asked if where == "here"} == chosen
-    assert compiler.asked[-1] == ("behind", "paper")
+    assert compiled_names == ["complementary", "eskf"]
 
 
 def test_the_gateway_holds_no_machine_code_that_is_not_made_ready() -> None:
@@ -100,13 +122,6 @@ def test_the_gateway_holds_no_machine_code_that_is_not_made_ready() -> None:
     )
     done = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
     assert done.stdout.split() == ["run", "run", "10"]
-
-
-def test_a_later_start_shows_nothing(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
-    compiler.kept.update(ENTRY_POINTS)
-    monkeypatch.setattr(warm_up, "console_of", lambda **_: pytest.fail("a clock"))
-    make_ready("paper")
-    assert compiler.asked == [("here", "paper"), ("here", SCANNER)]
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) ->
         free.bind(("127.0.0.1", 0))
         place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     # Once for all: three sites that compile at the same time would take minutes.
-    make_ready(EstimationSettings().estimator)
+    compiling = make_ready(EstimationSettings().estimator)
+    while compiling is not None and compiling.take_one():
+        pass
     running: dict[str, Gateway] = {}
     ports = free_udp_ports(3)
     words = [sys.executable, "-m", "gateway.cli", "fleet", "--listen", place, "--site", "field-*"]

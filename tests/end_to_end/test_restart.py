@@ -80,7 +80,9 @@ async def run(folder: Path, use: Callable[[int], Any]) -> Any:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    make_ready("complementary")
+    compiling = make_ready("complementary")
+    while compiling is not None and compiling.take_one():
+        pass
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path
 

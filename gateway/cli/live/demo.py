@@ -81,7 +81,7 @@ def demo(
         return with_endpoints(load_settings(config), endpoint)
 
     settings = or_refuse(read)
-    make_ready(settings.estimation.estimator)
+    compiling = make_ready(settings.estimation.estimator)
     daemons: list[Daemon] = []
 
     def report(text: str) -> None:
@@ -113,7 +113,7 @@ def demo(
             return daemons[0]
 
         page = PanelProcess(config) if panel and is_installed() else None
-        asyncio.run(serve(daemon, plain=plain, panel=page))
+        asyncio.run(serve(daemon, plain=plain, panel=page, compiling=compiling))
 
 
 def recorded_line(

@@ -20,7 +20,7 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_aircraft,
 )
-from gateway.cli.support.warm_up import make_ready
+from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
@@ -73,9 +73,12 @@ def run_gateway(
     settings = or_refuse(read)
     aircraft = read_aircraft(settings)
     own = {one.estimation.estimator for one in aircraft.values()}
-    make_ready(settings.estimation.estimator, *own - {settings.estimation.estimator})
+    compiling = make_ready(settings.estimation.estimator, *own - {settings.estimation.estimator})
     page = PanelProcess(config) if panel or settings.panel.enabled else None
-    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
+    work = serve(
+        lambda: Daemon(settings, aircraft, read), plain=plain, panel=page, compiling=compiling
+    )
+    asyncio.run(work)
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
@@ -90,7 +93,11 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
 
 
 async def serve(
-    daemon_of: Callable[[], Daemon], *, plain: bool, panel: PanelProcess | None = None
+    daemon_of: Callable[[], Daemon],
+    *,
+    plain: bool,
+    panel: PanelProcess | None = None,
+    compiling: Compilation | None = None,
 ) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing its status; SIGHUP reloads the settings.
 
@@ -102,6 +109,8 @@ async def serve(
         Log lines even on a terminal.
     panel : PanelProcess, optional
         The page in a browser, to be started and ended with the daemon.
+    compiling : Compilation, optional
+        From `make_ready`.
     """
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -109,6 +118,8 @@ async def serve(
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
+    if compiling is not None:
+        compiling.watch()
     with loop_comes_first():
         daemon.start()
         if panel is not None:

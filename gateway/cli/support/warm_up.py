@@ -1,17 +1,17 @@
 """Compiled code, made ready before samples wait for it."""
 
+import asyncio
 import gc
 import logging
 import os
 import signal
-import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import Final
 
 from gateway.aircraft import AircraftSettings
-from gateway.analysis.processes import begin_copy, run_copies
-from gateway.cli.support.terminal import console_of
+from gateway.analysis.processes import begin_copy
 from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
@@ -43,72 +43,93 @@ def is_kept(name: str) -> bool:
     return all(entry_point.is_kept for entry_point in ENTRY_POINTS[name])
 
 
-def make_ready(*estimators: str) -> None:
-    """Load or compile estimators in this process, and compile the others in the background.
+def make_ready(*estimators: str) -> "Compilation | None":
+    """Load estimators into this process; what is not compiled runs as Python meanwhile.
 
     The machine code is cached beside the source, so only the first start after an upgrade
-    compiles: the chosen estimators first, and then the others in a separate process while telemetry
-    runs, since a ground station may choose one in flight, when compiling would interrupt the
-    attitude for seconds; loading one from disk takes some hundredths of a second. This process
-    never imports the compiler, which needs more memory than everything else together.
+    compiles, in a separate process while telemetry runs: the chosen estimators first, and then the
+    others, since a ground station may choose one in flight. This process never imports the
+    compiler, which needs more memory than everything else together.
 
     Parameters
     ----------
     *estimators : str
         Names of those in the settings.
+
+    Returns
+    -------
+    Compilation, optional
+        If something is compiled, to be watched by the event loop.
     """
-    missing = [name for name in ENTRY_POINTS if not is_kept(name)]
-    if chosen := [name for name in missing if name in (*estimators, SCANNER)]:
-        log.info("compiling %s, this once; later starts take a second", " and ".join(chosen))
-        begin = time.monotonic()
-        with _clock() as show:
-            # In separate processes, because the compiler's memory is never freed; this one reads
-            # the cache. The largest entry point takes as long as all others together.
-            largest = [ENTRY_POINTS[name][0] for name in chosen if name != SCANNER]
-            others = [point for name in chosen for point in ENTRY_POINTS[name]]
-            shares = [largest, [point for point in others if point not in largest]]
-            run_copies(_compile, filter(None, shares), show)
-        log.info("compiled in %.0f s", time.monotonic() - begin)
+    ordered = dict.fromkeys((SCANNER, *estimators, *ENTRY_POINTS))
+    missing = [name for name in ordered if name in ENTRY_POINTS and not is_kept(name)]
+    for name in missing:
+        for entry_point in ENTRY_POINTS[name]:
+            entry_point.interpret()
     for name in (*estimators, SCANNER):
         _rehearse(name)
-    if behind := [name for name in missing if name not in chosen]:
-        log.info("compiling %s for a later choice, behind the telemetry", " and ".join(behind))
-        begin_copy(_compile_behind, behind)
+    if not missing:
+        return None
+    log.info("compiling, this once: estimates cost more computing for a minute")
+    return Compilation(missing)
 
 
-@contextmanager
-def _clock() -> Iterator[Callable[[], None]]:
-    """Show on a terminal that work is in progress, and for how long."""
-    # Imported here: most starts compile nothing.
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+class Compilation:
+    """A process that compiles, and hands over machine code while telemetry runs.
 
-    console = console_of(stderr=True)
-    # Without a thread: the process that compiles is forked from this one.
-    with Progress(
-        SpinnerColumn(), TextColumn("compiling the estimator, this once"), TimeElapsedColumn(),
-        console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
-        progress.add_task("", total=None)
-        yield progress.refresh
+    Parameters
+    ----------
+    names : sequence of str
+        Of `ENTRY_POINTS`, in the order in which they are compiled.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._receiver, sender = Pipe(duplex=False)
+        self._missing = {(name, k) for name in names for k in range(len(ENTRY_POINTS[name]))}
+        begin_copy(_compile, (names, sender))
+        # So that the pipe ends with that process.
+        sender.close()
+
+    def watch(self) -> None:
+        """Take the machine code as it comes; needs a running event loop."""
+        loop = asyncio.get_running_loop()
+
+        def take() -> None:
+            if not self.take_one():
+                loop.remove_reader(self._receiver)
+                self._receiver.close()
+
+        loop.add_reader(self._receiver, take)
+
+    def take_one(self) -> bool:
+        """Wait for the next function and load it; return whether there was one."""
+        try:
+            name, place, code = self._receiver.recv()
+        except EOFError:
+            if self._missing:
+                log.warning("the compiler has failed: estimates go on costing more computing")
+            return False
+        ENTRY_POINTS[name][place].take(code)
+        self._missing.discard((name, place))
+        if not self._missing:
+            log.info("everything is compiled; later starts find it so")
+        return True
 
 
-def _compile(entry_points: Iterable[EntryPoint[...]]) -> None:
+def _compile(task: tuple[Sequence[str], Connection]) -> None:
+    names, sender = task
     # The parent reports an interrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    os.nice(BEHIND)
     # The collector would take a fifth of the time.
     gc.disable()
-    for entry_point in entry_points:
-        entry_point.prepare()
-
-
-def _compile_behind(names: Iterable[str]) -> None:
-    os.nice(BEHIND)
     for name in names:
-        _compile(ENTRY_POINTS[name])
+        for place, entry_point in enumerate(ENTRY_POINTS[name]):
+            sender.send((name, place, entry_point.code()))
 
 
 def _rehearse(name: str) -> None:
-    """Load here what is cached, or could not be."""
+    """Load here what is cached, and do what comes with the first samples."""
     if name == SCANNER:
         scan_at.prepare()
         return

@@ -23,7 +23,14 @@ from gateway.estimation.flagbits import (
     HEADING_VALID,
     gps_flags,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    as_quat,
+    as_vec,
+    fill,
+    write_quat,
+    write_vec,
+)
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
@@ -47,14 +54,14 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
     """
     write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
     write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
-    row[NAV_ATTITUDE_STD:NAV_FLAGS] = NAN
+    fill(row[NAV_ATTITUDE_STD:NAV_FLAGS], NAN)
     if s.started == 1:
         write_vec(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], as_vec(s.told_std))
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
     row[NAV_FLAGS] = float(flags_of(s))
     if s.has_origin == 0:
         row[NAV_LAT] = row[NAV_LON] = NAN
-        row[NAV_VEL : NAV_VEL + 3] = NAN
+        fill(row[NAV_VEL : NAV_VEL + 3], NAN)
         return
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon

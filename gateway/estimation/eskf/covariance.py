@@ -27,7 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
 SCALE_S: Final = 1.0
@@ -50,7 +50,8 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     if dt <= 0.0:
         return
     apply_transition(s, s.P)
-    apply_transition(s, s.P.T)
+    transpose(s.P)
+    apply_transition(s, s.P)
     symmetrise(s.P)
     turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
@@ -67,14 +68,15 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
     s.P[TILT + 2, TILT + 2] = min(s.P[TILT + 2, TILT + 2], MAX_TILT_VAR)
     s.pending_s = 0.0
-    s.pending_force_n[:] = 0.0
-    s.pending_turn[:, :] = 0.0
-    s.pending_scaled[:, :] = 0.0
+    fill(s.pending_force_n, 0.0)
+    for k in range(3):
+        for j in range(3):
+            s.pending_turn[k, j] = s.pending_scaled[k, j] = 0.0
 
 
 @compiled
 def apply_transition(s: EskfState, P: FloatArray) -> None:
-    """Multiply `P` by the transition matrix from the left; given `P^T`, `P` from the right."""
+    """Multiply `P` by the transition matrix from the left."""
     R, W, dt = s.pending_turn, s.pending_scaled, s.pending_s
     f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
     for j in range(STATES):
@@ -88,6 +90,14 @@ def apply_transition(s: EskfState, P: FloatArray) -> None:
             for k in range(3):
                 P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
                 P[TILT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
+
+
+@compiled
+def transpose(P: FloatArray) -> None:
+    """Transpose in place, for a product from the right."""
+    for i in range(STATES):
+        for j in range(i):
+            P[i, j], P[j, i] = P[j, i], P[i, j]
 
 
 @compiled
@@ -120,8 +130,8 @@ def renew(s: EskfState, k: int, variance: float) -> None:
 @compiled
 def clear(s: EskfState) -> None:
     """Begin a measurement: an empty row, no state held."""
-    s.h[:] = 0.0
-    s.considered[:] = 0.0
+    fill(s.h, 0.0)
+    fill(s.considered, 0.0)
 
 
 @compiled
@@ -183,7 +193,7 @@ def update_scalar(s: EskfState, innovation: float, variance: float, gate_sq: flo
 @compiled
 def consider(s: EskfState, first: int, count: int) -> None:
     """Mark states as only considered."""
-    s.considered[first : first + count] = 1.0
+    fill(s.considered[first : first + count], 1.0)
 
 
 @compiled
@@ -202,4 +212,4 @@ def inject(s: EskfState) -> None:
         s.wander_n[k] = max(min(s.wander_n[k] + d[WANDER + k], most), -most)
         s.mag_bias_b[k] += d[MAG_BIAS + k]
     s.baro_bias_m += d[BARO_BIAS]
-    d[:] = 0.0
+    fill(d, 0.0)

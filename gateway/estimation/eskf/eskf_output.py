@@ -24,7 +24,14 @@ from gateway.estimation.flagbits import (
     HEADING_VALID,
     gps_flags,
 )
-from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    as_quat,
+    as_vec,
+    fill,
+    write_quat,
+    write_vec,
+)
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
@@ -57,7 +64,7 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
     write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_FLAGS] = float(flags_of(s))
-    row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3] = NAN
+    fill(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], NAN)
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
         level_ut = math.hypot(s.field_n[0], s.field_n[1])
@@ -73,9 +80,9 @@ def write_output(s: EskfState, row: FloatArray) -> None:
 @compiled
 def write_place(s: EskfState, row: FloatArray) -> None:
     """Write place and velocity, and how accurate they are; NaN what is not known."""
-    row[NAV_VEL : NAV_VEL + 3] = NAN
-    row[NAV_VEL_STD : NAV_VEL_STD + 3] = NAN
-    row[NAV_POS_STD : NAV_POS_STD + 3] = NAN
+    fill(row[NAV_VEL : NAV_VEL + 3], NAN)
+    fill(row[NAV_VEL_STD : NAV_VEL_STD + 3], NAN)
+    fill(row[NAV_POS_STD : NAV_POS_STD + 3], NAN)
     row[NAV_LAT] = row[NAV_LON] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_known == 1 else NAN
     if s.has_origin == 0:

@@ -9,7 +9,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 
-from gateway.compiled import array_at, compiled_with, record_at
+from gateway.compiled import array_at, compiled, compiled_with, record_at
 from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import GPS_COLUMNS, IMU_COLUMNS, NAV_COLUMNS
 from gateway.estimation.kernel import Kernels
@@ -22,6 +22,7 @@ Arguments = ParamSpec("Arguments")
 STATE_LAYOUT = GAINS_LAYOUT = np.dtype(np.void)
 FLOAT: Final = np.dtype(np.float64)
 INT: Final = np.dtype(np.int64)
+FLOAT_SIZE: Final = FLOAT.itemsize
 
 
 def start(s: Any, p: Any) -> None:
@@ -44,6 +45,12 @@ def write_output(s: Any, row: FloatArray) -> None:
     """Stand for the filter's own."""
 
 
+@compiled
+def row_at(matrix: int, row: int, columns: int) -> FloatArray:
+    """View a row of a matrix at an address."""
+    return array_at(matrix + row * columns * FLOAT_SIZE, (columns,), FLOAT)  # type: ignore[no-any-return]
+
+
 def begin(state: int, gains: int) -> None:
     """Make a state of zeros one that nothing has been seen in."""
     start(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT))
@@ -55,11 +62,9 @@ def imu_steps(
     """Take IMU samples, and write a row after each."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     time_us = array_at(times_us, (count,), INT)
-    rows = array_at(samples, (count, IMU_COLUMNS), FLOAT)
-    out = array_at(outputs, (count, NAV_COLUMNS), FLOAT)
     for i in range(count):
-        take_imu(s, p, time_us[i], rows[i])
-        write_output(s, out[i])
+        take_imu(s, p, time_us[i], row_at(samples, i, IMU_COLUMNS))
+        write_output(s, row_at(outputs, i, NAV_COLUMNS))
 
 
 def baro_step(state: int, gains: int, alt_m: float) -> None:
@@ -70,7 +75,7 @@ def baro_step(state: int, gains: int, alt_m: float) -> None:
 def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
     """Take one fix."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
-    take_gps(s, p, arrival_us, array_at(fix, (GPS_COLUMNS,), FLOAT))
+    take_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
 
 
 def take_earlier(
@@ -110,23 +115,20 @@ def run(
     """Advance over a log: at each IMU sample first the heights, then the fixes before it."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     imu_time_us = array_at(imu_times_us, (imu_count,), INT)
-    imu = array_at(imu_rows, (imu_count, IMU_COLUMNS), FLOAT)
     baro_before = array_at(baro_places, (baro_count,), INT)
     baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
     gps_before = array_at(gps_places, (gps_count,), INT)
     gps_time_us = array_at(gps_times_us, (gps_count,), INT)
-    gps = array_at(gps_rows, (gps_count, GPS_COLUMNS), FLOAT)
-    out = array_at(outputs, (imu_count, NAV_COLUMNS), FLOAT)
     baros = fixes = 0
     for i in range(imu_count):
         while baros < baro_count and baro_before[baros] <= i:
             take_baro(s, p, baro_alt_m[baros])
             baros += 1
         while fixes < gps_count and gps_before[fixes] <= i:
-            take_gps(s, p, gps_time_us[fixes], gps[fixes])
+            take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
             fixes += 1
-        take_imu(s, p, imu_time_us[i], imu[i])
-        write_output(s, out[i])
+        take_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))
+        write_output(s, row_at(outputs, i, NAV_COLUMNS))
 
 
 def kernels_of(

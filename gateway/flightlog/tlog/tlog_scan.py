@@ -61,7 +61,7 @@ def crc_extra_table() -> ExtraArray:
 
 @compiled
 def _is_header(data: ByteArray, at: int, final: bool) -> int:
-    if at + HEADER_SIZE > data.size:
+    if at + HEADER_SIZE > data.shape[0]:
         return _NO if final else _WAIT
     first = data[at + TIME_SIZE]
     return _YES if data[at] == 0 and (first == 0xFD or first == 0xFE) else _NO
@@ -97,7 +97,7 @@ def _crc_step(crc: int, byte: int) -> int:
 def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
     """Return whether a complete frame's checksum holds: yes, no, or an unknown message."""
     message_id = _message_id(data, at)
-    seed = int(extra[message_id]) if message_id < extra.size else -1
+    seed = int(extra[message_id]) if message_id < extra.shape[0] else -1
     if seed < 0:
         return _WAIT
     end = at + int(data[at + 1]) + (6 if data[at] == 0xFE else 10)
@@ -117,18 +117,18 @@ def _judge(
     if header != _YES:
         return header
     frame = at + TIME_SIZE
-    if frame + 3 > data.size:
+    if frame + 3 > data.shape[0]:
         return 0 if final else _WAIT
     size = _frame_size(data, frame)
     following = frame + size
     if size == 0:
         return 0
-    if following > data.size:
+    if following > data.shape[0]:
         return 0 if final else _WAIT
     successor = _is_header(data, following, final)
     if successor == _WAIT:
         return _WAIT
-    if in_step and not strict and (successor == _YES or following == data.size):
+    if in_step and not strict and (successor == _YES or following == data.shape[0]):
         return size
     checksum = _checksum(data, frame, extra)
     if checksum == _YES:
@@ -217,7 +217,7 @@ def _walk(
 ) -> tuple[int, int, int, bool]:
     at = count = damaged = 0
     bad_from = -1
-    while at < data.size:
+    while at < data.shape[0]:
         size = _judge(data, at, final, strict, in_step, extra)
         if size == _WAIT:
             break

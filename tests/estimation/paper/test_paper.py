@@ -3,7 +3,9 @@ import math
 import numpy as np
 import pytest
 
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper.paper_entry import step_live
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import displacement_m
@@ -308,6 +310,27 @@ def test_reset_forgets() -> None:
     state = run(estimator, [imu(0)])
     assert math.isnan(state.lat_deg)
     assert state.q_nb == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_python_gives_what_machine_code_does(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before everything is compiled, it flies as Python."""
+
+    def flown(samples: list[ImuSample]) -> np.ndarray:
+        estimator = make(blend="every_sample", alpha_accel=0.7, beta_velocity=0.4)
+        run(estimator, samples[:150])
+        estimator.update_gps(fix(-1_500_000, north_m=3.0, vel=(9.0, 1.0, 0.2)))
+        state = run(estimator, samples[150:])
+        return np.array([*state.q_nb, *state.rate_b_radps, *state.vel_n_mps, state.lat_deg])
+
+    samples = noisy_rest(rng, BIAS, -3_000_000, 3.0)
+    machine = flown(samples)
+    assert np.isfinite(machine).all()
+    python: EntryPoint[...] = EntryPoint(step_live.__wrapped__)
+    python.interpret()
+    monkeypatch.setattr("gateway.estimation.paper.paper.step_live", python)
+    np.testing.assert_allclose(flown(samples), machine, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("blend", ["at_fix", "every_sample"])
