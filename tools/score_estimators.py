@@ -266,20 +266,22 @@ def score(flight: Flight, name: str, run: Run) -> Scores:
     return scores
 
 
-def spoilt_scores(flight: Flight, run: Run) -> dict[str, tuple[float, float, float]]:
+def spoilt_scores(flight: Flight, run: Run) -> dict[str, tuple[float, float, float, float]]:
     """Spoil a flight in every way, and compare with the unspoilt run after the recovery.
 
     Returns
     -------
     dict
-        By the way of spoiling: tilt and heading in deg and place in m, kept for 95 % of the time.
+        By the way of spoiling: tilt, heading that is told as valid, both in deg, and place in m,
+        kept for 95 % of the time; and the share of the time in which a heading is told.
     """
     out, found = run(flight), {}
     for how, spoil in SPOILS.items():
         if applies(how, flight):
             spoilt = spoil(flight)
             off = departure(flight, out, spoilt.flight, run(spoilt.flight))
-            found[how] = off.after(spoilt.ends_s + RECOVERY_S)
+            since_s = spoilt.ends_s + RECOVERY_S
+            found[how] = (*off.as_told().after(since_s), off.told_share(since_s))
     return found
 
 
@@ -317,7 +319,7 @@ def main() -> None:
     flights = flights_to_score(arguments.data, arguments.only)
     runs = OWN | SMOOTHED | ({} if arguments.no_peers else PEERS)
     board: dict[str, dict[str, Scores]] = {flight.name: {} for flight in flights}
-    spoilt: dict[str, dict[str, dict[str, tuple[float, float, float]]]] = {}
+    spoilt: dict[str, dict[str, dict[str, tuple[float, float, float, float]]]] = {}
     honesty: dict[str, Scores] = {}
     columns = (TextColumn("{task.description:50}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as progress:

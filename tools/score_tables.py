@@ -17,6 +17,8 @@ SPEEDS = {"paper": 5e5, "complementary": 1e6, "eskf": 2e5, "smoothed": 1e5}
 """Samples a second that each is to reach."""
 SPOILT_LIMITS = (3.0, 3.0, 10.0)
 """Tilt and heading in deg and place in m, off the unspoilt run, at which a spoilt one is back."""
+FULL_SHARE = 0.995
+"""A share that rounds to all of the time."""
 HONEST = (0.9, 0.99)
 """Share of instants within two sigma that an honest covariance has."""
 TARGETS: dict[tuple[str, str], Scores] = {
@@ -84,9 +86,12 @@ def show_honesty(board: dict[str, dict[str, Scores]]) -> None:
     Console(width=WIDTH).print(table)
 
 
-def show_spoilt(board: dict[str, dict[str, dict[str, tuple[float, float, float]]]]) -> None:
+def show_spoilt(board: dict[str, dict[str, dict[str, tuple[float, float, float, float]]]]) -> None:
     """Print what is left of each disturbance 20 s after its end."""
-    title = f"{RECOVERY_S:.0f} s after a disturbance, off the unspoilt run: tilt/heading deg, m"
+    title = (
+        f"{RECOVERY_S:.0f} s after a disturbance, off the unspoilt run: tilt/heading deg, m; "
+        "% of the time in which a heading is told"
+    )
     table = table_of(title, SPOILS)
     for flight, rows in board.items():
         for name, found in rows.items():
@@ -145,7 +150,8 @@ def share_cell(scores: Scores, column: str) -> str:
     return coloured(f"{100.0 * value:.0f}", HONEST[0] <= round(value, 2) <= HONEST[1])
 
 
-def spoilt_cell(off: tuple[float, float, float]) -> str:
+def spoilt_cell(off: tuple[float, float, float, float]) -> str:
     """Write one disturbance's remains, coloured by the limits."""
-    good = all(a < b for a, b in zip(off, SPOILT_LIMITS, strict=True))
-    return coloured(f"{off[0]:.1f}/{off[1]:.1f} {off[2]:.1f}", good)
+    good = all(a < b for a, b in zip(off[:3], SPOILT_LIMITS, strict=True))
+    told = "" if off[3] > FULL_SHARE else f" {100.0 * off[3]:.0f}%"
+    return coloured(f"{off[0]:.1f}/{off[1]:.1f} {off[2]:.1f}{told}", good)

@@ -23,9 +23,11 @@ from gateway.estimation.columns import (
     GPS_VEL,
     GYRO,
     MAG,
+    NAV_FLAGS,
     NAV_LAT,
     NAV_LON,
 )
+from gateway.records import NavFlags
 from tools.flights import GPS_NAMES, IMU_NAMES, Flight, north_east_m, read_flight
 
 SILENCE_S = 4.0
@@ -192,7 +194,10 @@ class Departure:
     time_s: np.ndarray
     tilt_deg: np.ndarray
     heading_deg: np.ndarray
+    """NaN where the unspoilt run knows none itself."""
     place_m: np.ndarray
+    told: np.ndarray
+    """Whether the spoilt run tells its heading as valid."""
 
     def after(self, since_s: float, percent: float = 95.0) -> tuple[float, float, float]:
         """Tell what tilt, heading and place keep below most of the time; 0 where there is none."""
@@ -203,6 +208,15 @@ class Departure:
             return float(np.percentile(known, percent, method="higher")) if len(known) else 0.0
 
         return usual(self.tilt_deg), usual(self.heading_deg), usual(self.place_m)
+
+    def told_share(self, since_s: float) -> float:
+        """Tell for which share of the time the spoilt run tells a heading that can be compared."""
+        counted = (self.time_s >= since_s) & np.isfinite(self.heading_deg)
+        return float(self.told[counted].mean()) if counted.any() else 0.0
+
+    def as_told(self) -> "Departure":
+        """Leave out the headings that the spoilt run itself does not tell as valid."""
+        return replace(self, heading_deg=np.where(self.told, self.heading_deg, math.nan))
 
 
 def departure(flight: Flight, out: np.ndarray, spoilt: Flight, spoilt_out: np.ndarray) -> Departure:
@@ -226,12 +240,22 @@ def departure(flight: Flight, out: np.ndarray, spoilt: Flight, spoilt_out: np.nd
         place[np.isnan(theirs[:, 0]) & np.isfinite(ours[:, 0])] = math.inf
     # Nothing told where the other tells something is as far off as can be.
     tilt = np.where(told, 2.0 * np.arccos(np.hypot(w, z).clip(max=1.0)), math.inf)
+    heading = np.where(told, np.abs(heading), math.inf)
     return Departure(
         time_s=spoilt.log.imu_time_us[right] * 1e-6,
         tilt_deg=np.degrees(tilt),
-        heading_deg=np.degrees(np.where(told, np.abs(heading), math.inf)),
+        heading_deg=np.degrees(np.where(knows_heading(out[left]), heading, math.nan)),
         place_m=place,
+        told=knows_heading(spoilt_out[right]),
     )
+
+
+def knows_heading(out: np.ndarray) -> np.ndarray:
+    """Tell where an estimator calls its heading valid; one without flags always does."""
+    if out.shape[1] <= NAV_FLAGS:
+        return np.ones(len(out), bool)
+    flags = out[:, NAV_FLAGS]
+    return np.isnan(flags) | (np.nan_to_num(flags).astype(int) & int(NavFlags.HEADING_VALID) != 0)
 
 
 def write_flight(flight: Flight, path: Path) -> None:

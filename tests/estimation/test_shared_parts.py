@@ -19,6 +19,8 @@ from gateway.estimation.magfield import (
     CompassSettings,
     compare_field,
     field_similarity,
+    iron_variance,
+    note_iron,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
@@ -109,6 +111,24 @@ class TestField:
         self.feed(state, 45.0, 10.0)
         self.feed(state, 70.0, NEW_FIELD_S + 5.0, rate=0.0)
         assert state.mag_disturbed == 1
+
+    @pytest.mark.parametrize("iron_ut", [0.0, 6.0])
+    def test_iron_shows_in_the_strength_and_tells_the_error_of_the_heading(
+        self, iron_ut: float
+    ) -> None:
+        """A flat field of 30 uT with iron to the front, turned about down; white noise is none."""
+        state, rng, headings = new_record(ComplementaryState), np.random.default_rng(3), []
+        for k in range(1200):
+            angle = 0.3 * 0.05 * k
+            north = 30.0 * math.cos(angle) + iron_ut
+            east = -30.0 * math.sin(angle)
+            headings.append(math.remainder(math.atan2(-east, north) - angle, math.tau))
+            note_iron(state, math.hypot(north, east, 5.0) + rng.normal(0.0, 0.3), 0.17, 0.05)
+        seen = math.sqrt(iron_variance(state))
+        if iron_ut:
+            assert np.std(headings) == pytest.approx(seen, rel=0.25)
+        else:
+            assert seen < 0.01
 
     def test_a_field_counts_by_its_likeness_to_the_usual_one(self) -> None:
         state = new_record(ComplementaryState)

@@ -81,10 +81,11 @@ def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["zero_rows", "no_height", "silence", "gyro_off", "half_rate"])
-def test_real_car(data_dir: Path, how: str) -> None:
+@pytest.mark.parametrize("name", RUNS)
+def test_real_car(data_dir: Path, name: str, how: str) -> None:
     """Without a compass; its engine idles before it goes, and shows the gyroscope's bias."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
-    tilt_deg, heading_deg, place_m = off(flight, "eskf", how)
+    tilt_deg, heading_deg, place_m = off(flight, name, how)
     assert tilt_deg < LIMIT_DEG
     assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
@@ -123,6 +124,42 @@ def test_a_heading_that_nothing_tells_is_not_vouched_for(data_dir: Path) -> None
     flags = out[straight, NAV_FLAGS].astype(int)
     assert not (flags & int(NavFlags.HEADING_VALID)).any()
     assert (out[straight, NAV_ATTITUDE_STD + 2] > math.radians(50.0)).all()
+
+
+@pytest.mark.parametrize("how", ["late_gps", "no_velocity", "mid_air"])
+def test_a_real_car_tells_its_heading_while_it_is_known(data_dir: Path, how: str) -> None:
+    """It has no compass: on a straight road its heading is not known, and not told."""
+    flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
+    spoilt = SPOILS[how](flight)
+    found = departure(
+        flight, run_complementary(flight), spoilt.flight, run_complementary(spoilt.flight)
+    )
+    since_s = spoilt.ends_s + RECOVERY_S
+    tilt_deg, heading_deg, place_m = found.as_told().after(since_s)
+    assert max(tilt_deg, heading_deg) < LIMIT_DEG
+    assert place_m < PLACE_M
+    assert found.told_share(since_s) > 0.8
+
+
+@pytest.mark.parametrize("how", SPOILS)
+def test_real_quadrotor_with_iron_at_its_compass(data_dir: Path, how: str) -> None:
+    """Its compass is up to 40 deg off: what depends on it is told as unsure."""
+    flight = read_flight(data_dir / "px4_f450_glitch.csv.gz")
+    spoilt = SPOILS[how](flight)
+    out, spoilt_out = run_complementary(flight), run_complementary(spoilt.flight)
+    found = departure(flight, out, spoilt.flight, spoilt_out)
+    tilt_deg, heading_deg, place_m = found.after(spoilt.ends_s + RECOVERY_S)
+    assert tilt_deg < LIMIT_DEG
+    _, left, right = np.intersect1d(
+        flight.log.imu_time_us, spoilt.flight.log.imu_time_us, return_indices=True
+    )
+    down = NAV_ATTITUDE_STD + 2
+    told_deg = np.degrees(np.hypot(out[left, down], spoilt_out[right, down]))
+    late = found.told & (found.time_s > spoilt.ends_s + RECOVERY_S)
+    assert np.mean((found.heading_deg < 2.0 * told_deg)[late]) > 0.9
+    if how in ("zero_rows", "no_height", "no_baro", "silence", "gyro_off"):
+        assert heading_deg < LIMIT_DEG
+        assert place_m < PLACE_M
 
 
 @pytest.mark.parametrize("name", RUNS)

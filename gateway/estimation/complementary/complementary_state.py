@@ -163,6 +163,8 @@ class ComplementaryState(FilterState):
     """Turn about down from the level frame to NED."""
     compass_rad: float
     """Slow error of the compass."""
+    compass_var: float
+    """Within which that error is expected, rad2."""
     accel_bias_b: Annotated[FloatArray, (3,)]
     """Error of the specific force, m/s2."""
     level_by_gps: int

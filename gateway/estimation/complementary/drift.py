@@ -20,6 +20,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
+from gateway.estimation.magfield import iron_variance
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -77,7 +78,8 @@ def forget_heading(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Know nothing of the heading, nor of the compass's error."""
     start_heading(s, p, s.heading_rad, UNKNOWN_VAR)
     s.compass_rad = 0.0
-    begin_state(s, COMPASS, p.heading_noise_rad**2)
+    s.compass_var = p.heading_noise_rad**2
+    begin_state(s, COMPASS, s.compass_var)
 
 
 @compiled
@@ -149,10 +151,7 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
             P[j, k] -= turn[axis, 0] * P[j, 0] + turn[axis, 1] * P[j, 1] + turn[axis, 2] * P[j, 2]
         P[k, k] += walked
     limit_variance(s, HEADING, UNKNOWN_VAR)
-    kept = math.exp(-s.carried_s / p.tau_heading_s)
-    scale_state(s, COMPASS, kept)
-    P[COMPASS, COMPASS] += (1.0 - kept * kept) * p.heading_noise_rad**2
-    s.compass_rad *= kept
+    carry_compass(s, p)
     for k in range(3):
         P[k, k] += BIAS_WALK_RAD2PS3 * s.carried_s
         P[FORCE + k, FORCE + k] += FORCE_WALK_M2PS5 * s.carried_s
@@ -160,6 +159,38 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         limit_variance(s, FORCE + k, FORCE_BIAS_MPS2**2)
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
     s.carried_s = s.carried_rad = 0.0
+
+
+@compiled
+def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Carry the compass's error on: it fades with time, and that of iron as the aircraft turns.
+
+    Without GPS there is nothing to weigh that of iron against, and it averages out over turns.
+    """
+    iron = iron_variance(s) if s.level_by_gps == 1 else 0.0
+    variance = p.heading_noise_rad**2 + iron
+    widen_compass(s, variance)
+    faded = s.carried_s / p.tau_heading_s + s.carried_rad * iron / variance
+    kept = math.exp(-faded)
+    scale_state(s, COMPASS, kept)
+    s.drift_cov[COMPASS, COMPASS] += (1.0 - kept * kept) * variance
+    s.compass_rad *= kept
+
+
+@compiled
+def widen_compass(s: ComplementaryState, variance: float) -> None:
+    """Take back what a compass that is worse than it was thought to be has told.
+
+    Its error was expected within `compass_var`; with that expectation goes the certainty that it
+    gave to the heading, but none that GPS has given.
+    """
+    if variance > s.compass_var:
+        cleared_row(s)[COMPASS] = 1.0
+        expected_variance(s)
+        excess = s.drift_cov[COMPASS, COMPASS] - 1.0 / (1.0 / s.compass_var - 1.0 / variance)
+        if excess < 0.0:
+            reduce_covariance(s, excess)
+    s.compass_var = variance
 
 
 @compiled
