@@ -176,7 +176,7 @@ def test_heartbeats_keep_coming_while_the_receiver_is_away(pipeline: Pipeline) -
     assert 9 <= sum(beats) <= 11
 
 
-def test_loss_of_the_receiver_is_told(pipeline: Pipeline) -> None:
+def test_loss_of_the_receiver_is_reported(pipeline: Pipeline) -> None:
     pipeline.connect("/dev/ttyUSB0")
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     pipeline.poll(1_000)

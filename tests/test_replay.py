@@ -227,7 +227,7 @@ def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
 
 
 @pytest.mark.parametrize("estimator", ["paper", "complementary"])
-def test_a_state_that_does_not_fit_is_told_and_left_alone(
+def test_a_state_that_does_not_fit_is_reported_and_left_alone(
     rng: np.random.Generator, estimator: str
 ) -> None:
     settings, state, rows = fly_from_the_middle(estimator, rng)

@@ -1,4 +1,4 @@
-"""What Prometheus is told of a fleet, beside what it is told of any hub."""
+"""The metrics of a fleet for Prometheus, beside those of any hub."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final

@@ -213,10 +213,10 @@ class FleetServer:
         if not site.is_here:
             site.become("gone")
             site.round_trip_us = None
-            self._tell_gone(site)
+            self._report_gone(site)
 
-    def _tell_gone(self, site: SiteClient) -> None:
-        """Tell the ground stations once, in the name of each of the site's vehicles."""
+    def _report_gone(self, site: SiteClient) -> None:
+        """Report it to the ground stations once, in the name of each of the site's vehicles."""
         text = f"Site {site.endpoint.site} is gone"[:50].encode()
         for system_id in site.translation.traffic:
             own_id = self._ids.known_id(site.endpoint.site, system_id)

@@ -28,7 +28,7 @@ PATTERN: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}")
 MAX_KEYS: Final = 4096
 """More than there are vehicles that can have an id."""
 PING_TIMEOUT_S: Final = 5.0
-"""An answer that takes longer tells nothing of the link."""
+"""An answer that takes longer says nothing of the link."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class FleetSession:
         return sum(reader.dropped for reader in self._readers)
 
     async def open(self) -> None:
-        """Open the session if it is not open, and declare what is wanted; trouble is told once."""
+        """Open the session if it is not open, and declare what is wanted; log trouble once."""
         if self._session is not None:
             return
         try:

@@ -32,7 +32,7 @@ class IdsFile:
         self._kept = self.ids.version
 
     def keep(self) -> None:
-        """Write what has changed; a disk that takes nothing is told once."""
+        """Write what has changed; a disk that takes nothing is logged once."""
         if self._kept == self.ids.version:
             return
         table = {f"{site}/{system}": own_id for (site, system), own_id in self.ids.items()}

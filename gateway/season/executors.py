@@ -99,9 +99,9 @@ def _run_in_one_pool(
 
 
 def failure_of(error: BaseException) -> WorkFailed:
-    """Tell of an exception what was wrong."""
-    told = isinstance(error, WorkError)
-    return WorkFailed(str(error) if told else f"{type(error).__name__}: {error}")
+    """Say what was wrong."""
+    is_plain = isinstance(error, WorkError)
+    return WorkFailed(str(error) if is_plain else f"{type(error).__name__}: {error}")
 
 
 @contextmanager

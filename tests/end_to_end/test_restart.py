@@ -87,7 +87,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-async def test_a_broken_file_is_told_when_the_aircraft_appears(folder: Path) -> None:
+async def test_a_broken_file_is_reported_when_the_aircraft_appears(folder: Path) -> None:
     file = folder / "aircraft" / "1.places.json"
     file.parent.mkdir()
     file.write_text("{")

@@ -181,7 +181,7 @@ def test_norm_stays_one(estimator: KernelEstimator) -> None:
     np.testing.assert_allclose(norms, 1.0, atol=1e-12)
 
 
-def test_rest_is_found_and_told(estimator: KernelEstimator) -> None:
+def test_rest_is_found_and_reported(estimator: KernelEstimator) -> None:
     state = feed(estimator, still(0, 4.0))[-1]
     assert NavFlags.AT_REST | NavFlags.ATTITUDE_VALID | NavFlags.USING_MAG in state.flags
     assert NavFlags.HEADING_VALID not in state.flags
@@ -206,7 +206,7 @@ class TestNonsense:
         return bool(np.isfinite(rows[:, :4]).all() and np.isfinite(rows[1:, NAV_LAT]).all())
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30, -500.0])
-    def test_a_bad_number_is_left_out_and_told(
+    def test_a_bad_number_is_left_out_and_reported(
         self, estimator: KernelEstimator, bad: float
     ) -> None:
         feed(estimator, [*still(0, 3.0), fix(3_000_000)])
@@ -258,7 +258,7 @@ class TestNonsense:
         assert NavFlags.SENSOR_FAULT not in recovered[-1].flags
         assert recovered[-1].q_nb[0] > 0.99
 
-    def test_a_glitch_of_hundreds_of_metres_is_rejected_and_told(
+    def test_a_glitch_of_hundreds_of_metres_is_rejected_and_reported(
         self, estimator: KernelEstimator
     ) -> None:
         items: Items = []
@@ -309,7 +309,7 @@ def test_a_contradicting_fix_widens_what_is_told_only_when_repeated(name: str) -
     assert lasting[11_990_000] < 3.0
 
 
-def test_outage_is_told(estimator: KernelEstimator) -> None:
+def test_outage_is_reported(estimator: KernelEstimator) -> None:
     feed(estimator, [*still(0, 3.0), fix(3_000_000)])
     states = feed(estimator, still(3_000_000, 5.0))
     assert NavFlags.USING_GPS in states[50].flags

@@ -37,7 +37,7 @@ def test_it_scores_one_flight_whole(
     assert max(map(len, tables)) <= 200
 
 
-def test_a_word_that_names_no_flight_is_told(tmp_path: Path) -> None:
+def test_a_word_that_names_no_flight_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="no flight is named glider: simulated 11, simulated 12"):
         score_estimators.flights_to_score(tmp_path, ["glider"])
 

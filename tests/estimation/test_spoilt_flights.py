@@ -244,7 +244,7 @@ def test_a_take_off_run_without_gps_is_neither_tilt_nor_rest(flight: Flight) -> 
     assert not (out[use, NAV_FLAGS].astype(int) & int(NavFlags.AT_REST)).any()
 
 
-def test_real_turns_without_gps_are_told_as_unsure(data_dir: Path) -> None:
+def test_real_turns_without_gps_are_reported_as_unsure(data_dir: Path) -> None:
     """The declination of the log's header counts before any fix."""
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))

@@ -21,7 +21,7 @@ OVERFLOWS_16_MHZ = 1 << 17
 @pytest.mark.parametrize(
     ("cause", "through_bootloader"), [(BROWN_OUT, False), (WATCHDOG, False), (WATCHDOG, True)]
 )
-def test_a_reset_in_flight_costs_little_and_is_told(
+def test_a_reset_in_flight_costs_little_and_is_reported(
     bench: MakeBench, cause: int, through_bootloader: bool
 ) -> None:
     rig = bench()

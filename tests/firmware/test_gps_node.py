@@ -77,7 +77,7 @@ def test_node_time_is_the_arrival_of_the_first_byte(bench: MakeBench) -> None:
             assert -1000 < late_us < 1000
 
 
-def test_no_fix_is_told_and_sent_on(bench: MakeBench) -> None:
+def test_no_fix_is_reported_and_sent_on(bench: MakeBench) -> None:
     blind = Solution(
         fix_type=0, fix_ok=False, satellites=2, time_valid=False, h_acc_m=4e6, lat_deg=0.0
     )

@@ -120,7 +120,7 @@ def test_the_8_mhz_build_keeps_time_and_rate(bench: MakeBench, build: Callable[.
     assert not rig.faults
 
 
-def test_clipping_is_told(bench: MakeBench) -> None:
+def test_clipping_is_reported(bench: MakeBench) -> None:
     rig = bench(world=still(accel_mps2=(0.0, 0.0, 100.0), gyro_radps=(0.0, -30.0, 0.0)))
     rig.imu_node()
     rig.run(START_S + 0.2)
@@ -138,7 +138,7 @@ def test_a_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
     assert rig.last(ImuPayload).mag == (218, -4096, 436)
 
 
-def test_a_failed_self_test_is_told_and_flying_goes_on(bench: MakeBench) -> None:
+def test_a_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node().mpu6050.self_test_works = False
     rig.run(START_S + 0.3)
@@ -153,7 +153,7 @@ def test_a_failed_self_test_is_told_and_flying_goes_on(bench: MakeBench) -> None
         ("bmp180", ImuFlags.BARO_ABSENT, BMP180),
     ],
 )
-def test_an_absent_sensor_is_told_and_found_when_it_comes(
+def test_an_absent_sensor_is_reported_and_found_when_it_comes(
     bench: MakeBench, absent: str, flag: ImuFlags, bits: int
 ) -> None:
     rig = bench()

@@ -105,7 +105,7 @@ def test_nodes_that_start_in_step_get_through(bench: MakeBench, build: Callable[
     assert rig.node_status(0).radio_failed <= 2
 
 
-def test_noise_on_the_channel_is_told_and_own_packets_are_not(bench: MakeBench) -> None:
+def test_noise_on_the_channel_is_reported_and_own_packets_are_not(bench: MakeBench) -> None:
     rig = bench(seed=2)
     rig.imu_node()
     rig.run(2.2)

@@ -60,7 +60,7 @@ async def test_one_sites_frames_never_reach_another(world: World) -> None:
         assert before[name] <= hub.clients()[0].received
 
 
-async def test_a_site_goes_and_that_is_told_once(world: World) -> None:
+async def test_a_site_goes_and_that_is_reported_once(world: World) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)

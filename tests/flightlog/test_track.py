@@ -70,7 +70,7 @@ def test_seek_tells_the_newest_of_what_must_be_known() -> None:
     assert [message_id_of(frame) for frame in context] == [31, 0]
 
 
-def test_every_parameter_is_told() -> None:
+def test_every_parameter_is_reported() -> None:
     mav = mavlink.MAVLink(None, 1, 1)
     frames = [
         bytes(mavlink.MAVLink_param_value_message(name, value, 9, 2, 0).pack(mav))

@@ -55,7 +55,7 @@ def test_the_rows_are_read_once(untold: Path) -> None:
 
 
 @pytest.mark.parametrize("set_s", [0.16, 0.4])
-def test_a_recording_that_was_fused_with_another_latency_is_told(
+def test_a_recording_that_was_fused_with_another_latency_is_reported(
     untold: Path, tmp_path: Path, set_s: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"

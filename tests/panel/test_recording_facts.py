@@ -32,7 +32,7 @@ def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> No
     assert [facts.shows(name, "duration < 300") for name in ("Morning", "evening")] == [False, True]
 
 
-def test_a_wrong_condition_is_told_and_shows_nothing(tmp_path: Path) -> None:
+def test_a_wrong_condition_is_reported_and_shows_nothing(tmp_path: Path) -> None:
     catalogue(tmp_path, a=1.0)
     facts = RecordingFacts()
     facts.look(tmp_path, "height > 3")

@@ -36,7 +36,7 @@ def look(watch: TroubleWatch, clients: tuple[ClientStats, ...], now_us: int) -> 
     return watch.update(clients, (), now_us)
 
 
-def test_a_short_absence_is_not_told() -> None:
+def test_a_short_absence_is_not_reported() -> None:
     watch = TroubleWatch()
     assert look(watch, client(state="unreachable"), 0) == []
     assert look(watch, client(state="unreachable"), PATIENCE_US - 1) == []
@@ -59,7 +59,7 @@ def test_the_reason_is_told_if_it_is_known() -> None:
     assert texts == ["tablet: Permission denied"]
 
 
-def test_a_port_that_cannot_be_bound_is_told_until_it_can() -> None:
+def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
     watch, taken = TroubleWatch(), "Address already in use"
     closed = ListenerStats("here", "udp-listen:0.0.0.0:14550", "closed", taken, 0, 0, 0)
     texts = [text for n in range(20) for text in watch.update((), (closed,), n * S)]

@@ -45,7 +45,7 @@ def fused(season: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return out, *run("fuse", season, "-o", out, "--jobs", 2)
 
 
-def test_one_broken_file_stops_nothing_and_is_told(fused: tuple[Path, int, str]) -> None:
+def test_one_broken_file_stops_nothing_and_is_reported(fused: tuple[Path, int, str]) -> None:
     out, code, text = fused
     assert code == 1
     assert "broken.csv" in text

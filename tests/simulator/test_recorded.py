@@ -132,7 +132,7 @@ class TestRanges:
         clipped = [bool(r.flags & ImuFlags.ACCEL_CLIPPED) for r in imu]
         assert clipped == [k == 10 and peak_mps2 == 900.0 for k in range(ROWS)]
 
-    def test_absent_sensors_are_told(self) -> None:
+    def test_absent_sensors_are_reported(self) -> None:
         bare = {name: values for name, values in columns().items() if name[0] in "tag" and
                 not name.startswith("gps")}  # fmt: skip
         found = fly(RecordedFlight.from_columns(bare))
@@ -151,7 +151,7 @@ class TestGpsGaps:
         fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
         assert fixes[0].vel_n_mps == pytest.approx((0.0, 10.0, 0.0))
 
-    def test_what_is_missing_is_told_as_unknown(self) -> None:
+    def test_what_is_missing_is_reported_as_unknown(self) -> None:
         table = columns(gps_vn=None, gps_alt_m=None)
         fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
         assert np.isnan(fixes[0].speed_acc_mps)

@@ -172,7 +172,7 @@ def test_heartbeats_go_on_when_everything_is_silent() -> None:
     assert "GPS fix lost" in texts(found)
 
 
-def test_link_and_nodes_are_told() -> None:
+def test_link_and_nodes_are_reported() -> None:
     vehicle = make()
     both = link(), link(GPS_NODE)
     vehicle.on_node_status(status(GPS_NODE, sensors_present=0b1000), 0)
@@ -197,13 +197,13 @@ def test_good_news_is_info() -> None:
     assert trouble == {"Receiver lost: /dev/ttyUSB0"}
 
 
-def test_a_node_that_restarts_is_told() -> None:
+def test_a_node_that_restarts_is_reported() -> None:
     vehicle = make()
     assert "Node 0 restarted" not in texts(vehicle.on_link(report(link(restarts=3)), ONE_S))
     assert texts(vehicle.on_link(report(link(restarts=4)), ONE_S)) == ["Node 0 restarted"]
 
 
-def test_flags_of_the_estimator_are_told_and_cannot_flood() -> None:
+def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
     vehicle = make()
     told = texts(fly(vehicle, 0, 2))
     assert {"Attitude valid", "Heading valid", "GPS fix"} <= set(told)

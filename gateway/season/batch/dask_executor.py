@@ -118,7 +118,7 @@ _SAME: Final = f"install mavgate[batch]=={__version__} on every worker"
 
 
 def prepare_worker() -> str:
-    """Let a worker load its extensions, and tell its version."""
+    """Let a worker load its extensions, and return its version."""
     load_extensions()
     _keep_freed_memory()
     return __version__

@@ -189,7 +189,7 @@ class SweepTask(_ReadingTask):
 
 @dataclass(frozen=True)
 class InfoTask(_ReadingTask):
-    """Tell what is in each file."""
+    """Describe what is in each file."""
 
     name: ClassVar[str] = "info"
 
@@ -207,7 +207,7 @@ class InfoTask(_ReadingTask):
 
 @dataclass(frozen=True, slots=True)
 class ReadFlight:
-    """A flight, and what its file tells beside the samples."""
+    """A flight, and what its file holds beside the samples."""
 
     flight: Flight
     header: Any
@@ -278,7 +278,7 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
 
 
 def options_bytes(options: ReadOptions) -> bytes:
-    """Write down how flights are read, so that it can be told whether it was the same."""
+    """Write down how flights are read, so that it can be compared later."""
     current = options.current
     told = {
         "default": current.default,

@@ -17,7 +17,7 @@ from gateway.season.executors import Executor, WorkFailed
 Tell = Callable[[str, int, int], None]
 """Called with what was done last, how many are done, and of how many."""
 LOOKING: Final = "looking for changes"
-"""What is done first: it tells which recordings are to be worked on."""
+"""What is done first: it decides which recordings are to be worked on."""
 
 
 def run_season(

@@ -30,7 +30,7 @@ REMOTE_ENDINGS: Final = (*ENDINGS, ".parquet", ".ulg", ".bin")
 STAMPS: Final = (
     "ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "last_modified", "updated",
 )  # fmt: skip
-"""What storages call that by which a file can be told from what it was before."""
+"""What storages call that by which a changed file is known."""
 PACKAGES: Final = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko",
     "ssh": "paramiko", "az": "adlfs", "abfs": "adlfs", "http": "aiohttp", "https": "aiohttp",
@@ -113,7 +113,7 @@ def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem
 def stamp_of_item(item: BatchItem) -> str:
     """Return what changes when a recording does, in hexadecimal digits.
 
-    That is the SHA-256 of its files, or of what their storage tells of them, where they need not be
+    That is the SHA-256 of its files, or of what their storage says of them, where they need not be
     fetched for it; raises OSError and StorageError.
     """
     if item.is_fetched:
@@ -207,7 +207,7 @@ def _part(place: str) -> StoredFile:
 
 
 def _told_by_storage(part: StoredFile) -> str:
-    """Return a file's place, size and change as its storage tells them; nothing if it does not."""
+    """Return a file's place, size and change as its storage reports them, or nothing."""
     if part.data is not None or not is_url(part.place):
         return ""
     storage, remote = _storage(part.place)

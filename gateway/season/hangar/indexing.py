@@ -29,7 +29,7 @@ from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogT
 ENDINGS: Final = (".tlog", ".csv")
 """Files of other endings are looked at where a format knows their first bytes."""
 CHUNK_FILES: Final = 8
-"""Files that one process reads before it tells."""
+"""Files that one process reads before it reports."""
 KEEP_S: Final = 1.0
 """What is read is stored so often: an interruption costs no more than that."""
 
@@ -185,8 +185,8 @@ def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    told = path.stat()
-    return told.st_size, told.st_mtime_ns
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns
 
 
 def _may_be_recording(path: Path) -> bool:

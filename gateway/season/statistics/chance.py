@@ -32,7 +32,7 @@ class Lead:
 
     @property
     def text(self) -> str:
-        """Tell it in one sentence."""
+        """Say it in one sentence."""
         change = f"{_percent(self.ratio)} error over {self.flights} flights"
         if self.p is None or self.low is None or self.high is None:
             return f"{change}, all of one aircraft and day: nothing tells it from chance"

@@ -1,4 +1,4 @@
-"""What the catalogue tells of one flight, computed from its positions and fixes in one pass."""
+"""What the catalogue says of one flight, computed from its positions and fixes in one pass."""
 
 import math
 from typing import Final
@@ -14,7 +14,7 @@ from gateway.season.statistics.track_shape import Place, simplified
 from gateway.units import US_PER_S
 
 POINT_US: Final = US_PER_S // 10
-"""Positions nearer in time than this tell nothing new of a flight."""
+"""Positions nearer in time than this add nothing new of a flight."""
 SILENCE_STEPS: Final = 2.5
 """So many usual intervals without a fix are an outage, where fixes come seldom."""
 EARLIEST_US: Final = 315_532_800 * US_PER_S
@@ -24,7 +24,7 @@ LOST_STEP: Final = 1.5
 
 
 class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """One flight in the catalogue; None is what cannot be told.
+    """One flight in the catalogue; None is what is not known.
 
     The names are those of the columns that a query may use.
     """
@@ -87,7 +87,7 @@ class FlightTally:
         self._way.add(time_us, place[0], place[1])
 
     def add_gps(self, time_us: int, *, fixed: bool) -> None:
-        """Take in that the receiver told something, and whether it had a fix."""
+        """Note that the receiver sent something, and whether it had a fix."""
         self._gps_us.append(time_us)
         self._fixed.append(fixed)
 

@@ -113,7 +113,7 @@ class TableSkimmer:
         self._places: tuple[int, int, int, int] | None = None
         """Where the time, the node's time, the fix and the state stand in a row."""
         self._state_us = 0
-        """From when on the next state tells something new."""
+        """From when on the next state adds something new."""
 
     def feed(self, data: bytes) -> None:
         """Take the next chunk of the file."""
@@ -226,7 +226,7 @@ class TlogTally:
 
 
 class _Told:
-    """What one vehicle told."""
+    """What one vehicle sent."""
 
     def __init__(self) -> None:
         self._tally = FlightTally()

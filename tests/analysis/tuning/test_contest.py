@@ -39,7 +39,7 @@ def test_a_setting_is_found_by_its_name(name: str, key: str) -> None:
     assert full_key(name) == key
 
 
-def test_an_unknown_setting_is_told() -> None:
+def test_an_unknown_setting_is_reported() -> None:
     with pytest.raises(SweepError, match="no setting ends in 'gama'"):
         full_key("gama")
 
@@ -63,7 +63,7 @@ def test_names_are_values_too() -> None:
 
 
 @pytest.mark.parametrize("text", ["0:2:3", "a:b:c", "-0.1", "chebyshev"])
-def test_values_that_are_not_allowed_are_told(text: str) -> None:
+def test_values_that_are_not_allowed_are_reported(text: str) -> None:
     with pytest.raises(SweepError, match="alpha"):
         parse_axis("alpha", text)
 

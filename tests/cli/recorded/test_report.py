@@ -32,7 +32,7 @@ def test_a_recording_is_reported_beside_other_settings(tmp_path: Path) -> None:
     assert (folder / "timing.csv").exists()
 
 
-def test_a_file_without_a_flight_is_told(tmp_path: Path) -> None:
+def test_a_file_without_a_flight_is_reported(tmp_path: Path) -> None:
     empty = tmp_path / "empty.csv"
     empty.write_text(encode_head(TableHeader()))
     result = CliRunner().invoke(app, ["report", str(empty), "-o", str(tmp_path / "out")])
@@ -41,7 +41,7 @@ def test_a_file_without_a_flight_is_told(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_what_must_be_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_must_be_installed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def without(name: str) -> ModuleSpec | None:
         return None if name == "jinja2" else find_spec(name)
 
@@ -52,7 +52,7 @@ def test_what_must_be_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     assert "-m pip install 'mavgate[plot]'\n" in result.output
 
 
-def test_a_folder_that_cannot_be_written_is_told(
+def test_a_folder_that_cannot_be_written_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:

@@ -66,7 +66,7 @@ def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) 
     assert estimation.reference.gps_latency_s == winner["estimation.reference.gps_latency_s"]
 
 
-def test_a_setting_that_changes_nothing_is_told(recording: Path, tmp_path: Path) -> None:
+def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: Path) -> None:
     idle = ["--vary", "dip_tolerance_deg=5.0,10.0"]
     base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1", "--force"]
     result = CliRunner().invoke(app, [*base, "--beta", "0.1,0.9", *idle])
@@ -91,13 +91,13 @@ def test_a_setting_that_changes_nothing_is_told(recording: Path, tmp_path: Path)
         (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the position"),
     ],
 )
-def test_what_cannot_be_done_is_told(recording: Path, arguments: list[str], told: str) -> None:
+def test_what_cannot_be_done_is_reported(recording: Path, arguments: list[str], told: str) -> None:
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 2
     assert told in result.output
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_is_reported(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["sweep", str(tmp_path / "no.csv"), "--alpha", "0.1,0.2"])
     assert result.exit_code == 2
     assert "no.csv" in result.output

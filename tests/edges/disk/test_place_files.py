@@ -70,7 +70,7 @@ async def test_an_end_loses_nothing(bench: Bench) -> None:
     assert bench.read() == {1: FIRST, 2: SECOND}
 
 
-async def test_a_disk_that_refuses_is_counted_and_told(
+async def test_a_disk_that_refuses_is_counted_and_reported(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await bench.save(1, FIRST)
@@ -89,7 +89,7 @@ async def test_a_disk_that_refuses_is_counted_and_told(
     assert bench.told[1:] == [(1, None)]
 
 
-async def test_what_could_not_be_written_is_tried_again_and_told_once(
+async def test_what_could_not_be_written_is_tried_again_and_reported_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attempts = []
@@ -131,7 +131,7 @@ async def test_one_that_cannot_be_written_holds_up_no_other(
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"version": 7}'])
-async def test_a_broken_file_is_told_and_left_alone(
+async def test_a_broken_file_is_reported_and_left_alone(
     bench: Bench, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     await bench.save(2, SECOND)

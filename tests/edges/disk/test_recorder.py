@@ -357,7 +357,7 @@ async def test_what_is_wanted_from_the_start_misses_nothing(bench: Bench) -> Non
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-async def test_a_start_on_a_bad_disk_is_told_and_mended(
+async def test_a_start_on_a_bad_disk_is_reported_and_mended(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.recorder.folder.write_text("a file where the folder should be")

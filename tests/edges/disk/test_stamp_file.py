@@ -28,13 +28,15 @@ def test_nothing_to_keep_leaves_what_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"1":{"k":{"0.1":3}}}', '{"1":{"k":{"0.1.1":-3}}}'])
-def test_a_broken_file_is_told(tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_broken_file_is_reported(
+    tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / NAME).write_text(text)
     assert StampFile(tmp_path).load() == {}
     assert "cannot be read" in caplog.text
 
 
-def test_a_disk_that_does_not_take_it_is_told_once(
+def test_a_disk_that_does_not_take_it_is_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / NAME).mkdir()

@@ -115,7 +115,7 @@ async def test_too_many_connections_are_turned_away(server: ControlServer) -> No
         await writer.wait_closed()
 
 
-async def test_a_path_that_is_too_long_for_a_socket_is_told(tmp_path: Path) -> None:
+async def test_a_path_that_is_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
     path = tmp_path / ("x" * 100) / "run.sock"
     with pytest.raises(ControlError, match="at most 107; let XDG_RUNTIME_DIR name a shorter"):
         await ControlServer(path).start()

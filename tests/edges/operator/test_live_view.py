@@ -129,7 +129,7 @@ def test_rates_are_those_since_the_previous_view() -> None:
     assert "1.0" in text
 
 
-def test_what_stands_in_the_way_is_told() -> None:
+def test_what_stands_in_the_way_is_reported() -> None:
     closed = ListenerStats("udp-listen:[::]:5760", "", "closed", "Address already in use", 0, 0, 0)
     radio = replace(CLIENT, name="radio", state="unreachable", reason="Permission denied")
     text = text_of(replace(SNAPSHOT, listeners=(closed,), clients=(CLIENT, radio)))
@@ -214,7 +214,7 @@ def test_a_wide_terminal_is_used() -> None:
         (replace(WELL_KNOWN.recorder, reason="disk is full"), "not recorded: disk is full"),
     ],
 )
-def test_the_recorder_is_told(recorder: RecorderStatus, text: str) -> None:
+def test_the_recorder_is_reported(recorder: RecorderStatus, text: str) -> None:
     assert text in text_of(replace(WELL_KNOWN, recorder=recorder))
 
 

@@ -208,7 +208,7 @@ class TestServer:
         while any(task.get_coro().__name__ == "_serve" for task in asyncio.all_tasks()):
             await asyncio.sleep(0)
 
-    async def test_a_taken_port_is_told_and_used_when_it_is_free(
+    async def test_a_taken_port_is_reported_and_used_when_it_is_free(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(prometheus, "RETRY_S", 0.0)

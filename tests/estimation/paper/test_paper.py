@@ -244,7 +244,7 @@ def test_norm_stays_one() -> None:
 
 
 class TestNonsense:
-    def test_not_finite_is_left_out_and_told(self) -> None:
+    def test_not_finite_is_left_out_and_reported(self) -> None:
         estimator = make()
         run(estimator, [imu(t) for t in times(0.5)])
         estimator.update_gps(fix(500_000))

@@ -129,7 +129,7 @@ def test_a_fix_has_the_velocity_of_its_course_and_the_climb_of_the_position() ->
     assert second.utc_us is None
 
 
-def test_no_fix_is_told_as_none() -> None:
+def test_no_fix_is_reported_as_none() -> None:
     (fix,) = read([(0, raw(0)), (0, gps(0, fix=1))])[1:]
     assert isinstance(fix, GpsFix)
     assert not fix.fix_ok

@@ -41,7 +41,7 @@ def test_a_full_line() -> None:
     assert row.raw is row.state is None
 
 
-def test_speed_and_course_stand_in_for_a_velocity_that_is_not_told() -> None:
+def test_speed_and_course_stand_in_for_a_velocity_that_is_not_reported() -> None:
     _, rows = read("1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120")
     north, east, down = rows[0].gps.vel_n_mps
     assert (north, east) == pytest.approx((-2.5, 4.330127), abs=1e-6)

@@ -179,7 +179,7 @@ def test_what_is_not_installed_is_named(
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
-def test_damage_is_counted_and_told(folder: Path, tmp_path: Path, name: str) -> None:
+def test_damage_is_counted_and_reported(folder: Path, tmp_path: Path, name: str) -> None:
     data = (folder / name).read_bytes()
     _, all_rows = whole(folder / name)
     middle = len(data) // 2

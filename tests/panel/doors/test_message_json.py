@@ -176,6 +176,6 @@ def test_ways_to_write_a_text(text: Any) -> None:
         ({**template("HOME_POSITION"), "q": 1}, "array of 4"),
     ],
 )
-def test_what_is_no_message_is_told(fields: Any, words: str) -> None:
+def test_what_is_no_message_is_reported(fields: Any, words: str) -> None:
     with pytest.raises(BadMessageError, match=words):
         from_json(fields)

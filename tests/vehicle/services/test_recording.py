@@ -34,7 +34,7 @@ def test_a_start_is_accepted_once_the_files_are_open(station: GroundStation) -> 
     assert results(station.wait(20.0)) == []
 
 
-def test_a_start_that_fails_is_told_and_why(station: GroundStation) -> None:
+def test_a_start_that_fails_is_reported_and_why(station: GroundStation) -> None:
     station.command(START)
     found = recorder(station, "Read-only file system")
     assert results(found) == [(START, FAILED)]

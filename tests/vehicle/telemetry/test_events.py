@@ -10,7 +10,7 @@ def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
     return [m.text for m in found]
 
 
-def test_a_change_is_told_once() -> None:
+def test_a_change_is_reported_once() -> None:
     announcer = Announcer()
     assert track(announcer, True, 0) == []
     assert track(announcer, False, 1) == ["bad"]
@@ -31,7 +31,7 @@ def test_flapping_cannot_flood_and_the_last_text_is_true() -> None:
     assert told[-1] == "bad"
 
 
-def test_a_change_while_held_is_told_when_the_hold_ends() -> None:
+def test_a_change_while_held_is_reported_when_the_hold_ends() -> None:
     announcer = Announcer()
     track(announcer, False, 0)
     assert track(announcer, True, 1000) == []

@@ -151,7 +151,7 @@ def test_counters_stand_in_sys_status(flying: Flying) -> None:
     assert counts == [65_534, 10, 300, 7]
 
 
-def test_the_firmware_is_told_as_a_version(flying: Flying) -> None:
+def test_the_firmware_is_reported_as_a_version(flying: Flying) -> None:
     frames = decode(flying.vehicle.introduction()[:1])
     (version,) = (m for m in frames if m.get_type() == "AUTOPILOT_VERSION")
     assert version.os_sw_version == 1 << 24 | 4 << 16

@@ -148,7 +148,7 @@ class ZenohClient(Client):
             self._task = None
 
     def _declare(self, session: "zenoh.Session") -> None:
-        """Tell the router what we take, and that we are here."""
+        """Declare to the router what we take, and that we are here."""
         import zenoh
 
         inlet: Inlet[bytes] = Inlet(self._take)

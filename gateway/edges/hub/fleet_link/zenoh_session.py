@@ -71,7 +71,7 @@ def session_config(place: str, file: str, mode: str = "client") -> "zenoh.Config
             config = zenoh.Config.from_file(Path(file).expanduser())
         else:
             config = zenoh.Config()
-            # Only where it was told to: no site joins a stranger's network by itself.
+            # Only to the configured place: no site joins a stranger's network by itself.
             config.insert_json5("scouting/multicast/enabled", "false")
             config.insert_json5("scouting/gossip/enabled", "false")
             config.insert_json5("transport/link/tx/queue/size/data", str(BATCHES))

@@ -62,7 +62,7 @@ class TestPages:
         await rig.until(lambda: hub.clients()[0].bytes_garbage == 5)
         assert hub.clients()[0].state == "open"
 
-    async def test_a_page_of_elsewhere_is_refused_and_told(
+    async def test_a_page_of_elsewhere_is_refused_and_reported(
         self, rig: Rig, visit: Visit, caplog: pytest.LogCaptureFixture
     ) -> None:
         hub = rig.hub(LISTEN)
@@ -368,7 +368,7 @@ class TestTls:
         shutil.copy(certificate, file)
         assert (await visit(port, tls=tls)).is_open
 
-    async def test_a_missing_certificate_is_told_and_waited_for(
+    async def test_a_missing_certificate_is_reported_and_waited_for(
         self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
     ) -> None:
         file = tmp_path / "mine.pem"

@@ -140,7 +140,7 @@ def test_cancelling_and_silence_end_it() -> None:
     assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")
 
 
-def test_a_refusal_is_told() -> None:
+def test_a_refusal_is_reported() -> None:
     run = CalibrationRun(1, CalibrationStep.GYRO, 0)
     command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
     run.take(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)

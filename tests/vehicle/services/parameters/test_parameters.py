@@ -175,7 +175,7 @@ def test_integers_encoded_byte_wise_are_understood(
     assert values(station)["TUNING_ORDER"] == 5.0
 
 
-def test_an_untrusted_client_changes_nothing_and_is_told(station: GroundStation) -> None:
+def test_an_untrusted_client_changes_nothing_and_is_reported(station: GroundStation) -> None:
     station.trusted = False
     found = station.send(set_message("TUNING_ORDER", 5.0))
     assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
