@@ -8,7 +8,6 @@ import logging
 import os
 import signal
 import socket
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -24,6 +23,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.edges.clock import GatewayClock
+from gateway.edges.operator.attachment import on_parent_gone
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.doors.rest_door import RestDoor
@@ -189,7 +189,7 @@ async def _serve(
     server = _Server(config)
     _end_with_signals(server)
     if attached:
-        _end_with_input(server)
+        on_parent_gone(partial(setattr, server, "should_exit", True))
     parts.uplink.start()
     parts.dialogues.start()
     if parts.uplink.is_local:
@@ -223,17 +223,6 @@ def _end_with_signals(server: uvicorn.Server) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, end)
-
-
-def _end_with_input(server: uvicorn.Server) -> None:
-    loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
-
-    def on_input() -> None:
-        if not os.read(source, 1024):
-            loop.remove_reader(source)
-            server.should_exit = True
-
-    loop.add_reader(source, on_input)
 
 
 def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:

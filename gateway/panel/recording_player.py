@@ -166,14 +166,14 @@ class Playback:
     async def _start(self, files: Sequence[Path], firsts: Sequence[int]) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="mavgate-playback-")
         socket = Path(self._folder.name) / "mavgate" / "play.sock"
-        arguments = ["play", *map(str, files), "--loop"]
+        arguments = ["play", *map(str, files), "--loop", "--attached"]
         arguments += ["--endpoint", f"udp:127.0.0.1:{self._uplink.playback_port}"]
         for system_id in firsts:
             arguments += ["--as", str(system_id)]
         self._child = await asyncio.create_subprocess_exec(
             sys.executable,
             *("-m", "gateway.cli", *arguments),
-            stdin=asyncio.subprocess.DEVNULL,
+            stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             env=os.environ | {"XDG_RUNTIME_DIR": self._folder.name},

@@ -74,6 +74,7 @@ class Playing:
                 *("--endpoint", f"udp:127.0.0.1:{self.port}"),
             ],
             env=environment,
+            stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
         )
 
@@ -89,7 +90,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Playing]]:
     yield start
     for playing in started:
         playing.process.kill()
-        playing.process.wait(10)
+        playing.process.communicate()
 
 
 def test_a_client_gets_every_frame_byte_for_byte(
@@ -100,6 +101,19 @@ def test_a_client_gets_every_frame_byte_for_byte(
     playing = play(str(tlog), "--speed", "50", port=port)
     frames = [client.sock.recv(2048) for _ in RECORDS]
     assert frames == [record.frame for record in RECORDS]
+    assert playing.process.wait(START_LIMIT_S) == 0
+
+
+def test_an_attached_player_ends_when_its_parent_is_gone(
+    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+) -> None:
+    (port,) = free_udp_ports(1)
+    client = connect(port)
+    playing = play(str(tlog), "--loop", "--attached", port=port)
+    assert client.sock.recv(2048)
+    assert playing.process.poll() is None
+    assert playing.process.stdin is not None
+    playing.process.stdin.close()
     assert playing.process.wait(START_LIMIT_S) == 0
 
 

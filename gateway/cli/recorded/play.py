@@ -41,6 +41,7 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.edges.disk.player_edge import PlayerStatus
+from gateway.edges.operator.attachment import on_parent_gone
 from gateway.edges.operator.control_socket import ControlError
 from gateway.edges.operator.keyboard import Keyboard
 from gateway.flightlog.playback import (
@@ -108,6 +109,7 @@ def play(
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Do not ask before commands leave this machine.")
     ] = False,
+    attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
     endpoint: EndpointOption = None,
     config: ConfigOption = None,
 ) -> None:
@@ -137,7 +139,9 @@ def play(
             console_of(stderr=True).print(remark, markup=False)
         names = [file.name for file in files]
         try:
-            asyncio.run(_serve(lambda: PlayerDaemon(gateway, flights, plan, names)))
+            asyncio.run(
+                _serve(lambda: PlayerDaemon(gateway, flights, plan, names), attached=attached)
+            )
         except ControlError as error:
             refuse(str(error))
 
@@ -205,8 +209,10 @@ def status() -> None:
     _show(ask("play.status", of="play"))
 
 
-async def _serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
+async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:
     daemon = daemon_of()
+    if attached:
+        on_parent_gone(daemon.ended.set)
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
     try:
