@@ -275,5 +275,11 @@ def test_a_heading_by_compass_alone_is_as_unsure_as_the_iron_left(
     assert share(two_sigma(flight, run_eskf(flight))["heading"]) > 0.95
 
 
+def test_the_level_needs_no_heading(data_dir: Path) -> None:
+    """Turned for minutes without compass and GPS."""
+    flight = read_flight(data_dir / "broad_30_disturbed_stationary_magnet_C.csv.gz")
+    assert off(flight, "eskf", "no_mag")[0] < 1.0
+
+
 def test_every_way_of_spoiling_applies_to_a_whole_flight(flight: Flight) -> None:
     assert all(applies(how, flight) for how in SPOILS)

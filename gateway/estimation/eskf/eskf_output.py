@@ -38,6 +38,7 @@ from gateway.records import NAN
 
 LEVEL_VAR = 0.1**2
 HEADING_VAR = 0.26**2
+NO_HEADING_RAD = math.sqrt(3.0)
 NO_HOLD_S = 1.0
 DECLINATION_RAD = 0.2
 """Magnetic north may be off by so much where the declination is not known."""
@@ -67,6 +68,8 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     fill(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], NAN)
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
+        if s.heading_known == 0:
+            row[NAV_ATTITUDE_STD + 2] = NO_HEADING_RAD
         level_ut = math.hypot(s.field_n[0], s.field_n[1])
         if s.iron_search_started == 0 and level_ut > 0.0:
             # Iron that nothing tells from the heading yet turns it for as long as a flight lasts.
@@ -105,7 +108,8 @@ def flags_of(s: EskfState) -> int:
     flags = sensor_flags(s)
     if s.started == 1 and max(s.P[TILT, TILT], s.P[TILT + 1, TILT + 1]) < LEVEL_VAR:
         flags |= ATTITUDE_VALID
-    if s.heading_true == 1 and s.P[TILT + 2, TILT + 2] < HEADING_VAR:
+    known = s.heading_known == 1 and s.heading_true == 1
+    if known and s.P[TILT + 2, TILT + 2] < HEADING_VAR:
         flags |= HEADING_VALID
     if s.has_height == 1 or s.baro_known == 1:
         flags |= ALTITUDE_VALID

@@ -38,7 +38,7 @@ class EskfSettings(Settings, frozen=True):
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.14
+    ] = 0.13
     accel_roughness: Annotated[
         float, setting("The same of the specific force.", ge=0.0, le=10.0)
     ] = 0.46
@@ -60,7 +60,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.0195
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
-    ] = 1.5
+    ] = 1.2
     gps_height_m: Annotated[float, setting("The same of its height.", "m", ge=0.01, le=50.0)] = 1.9
     gps_wander_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)

@@ -272,9 +272,6 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
         s.h[VEL + k] = 1.0
         # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
         consider(s, ACCEL_BIAS, 3)
-        if s.heading_known == 0:
-            # The pull of what is flown would pass for a heading that explains it.
-            consider(s, TILT + 2, 1)
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
     for k in range(6):
         s.assumed[k] += s.dx[TILT + k]

@@ -23,6 +23,8 @@ ENOUGH_HEADING_RAD: Final = 0.3
 """A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
 NO_HEADING_VAR: Final = 3.0
+OWN_FRAME_VAR: Final = 0.0
+"""While no heading is known, it is counted from where the filter began: that it knows."""
 
 
 @compiled
@@ -88,6 +90,6 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     write_quat(s.q_nb, find(s, as_quat(s.q_nb), ENOUGH_HEADING_RAD))
     if s.heading_known == 1:
         s.heading_true = 1
-    heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else NO_HEADING_VAR
+    heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else OWN_FRAME_VAR
     raise_bias_variance(s, BIAS_CHANGE_RADPS)
     begin_attitude(s, p, s.level_std * s.level_std, heading_var)
