@@ -54,7 +54,7 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
     yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
     assert math.degrees(yaw) == pytest.approx(10.0, abs=0.5)
     known = last["nav_pos_std_north_m"] != ""
-    assert known == (estimator == "eskf")
+    assert known == (estimator != "paper")
 
 
 @pytest.mark.io
