@@ -1,5 +1,6 @@
 """Forked processes, which share all that this one has computed and compiled."""
 
+import gc
 import multiprocessing
 import os
 import warnings
@@ -35,16 +36,30 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
         Open it before a thread is started, such as that of a progress bar.
     """
     with no_warning_of_threads():
-        pool = multiprocessing.get_context(START).Pool(count, begin, arguments)
+        pool = multiprocessing.get_context(START).Pool(count, _begin, (begin, *arguments))
     with pool:
         yield pool
 
 
 def begin_copy(work: Callable[[Any], None], argument: Any) -> None:
     """Call a function in a background process, which ends with this one at the latest."""
-    process = multiprocessing.Process(target=work, args=(argument,), daemon=True)
+    process = multiprocessing.Process(target=_begin, args=(work, argument), daemon=True)
     with no_warning_of_threads():
         process.start()
+
+
+def _begin(work: Callable[..., None], *arguments: Any) -> None:
+    keep_inherited()
+    work(*arguments)
+
+
+def keep_inherited() -> None:
+    """Never collect what the parent process has left; for the beginning of a forked process.
+
+    Destructors may wait for the parent's threads, as that of a Zenoh session does, and a forked
+    process has none of them.
+    """
+    gc.freeze()
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from typing import Any, Final, Protocol, TypeVar
 
-from gateway.analysis.processes import START, cores, no_warning_of_threads
+from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
 
 WAITING: Final = 2
 """Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""
@@ -123,6 +123,7 @@ def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
 
 def _begin(stop: Event, parent: int) -> None:
     """Leave an interrupt to the parent, and end when it does."""
+    keep_inherited()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

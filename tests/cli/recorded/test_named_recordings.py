@@ -88,7 +88,8 @@ def test_every_command_takes_the_name(config: Path, tmp_path: Path, name: str) -
 def test_play_takes_the_name(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     played: list[str] = []
 
-    async def serve(daemon_of: Callable[[], PlayerDaemon]) -> None:
+    async def serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:
+        assert not attached
         daemon = daemon_of()
         played.extend(daemon.edge.status().files)
         daemon.close()
