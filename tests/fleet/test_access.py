@@ -96,8 +96,8 @@ def test_a_site_writes_its_own_keys_only(join: Callable[[str], Any]) -> None:
     office.liveliness().declare_subscriber(
         "mavlink/*/site/*", lambda sample: tokens.append(str(sample.key_expr)), history=True
     )
-    site.liveliness().declare_token("mavlink/field-1/site/x")
-    site.liveliness().declare_token("mavlink/field-2/site/x")
+    # A token ends with its object.
+    kept = [site.liveliness().declare_token(f"mavlink/field-{k}/site/x") for k in (1, 2)]
     asked = site.declare_queryable("mavlink/field-1/ping", lambda q: q.reply(q.key_expr, b"here"))
     orders, others = heard(site, "mavlink/field-1/*/in"), heard(site, "mavlink/field-2/*/out")
 
@@ -119,7 +119,8 @@ def test_a_site_writes_its_own_keys_only(join: Callable[[str], Any]) -> None:
     assert set(tokens) == {"mavlink/field-1/site/x"}
     assert {data for _, data in orders} == {b"order"}
     assert b"another's" not in {data for _, data in others}, "nor does it read another's"
-    asked.undeclare()
+    for one in (asked, *kept):
+        one.undeclare()
 
 
 def test_a_certificate_that_no_rule_names_may_nothing(join: Callable[[str], Any]) -> None:
