@@ -29,6 +29,8 @@ class ParameterRow:
         self._system_id = dialogue.parameters.system_id
         self._shown: object = None
         self._value = dialogue.parameters.entries[meta.name].value
+        self._settled: float | None = self._value
+        """What the field holds while nothing else is typed."""
         with ui.element("div").classes("parameter").props(f"data-name={meta.name}") as self._row:
             with ui.element("div"):
                 ui.label(meta.name).classes("name")
@@ -36,7 +38,6 @@ class ParameterRow:
                 ui.label(_range_of(meta)).classes("range")
                 self._trouble = ui.label().classes("trouble").props("role=alert")
             self._field = self._build_field()
-        # At once: a later first refresh would overwrite what is typed meanwhile.
         self.refresh(dialogue)
 
     def refresh(self, dialogue: Dialogue) -> None:
@@ -53,8 +54,12 @@ class ParameterRow:
             value, self._meta.default, rel_tol=1e-6, abs_tol=1e-12
         )
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
-        if not pending:
-            self._value = value
+        if pending:
+            return
+        self._value = value
+        # What is typed and not sent yet stays.
+        if self._field.value == self._settled:
+            self._settled = value
             self._field.set_value(value)
 
     def _build_field(self) -> Any:
@@ -76,6 +81,7 @@ class ParameterRow:
         return field
 
     def _set(self, value: float | None) -> None:
+        self._settled = value
         if value is None or value == self._value:
             return
         try:
