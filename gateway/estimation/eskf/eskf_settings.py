@@ -38,7 +38,7 @@ class EskfSettings(Settings, frozen=True):
     accel_noise_mpsprs: Annotated[
         float,
         setting("Noise of the accelerometer, vibration included.", "m/s/sqrt(s)", ge=1e-4, le=10.0),
-    ] = 0.13
+    ] = 0.14
     accel_roughness: Annotated[
         float, setting("The same of the specific force.", ge=0.0, le=10.0)
     ] = 0.46
