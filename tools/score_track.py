@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 from rich import box
 from rich.console import Console
@@ -25,6 +24,7 @@ from scipy.spatial.transform import Rotation, Slerp
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.config import GatewaySettings
 from gateway.edges.disk import tracker_csv
+from gateway.flights.log_facts import with_reference
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
@@ -41,10 +41,8 @@ def through_pipeline(file: Path) -> Iterator[mavlink.MAVLink_message]:
     """Give the messages of a log that is pushed through the stages without waiting."""
     log = tracker_csv.read_flight(file)
     settings = GatewaySettings()
-    aircraft = settings.default_aircraft
-    reference = replace(aircraft.estimation.reference, gps_latency_s=log.gps_latency_s)
-    estimation = replace(aircraft.estimation, reference=reference)
-    pipeline = Pipeline(PipelineSettings(replace(aircraft, estimation=estimation)))
+    aircraft = with_reference(settings.default_aircraft, gps_latency_s=log.gps_latency_s)
+    pipeline = Pipeline(PipelineSettings(aircraft))
     parser = mavlink.MAVLink(None)
     frames = list(replay(settings.simulator, log).frames(log.duration_s))
     for frame in track(frames, "fusing"):

@@ -21,8 +21,6 @@ import msgspec
 
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 READABLE: Final = 0o644
-
-
 ENTRY: Final = "entry"
 """The function's symbol."""
 

@@ -20,6 +20,8 @@ DEAD_RECKONING: Final = int(NavFlags.DEAD_RECKONING)
 SENSOR_FAULT: Final = int(NavFlags.SENSOR_FAULT)
 DEGRADED: Final = int(NavFlags.DEGRADED)
 
+HEADING_VALID_RAD: Final = 0.26
+"""A heading is valid up to this standard deviation."""
 FRESH_GPS_S: Final = 1.5
 """Without an accepted fix for longer than this, the estimate is dead reckoning."""
 

@@ -13,6 +13,8 @@ USABLE_FIXES: Final = frozenset(
 )
 FIELD_RENEWAL_M: Final = 20_000.0
 """The declination changes by well under 0.5 deg over this way."""
+NO_DECLINATION_RAD: Final = 0.2
+"""Magnetic north may be off by so much where the declination is not known."""
 
 
 class ReferenceSettings(Settings, frozen=True):

@@ -13,8 +13,8 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_POS_STD,
 )
-from gateway.estimation.eskf.eskf_output import DECLINATION_RAD
 from gateway.estimation.eskf.eskf_state import STATES
+from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import LASTING_RAD, _backward, smooth
 from tools.flights import Flight, read_flight, simulated_flight
@@ -91,7 +91,7 @@ def test_it_beats_the_filter_without_gps_too(flight: Flight) -> None:
     assert share(two_sigma(alone, smoothed)["tilt"]) > 0.9
     assert after["heading"] < before["heading"]
     # Without a fix the declination is not known, and hindsight does not tell it.
-    assert (smoothed[flight.counts, NAV_ATTITUDE_STD + 2] > DECLINATION_RAD).all()
+    assert (smoothed[flight.counts, NAV_ATTITUDE_STD + 2] > NO_DECLINATION_RAD).all()
 
 
 @pytest.mark.slow

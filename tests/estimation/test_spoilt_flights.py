@@ -50,34 +50,30 @@ def off(flight: Flight, name: str, how: str) -> tuple[float, float, float]:
     return found.after(spoilt.ends_s + RECOVERY_S)
 
 
-@pytest.mark.parametrize("how", SPOILS)
-@pytest.mark.parametrize("name", RUNS)
-def test_simulated(flight: Flight, name: str, how: str) -> None:
+def check_back(flight: Flight, name: str, how: str) -> None:
     tilt_deg, heading_deg, place_m = off(flight, name, how)
     assert tilt_deg < LIMIT_DEG
     assert heading_deg < LIMIT_DEG
     assert place_m < PLACE_M
 
 
+@pytest.mark.parametrize("how", SPOILS)
+@pytest.mark.parametrize("name", RUNS)
+def test_simulated(flight: Flight, name: str, how: str) -> None:
+    check_back(flight, name, how)
+
+
 @pytest.mark.parametrize("seed", [12, 32])
 def test_a_large_bias_is_learned_by_a_start_in_flight(seed: int) -> None:
     """These gyroscopes read up to 2.5 deg/s too much, and no rest has shown it."""
-    tilt_deg, heading_deg, place_m = off(
-        simulated_flight(seed, calibrated=False), "complementary", "mid_air"
-    )
-    assert tilt_deg < LIMIT_DEG
-    assert heading_deg < LIMIT_DEG
-    assert place_m < PLACE_M
+    check_back(simulated_flight(seed, calibrated=False), "complementary", "mid_air")
 
 
 @pytest.mark.parametrize("how", SPOILS)
 @pytest.mark.parametrize("name", RUNS)
 def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
-    tilt_deg, heading_deg, place_m = off(flight, name, how)
-    assert tilt_deg < LIMIT_DEG
-    assert heading_deg < LIMIT_DEG
-    assert place_m < PLACE_M
+    check_back(flight, name, how)
 
 
 @pytest.mark.parametrize("how", ["zero_rows", "no_height", "silence", "gyro_off", "half_rate"])
@@ -85,21 +81,13 @@ def test_real_fixed_wing(data_dir: Path, name: str, how: str) -> None:
 def test_real_car(data_dir: Path, name: str, how: str) -> None:
     """Without a compass; its engine idles before it goes, and shows the gyroscope's bias."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
-    tilt_deg, heading_deg, place_m = off(flight, name, how)
-    assert tilt_deg < LIMIT_DEG
-    assert heading_deg < LIMIT_DEG
-    assert place_m < PLACE_M
+    check_back(flight, name, how)
 
 
 @pytest.mark.parametrize("how", ["zero_rows", "no_height", "no_baro", "silence"])
 def test_real_quadrotor(data_dir: Path, how: str) -> None:
     """Its compass carries iron, which the field's strength tells in the first turns."""
-    tilt_deg, heading_deg, place_m = off(
-        read_flight(data_dir / "px4_f450_glitch.csv.gz"), "eskf", how
-    )
-    assert tilt_deg < LIMIT_DEG
-    assert heading_deg < LIMIT_DEG
-    assert place_m < PLACE_M
+    check_back(read_flight(data_dir / "px4_f450_glitch.csv.gz"), "eskf", how)
 
 
 def test_iron_that_the_compass_carries_is_found_by_the_strength_of_the_field(

@@ -40,6 +40,7 @@ from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.edges.disk.tracker_csv import FlightFileError
 from gateway.flights.flown import open_flown
+from gateway.flights.log_facts import with_reference
 from gateway.flights.reading import ReadOptions
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
@@ -142,11 +143,7 @@ def recorded_line(
             pipeline_settings(settings), columns=read_column_map(columns), progress=advance
         )
         flight = open_flown(files, options)
-    estimation = settings.estimation
-    reference = replace(estimation.reference, gps_latency_s=flight.gps_latency_s)
-    aircraft = replace(
-        settings.default_aircraft, estimation=replace(estimation, reference=reference)
-    )
+    aircraft = with_reference(settings.default_aircraft, gps_latency_s=flight.gps_latency_s)
 
     def on_round(number: int) -> None:
         report(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")

@@ -72,8 +72,8 @@ def run_gateway(
 
     settings = or_refuse(read)
     aircraft = read_aircraft(settings)
-    own = {one.estimation.estimator for one in aircraft.values()}
-    compiling = make_ready(settings.estimation.estimator, *own - {settings.estimation.estimator})
+    own = (one.estimation.estimator for one in aircraft.values())
+    compiling = make_ready(settings.estimation.estimator, *own)
     page = PanelProcess(config) if panel or settings.panel.enabled else None
     work = serve(
         lambda: Daemon(settings, aircraft, read), plain=plain, panel=page, compiling=compiling

@@ -54,19 +54,20 @@ def make_ready(*estimators: str) -> "Compilation | None":
     Parameters
     ----------
     *estimators : str
-        Names of those in the settings.
+        Names of those in the settings, also several times.
 
     Returns
     -------
     Compilation, optional
         If something is compiled, to be watched by the event loop.
     """
-    ordered = dict.fromkeys((SCANNER, *estimators, *ENTRY_POINTS))
+    needed = dict.fromkeys((SCANNER, *estimators))
+    ordered = needed | dict.fromkeys(ENTRY_POINTS)
     missing = [name for name in ordered if name in ENTRY_POINTS and not is_kept(name)]
     for name in missing:
         for entry_point in ENTRY_POINTS[name]:
             entry_point.interpret()
-    for name in (*estimators, SCANNER):
+    for name in needed:
         _rehearse(name)
     if not missing:
         return None

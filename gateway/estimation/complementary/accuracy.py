@@ -31,6 +31,7 @@ from gateway.estimation.complementary.manoeuvre import (
 )
 from gateway.estimation.complementary.navigation import REST_DECAY_S
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
+from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 STEP_S: Final = 0.1
@@ -39,8 +40,6 @@ LOST_RAD: Final = 0.5
 """Standard deviation of a tilt that is lost."""
 ANY_HEADING_RAD: Final = math.pi / math.sqrt(3.0)
 """The same of a heading that may be any."""
-NO_DECLINATION_RAD: Final = 0.2
-"""Magnetic north may be off by so much where the declination is not known."""
 FIX_M: Final = 1.0
 """Error of a fix along an axis, where the receiver tells none."""
 AXIS_SHARE: Final = math.sqrt(0.5)

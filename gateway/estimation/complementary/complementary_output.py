@@ -21,6 +21,7 @@ from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
     ATTITUDE_VALID,
     HEADING_VALID,
+    HEADING_VALID_RAD,
     gps_flags,
 )
 from gateway.estimation.kernel_record import (
@@ -37,8 +38,8 @@ from gateway.records import NAN
 
 DEAD_RECKONING_MAX_S: Final = 60.0
 """Dead reckoning longer than this is no position any more."""
-VALID_RAD: Final = 0.26
-"""Up to this standard deviation, tilt and heading are told as valid."""
+TILT_VALID_RAD: Final = 0.26
+"""A tilt is valid up to this standard deviation."""
 
 
 @compiled
@@ -75,9 +76,9 @@ def flags_of(s: ComplementaryState) -> int:
     """Put the flags together."""
     flags = sensor_flags(s)
     north, east, heading = as_vec(s.told_std)
-    if s.started == 1 and s.lost == 0 and max(north, east) < VALID_RAD:
+    if s.started == 1 and s.lost == 0 and max(north, east) < TILT_VALID_RAD:
         flags |= ATTITUDE_VALID
-    if s.heading_known == 1 and s.heading_true == 1 and heading < VALID_RAD:
+    if s.heading_known == 1 and s.heading_true == 1 and heading < HEADING_VALID_RAD:
         flags |= HEADING_VALID
     if s.has_height == 1:
         flags |= ALTITUDE_VALID

@@ -16,12 +16,14 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
+from gateway.estimation.eskf.recovery import NO_HEADING_VAR
 from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
     ATTITUDE_VALID,
     FRESH_GPS_S,
     HEADING_VALID,
+    HEADING_VALID_RAD,
     gps_flags,
 )
 from gateway.estimation.kernel_record import (
@@ -33,15 +35,14 @@ from gateway.estimation.kernel_record import (
     write_vec,
 )
 from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
 LEVEL_VAR = 0.1**2
-HEADING_VAR = 0.26**2
-NO_HEADING_RAD = math.sqrt(3.0)
+HEADING_VAR = HEADING_VALID_RAD**2
+NO_HEADING_RAD = math.sqrt(NO_HEADING_VAR)
 NO_HOLD_S = 1.0
-DECLINATION_RAD = 0.2
-"""Magnetic north may be off by so much where the declination is not known."""
 
 
 @compiled
@@ -76,7 +77,7 @@ def write_output(s: EskfState, row: FloatArray) -> None:
             std_rad = math.hypot(row[NAV_ATTITUDE_STD + 2], s.left_iron_ut / level_ut)
             row[NAV_ATTITUDE_STD + 2] = std_rad
         if s.heading_known == 1 and s.heading_true == 0:
-            row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], DECLINATION_RAD)
+            row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], NO_DECLINATION_RAD)
     write_place(s, row)
 
 

@@ -23,6 +23,7 @@ ENOUGH_HEADING_RAD: Final = 0.3
 """A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
 NO_HEADING_VAR: Final = 3.0
+"""Of a heading that may be any."""
 OWN_FRAME_VAR: Final = 0.0
 """While no heading is known, it is counted from where the filter began: that it knows."""
 
