@@ -2,7 +2,8 @@
 
 Theory of operation. PARAM_REQUEST_LIST makes the vehicle send everything; parameters still missing
 after a pause are requested one by one. A change is sent until the vehicle answers: PARAM_VALUE
-with the new value is a yes; PARAM_ERROR, or the old value, is a no.
+with the new value is a yes; PARAM_ERROR, or the old value, is a no. A value that is chosen before
+the last one is answered waits for that: an answer does not say which change it is for.
 """
 
 import math
@@ -59,6 +60,8 @@ class _Change:
     value: float
     due_us: int
     attempts: int = 1
+    newer: float | None = None
+    """The value to send once this one is answered."""
 
 
 class ParameterClient:
@@ -97,7 +100,7 @@ class ParameterClient:
         return [mavlink.MAVLink_param_request_list_message(self.system_id, AUTOPILOT)]
 
     def change(self, name: str, value: float, now_us: int) -> list[Any]:
-        """Set one; return the messages to send.
+        """Set one; return the messages to send now: none while its last change is not answered.
 
         Raises
         ------
@@ -110,6 +113,9 @@ class ParameterClient:
         if not math.isfinite(value):
             raise ValueError(f"{name}: {value} is not a number")
         self.refused.pop(name, None)
+        if (unanswered := self._changes.get(name)) is not None:
+            unanswered.newer = value
+            return []
         self._changes[name] = _Change(value, now_us + QUIET_US)
         return [self._set_message(entry, value)]
 
@@ -120,7 +126,7 @@ class ParameterClient:
                 self._take_value(message, now_us)
             case "PARAM_ERROR":
                 name = message.param_id
-                if self._changes.pop(name, None) is not None:
+                if self._answered(name, now_us) is not None:
                     self.refused[name] = ERRORS.get(message.error, f"error {message.error}")
             case "AUTOPILOT_VERSION":
                 bytewise = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
@@ -145,13 +151,23 @@ class ParameterClient:
         self.entries[name] = ParameterEntry(name, value, kind, index)
         self._indices.add(index)
         self.count = min(message.param_count, MAX_PARAMETERS) or self.count
-        change = self._changes.pop(name, None)
-        if change is not None and not math.isclose(value, change.value, rel_tol=1e-6, abs_tol=1e-9):
+        wanted = self._answered(name, now_us)
+        if wanted is not None and not math.isclose(value, wanted, rel_tol=1e-6, abs_tol=1e-9):
             self.refused[name] = f"the aircraft keeps {value:g}"
         if self.state is ListState.LOADING:
             self._due_us = now_us + QUIET_US
             if len(self._indices) >= self.count:
                 self.state, self._due_us = ListState.COMPLETE, None
+
+    def _answered(self, name: str, now_us: int) -> float | None:
+        """Return the value that was answered; None if none was awaited or a newer one follows."""
+        change = self._changes.pop(name, None)
+        if change is None:
+            return None
+        if change.newer is None:
+            return change.value
+        self._changes[name] = _Change(change.newer, now_us, attempts=0)
+        return None
 
     def _poll_list(self, now_us: int) -> list[Any]:
         if self._due_us is None or now_us < self._due_us:
@@ -178,6 +194,8 @@ class ParameterClient:
                 del self._changes[name]
                 self.refused[name] = "no answer"
                 continue
+            if change.newer is not None:
+                change.value, change.newer = change.newer, None
             change.attempts += 1
             change.due_us = now_us + QUIET_US
             found.append(self._set_message(self.entries[name], change.value))

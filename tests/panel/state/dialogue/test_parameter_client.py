@@ -71,6 +71,28 @@ def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
     assert client.entries["PAPER_ALPHA_GYRO"].value == 0.75
 
 
+def test_a_value_changed_again_before_the_answer_is_not_called_refused() -> None:
+    client = ParameterClient(1)
+    bench = Bench(client)
+    bench.run(client.load(bench.now_us), 2.0)
+    first = client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us)
+    bench.run(first + client.change("PAPER_ALPHA_GYRO", 0.5, bench.now_us), 0.02)
+    assert not client.refused
+    bench.run([], 0.1)
+    assert client.entries["PAPER_ALPHA_GYRO"].value == 0.5
+    assert not client.pending
+    assert not client.refused
+
+
+def test_a_value_that_follows_one_without_an_answer_is_sent_in_its_place() -> None:
+    client = ParameterClient(1)
+    client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
+    client.change("P", 2.0, 0)
+    assert not client.change("P", 3.0, 0)
+    [message] = client.poll(US_PER_S)
+    assert message.param_value == 3.0
+
+
 def test_a_client_that_may_not_change_is_told_so() -> None:
     client = ParameterClient(1)
     bench = Bench(client, may_change=False)
