@@ -1,9 +1,11 @@
 """The two radio nodes of an aircraft: samples in, payloads out, each at its time."""
 
+import heapq
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import count
 from operator import attrgetter
 from typing import Final
 
@@ -34,11 +36,9 @@ STATUS_S: Final = 1.0
 STARTING_US: Final = 600_000
 """From reset to the first payload: self-test and settling of the sensors."""
 
-IMU_AHEAD: Final = 40
-IMU_AHEAD_S: Final = 0.5
-GPS_AHEAD_S: Final = 2.0
-"""How far samples are generated ahead: few at once cost as much as many, but too many at once
-would block an event loop."""
+SAMPLES_AT_ONCE: Final = 20
+"""Few at once cost nearly as much as many, but many at once would hold up an event loop."""
+FIXES_AT_ONCE: Final = 10
 PHASES: Final = 4
 
 IMU_SENSORS: Final = 0b0111
@@ -64,7 +64,7 @@ class Sent:
 
 
 class Node(ABC):
-    """A source of payloads, run piece by piece.
+    """A source of payloads.
 
     Parameters
     ----------
@@ -74,18 +74,9 @@ class Node(ABC):
         Bits of the sensors on it.
     rate_hz : int
         What it reports as its sample rate.
-    ahead_s : float
-        How far payloads are generated ahead.
     """
 
-    def __init__(
-        self,
-        node_id: NodeId,
-        clock: DeviceClock,
-        sensors: int,
-        rate_hz: int,
-        ahead_s: float = 0.0,
-    ) -> None:
+    def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
         self.node_id = node_id
         self.restart_s = 0.0
         """True time at which its watchdog resets it; 0 for never."""
@@ -94,30 +85,28 @@ class Node(ABC):
         self._clock = clock
         self._sensors = sensors
         self._rate_hz = rate_hz
-        self._ahead_s = ahead_s
-        self._made_s = 0.0
-        self._waiting: list[Sent] = []
-        self._statuses = 0
 
-    def take(self, until_s: float) -> list[Sent]:
-        """Return every payload passed to the radio before a true time, in order."""
-        made = [*self._waiting, *self._report(until_s)]
-        if until_s > self._made_s:
-            ahead_s = self._ahead_s
-            if not self._made_s:
-                # Begin at different phases, so that the aircraft do not take the loop all at once.
-                ahead_s *= self.node_id.vehicle_id % PHASES / PHASES
-            self._made_s = until_s + ahead_s
-            made += self._make(self._made_s)
-        # Stable: a fix stays after the quality payload of the same time.
-        made.sort(key=attrgetter("time_s"))
-        ready = sum(1 for sent in made if sent.time_s < until_s)
-        self._waiting = made[ready:]
-        return [s for sent in made[:ready] if (s := self._after_restart(sent)) is not None]
+    def sent(self) -> Iterator[Sent]:
+        """Yield every payload passed to the radio, in order, without end.
+
+        Samples are made a few at a time, as they are asked for.
+        """
+        return filter(None, map(self._after_restart, self._with_reports()))
 
     @abstractmethod
-    def _make(self, until_s: float) -> Iterator[Sent]:
-        """Generate at least every payload that is passed to the radio before a true time."""
+    def _samples(self) -> Iterator[Sent]:
+        """Yield the sensors' payloads in order."""
+
+    def _with_reports(self) -> Iterator[Sent]:
+        times = ((k + 0.5) * STATUS_S for k in count())
+        report_s = next(times)
+        for sent in self._samples():
+            while report_s <= sent.time_s:
+                yield self._report(report_s)
+                report_s = next(times)
+            yield sent
+        yield self._report(report_s)
+        yield from map(self._report, times)
 
     def _after_restart(self, sent: Sent) -> Sent | None:
         """Silence a node while it restarts, with its clock from zero then."""
@@ -128,36 +117,46 @@ class Node(ABC):
             return None
         return Sent(sent.time_s, node_time_us, sent.payload)
 
-    def _report(self, until_s: float) -> Iterator[Sent]:
-        while (time_s := (self._statuses + 0.5) * STATUS_S) < until_s:
-            self._statuses += 1
-            status = NodeStatusPayload(
-                firmware_version=(1, 0),
-                reset_cause=POWER_ON,
-                sensors_present=self._sensors,
-                sensors_failed=0,
-                bus_errors=0,
-                radio_failed=self.radio_failed & UINT16_MAX,
-                radio_retries=self.radio_retries & UINT16_MAX,
-                loop_max_us=LOOP_US,
-                sample_rate_hz=self._rate_hz,
-                supply_mv=SUPPLY_MV,
-            )
-            yield Sent(time_s, self._clock.at(time_s), status)
+    def _report(self, time_s: float) -> Sent:
+        status = NodeStatusPayload(
+            firmware_version=(1, 0),
+            reset_cause=POWER_ON,
+            sensors_present=self._sensors,
+            sensors_failed=0,
+            bus_errors=0,
+            radio_failed=self.radio_failed & UINT16_MAX,
+            radio_retries=self.radio_retries & UINT16_MAX,
+            loop_max_us=LOOP_US,
+            sample_rate_hz=self._rate_hz,
+            supply_mv=SUPPLY_MV,
+        )
+        return Sent(time_s, self._clock.at(time_s), status)
+
+    def _pieces(self, length_s: float) -> Iterator[float]:
+        """Yield when each piece of samples ends; those of the next aircraft end at other times."""
+        first_s = length_s * (1.0 - self.node_id.vehicle_id % PHASES / PHASES)
+        return (first_s + k * length_s for k in count())
 
 
 class ImuNode(Node):
     """MPU6050, HMC5883L and BMP180 of a simulated aircraft."""
 
-    def __init__(self, aircraft: SimulatedAircraft, rate_hz: int) -> None:
+    def __init__(self, aircraft: SimulatedAircraft, rate_hz: int, baro_rate_hz: int) -> None:
         node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
-        ahead_s = min(IMU_AHEAD / rate_hz, IMU_AHEAD_S)
-        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz, ahead_s)
+        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz)
         self._aircraft = aircraft
+        self._baro_rate_hz = baro_rate_hz
 
-    def _make(self, until_s: float) -> Iterator[Sent]:
-        yield from imu_payloads(self._aircraft.imu.take(until_s))
-        yield from baro_payloads(self._aircraft.baro.take(until_s))
+    def _samples(self) -> Iterator[Sent]:
+        return heapq.merge(self._imu(), self._baro(), key=attrgetter("time_s"))
+
+    def _imu(self) -> Iterator[Sent]:
+        for until_s in self._pieces(SAMPLES_AT_ONCE / self._rate_hz):
+            yield from imu_payloads(self._aircraft.imu.take(until_s))
+
+    def _baro(self) -> Iterator[Sent]:
+        for until_s in self._pieces(SAMPLES_AT_ONCE / self._baro_rate_hz):
+            yield from baro_payloads(self._aircraft.baro.take(until_s))
 
 
 class GpsNode(Node):
@@ -165,18 +164,19 @@ class GpsNode(Node):
 
     def __init__(self, aircraft: SimulatedAircraft, geoid_separation_m: float) -> None:
         node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
-        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ, GPS_AHEAD_S)
+        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ)
         self._aircraft = aircraft
         self._geoid_separation_m = geoid_separation_m
 
-    def _make(self, until_s: float) -> Iterator[Sent]:
-        gps = self._aircraft.gps.take(until_s)
-        yield from gps_payloads(gps, self._clock, self._geoid_separation_m)
+    def _samples(self) -> Iterator[Sent]:
+        for until_s in self._pieces(FIXES_AT_ONCE / GPS_RATE_HZ):
+            gps = self._aircraft.gps.take(until_s)
+            yield from gps_payloads(gps, self._clock, self._geoid_separation_m)
 
 
 def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
     """Create the two nodes of an aircraft."""
-    imu = ImuNode(aircraft, settings.imu_rate_hz)
+    imu = ImuNode(aircraft, settings.imu_rate_hz, settings.baro_rate_hz)
     imu.restart_s = settings.imu_restart_s
     return (imu, GpsNode(aircraft, settings.geoid_separation_m))
 

@@ -172,16 +172,9 @@ class RecordedNode(Node):
     ) -> None:
         super().__init__(node_id, clock, sensors, rate_hz)
         self._payloads = payloads
-        self._ahead: Sent | None = None
 
-    def _make(self, until_s: float) -> Iterator[Sent]:
-        while True:
-            if self._ahead is None:
-                self._ahead = next(self._payloads, None)
-            if self._ahead is None or self._ahead.time_s >= until_s:
-                return
-            sent, self._ahead = self._ahead, None
-            yield sent
+    def _samples(self) -> Iterator[Sent]:
+        return self._payloads
 
 
 def fly_again(

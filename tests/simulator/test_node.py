@@ -1,14 +1,13 @@
 """Payloads carry what the sensors read, at their moments."""
 
-from collections.abc import Iterator
+from itertools import takewhile
 
 import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import SimulatedAircraft, fly
-from gateway.simulator.node import GpsNode, ImuNode, Sent, nodes_of
-from gateway.simulator.receiver import PIECE_S
+from gateway.simulator.node import GpsNode, ImuNode, Node, Sent, nodes_of
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
     BaroPayload,
@@ -29,14 +28,18 @@ def nodes() -> tuple[ImuNode, GpsNode]:
     return nodes_of(SimulatedAircraft(SETTINGS), SETTINGS)
 
 
+def sent_by(node: Node, until_s: float = SECONDS) -> list[Sent]:
+    return list(takewhile(lambda sent: sent.time_s < until_s, node.sent()))
+
+
 @pytest.fixture(scope="module")
 def imu_sent() -> list[Sent]:
-    return nodes()[0].take(SECONDS)
+    return sent_by(nodes()[0])
 
 
 @pytest.fixture(scope="module")
 def gps_sent() -> list[Sent]:
-    return nodes()[1].take(SECONDS)
+    return sent_by(nodes()[1])
 
 
 def of_kind(sent: list[Sent], kind: type) -> list[Sent]:
@@ -97,31 +100,15 @@ class TestGpsNode:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_pieces_equal_the_whole_and_stay_in_order(index: int) -> None:
-    whole = nodes()[index].take(12.0)
-    node = nodes()[index]
-    pieces = [sent for k in range(1, 121) for sent in node.take(k * 0.1)]
-    assert pieces == whole
-    times = [sent.time_s for sent in whole]
+def test_pieces_of_any_size_give_the_same_in_order(
+    index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = sent_by(nodes()[index])
+    for size in ("SAMPLES_AT_ONCE", "FIXES_AT_ONCE"):
+        monkeypatch.setattr(f"gateway.simulator.node.{size}", 7)
+    assert sent_by(nodes()[index]) == usual
+    times = [sent.time_s for sent in usual]
     assert times == sorted(times)
-
-
-def test_two_aircraft_are_not_made_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[tuple[int, int]] = []
-    imu = ImuNode._make
-
-    def make(node: ImuNode, until_s: float) -> Iterator[Sent]:
-        made.append((piece, node.node_id.vehicle_id))
-        return imu(node, until_s)
-
-    monkeypatch.setattr(ImuNode, "_make", make)
-    aircraft = [nodes_of(SimulatedAircraft(SETTINGS, index), SETTINGS)[0] for index in range(2)]
-    for piece in range(1, 30):
-        for node in aircraft:
-            node.take(piece * PIECE_S)
-    later = [piece for piece, _ in made if piece > 1]
-    assert len(later) > 8
-    assert len(set(later)) == len(later)
 
 
 def test_every_payload_fits_the_radio(imu_sent: list[Sent], gps_sent: list[Sent]) -> None:

@@ -5,6 +5,7 @@ import itertools
 import tracemalloc
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 import gateway
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
 from gateway.simulator.flight import fly
+from gateway.simulator.gps import GpsSampler
 from gateway.simulator.receiver import damage, simulate
+from gateway.simulator.samplers import BaroSampler, ImuSampler
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame
@@ -71,6 +74,31 @@ class TestLine:
         same, other = frames(5.0), frames(5.0, seed=2)
         assert same == line[: len(same)]
         assert same != other
+
+    def test_no_frame_makes_more_than_a_piece(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Or it would hold up the loop that asks for it."""
+        made: list[int] = []
+
+        def counted(sampler: type[ImuSampler | BaroSampler | GpsSampler]) -> None:
+            take = sampler.take
+
+            def wrapper(self: Any, until_s: float) -> Any:
+                samples = take(self, until_s)
+                made.append(len(samples.time_s))
+                return samples
+
+            monkeypatch.setattr(sampler, "take", wrapper)
+
+        for sampler in (ImuSampler, BaroSampler, GpsSampler):
+            counted(sampler)
+        line = simulate(settings(vehicles=4, radio_loss=0.0)).frames(6.0)
+        assert next(line).time_s < 0.1
+        total = len(made)
+        for _ in line:
+            assert len(made) <= total + 1
+            total = len(made)
+        assert total > 100
+        assert max(made) <= 21
 
     def test_too_slow_a_line_drops_and_counts(self) -> None:
         contents = decoded(frames(10.0, baud=38_400, imu_rate_hz=200))

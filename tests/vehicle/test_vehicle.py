@@ -71,6 +71,22 @@ def test_every_message_at_its_own_rate() -> None:
     assert {name: counted[name] for name in expected} == pytest.approx(expected, abs=1)
 
 
+def test_messages_are_not_due_all_at_once() -> None:
+    vehicle = make()
+    told = []
+    # A minute is missing, after which all that was missed is due.
+    for start_s in (0, 60):
+        for ms in range(start_s * 1000, (start_s + 10) * 1000, 10):
+            time_us = 1000 * ms
+            told.append(names(vehicle.on_state(state_at(time_us), sample_at(time_us), time_us)))
+            if ms % 200 == 0:
+                vehicle.on_gps(fix_at(time_us), time_us)
+            told.append(names(vehicle.poll(time_us)))
+        told[-2000:-1900] = []
+    assert max(map(len, told)) <= 2
+    assert len({name for each in told for name in each}) > 12
+
+
 def test_a_rate_of_zero_is_silence() -> None:
     vehicle = make(rates=RateSettings(attitude_hz=0.0, gps_raw_int_hz=0.0, sys_status_hz=0.0))
     found = set(names(fly(vehicle, 0, 2)))
@@ -219,7 +235,8 @@ def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
 
 def test_system_time_follows_gps() -> None:
     vehicle = make()
-    before = [m for m in decode(vehicle.poll(0)) if m.get_type() == "SYSTEM_TIME"]
+    told = decode([*vehicle.poll(0), *vehicle.poll(ONE_S)])
+    before = [m for m in told if m.get_type() == "SYSTEM_TIME"]
     assert before[0].time_unix_usec == 0
     vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
     after = [m for m in decode(vehicle.poll(3 * ONE_S)) if m.get_type() == "SYSTEM_TIME"]

@@ -16,8 +16,8 @@ MAX_LATE_S: Final = 1.0
 """A loop delayed for longer, as by a suspended machine, continues where it was: catching up would
 delay the loop even more."""
 
-MAX_BATCH: Final = 64
-"""Frames written at once before the loop's other work gets its turn."""
+MAX_BATCH: Final = 4
+"""Frames written at once before the loop's other work gets its turn: some have to be made first."""
 
 
 class PtyPort:
@@ -49,7 +49,8 @@ class PtyPort:
         """Set after the last frame, and by closing."""
         self._frames = frames
         self._speed = speed
-        self._next: TimedFrame | None = None
+        # Here and not by `start`: the first frame takes as long as many of the others.
+        self._next = next(frames, None)
         self._rest = b""
         self._start_s = 0.0
         self._timer: asyncio.Handle | None = None

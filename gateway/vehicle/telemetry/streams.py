@@ -10,10 +10,14 @@ a grid of its own interval. Three effects could disturb that:
   and now and then skip or double one. The grid therefore leans a sixteenth of the way towards
   each sample it takes. Where the sample rate is within 3 % of a multiple the grid locks on, and
   every n-th sample is sent; elsewhere the pulls cancel out over a period.
-- *Bursts.* After a gap, or where samples come slower than the interval, the grid restarts
-  at the sample, so a sample is sent once at most.
+- *Bursts.* After a gap, or where samples come slower than the interval, the moments that were
+  missed are left out, so a sample is sent once at most.
 
 Messages that no sample carries (HEARTBEAT and the like) run on the same grid by `tick`.
+
+Many intervals are multiples of each other, so messages whose grids begin at the same moment are
+due together, again and again, and the loop that sends them does nothing else meanwhile. `begin`
+sets them apart, and a gap leaves them so.
 """
 
 from typing import Final
@@ -63,6 +67,10 @@ class Stream:
     def due_us(self) -> int | None:
         """When the message is due next; None while it is off or has not started."""
         return None if self.interval_us == OFF else self._due_us
+
+    def begin(self, time_us: int) -> None:
+        """Start the grid at a time."""
+        self._due_us = time_us
 
     def change(self, interval: int) -> None:
         """Set a new interval, counted from the next sample."""
@@ -114,7 +122,9 @@ class Stream:
         return True
 
     def _advance(self, time_us: int, late: int, lean: int) -> None:
-        if self._due_us is None or late > self.interval_us:
-            self._due_us = time_us + self.interval_us
-        else:
-            self._due_us += self.interval_us + lean
+        if self._due_us is None:
+            self._due_us = time_us
+        if late > self.interval_us:
+            self._due_us += late // self.interval_us * self.interval_us
+            lean = 0
+        self._due_us += self.interval_us + lean

@@ -21,14 +21,15 @@ from gateway.vehicle.telemetry.motion import IN_AIR, Motion
 from gateway.vehicle.telemetry.streams import Pace, Stream, interval_us
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
-STATE_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-)
-"""Carried by IMU samples; the quaternion first, because its latency is the visible one."""
+STATE_MESSAGES: Final = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10_000,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: 30_000,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50_000,
+}
+"""Carried by IMU samples, each from so many µs after the first: at the usual rates no sample
+carries more than two. The quaternion comes first, because its latency is the visible one."""
 
 TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -43,6 +44,9 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
 )
 
+APART_US: Final = 10_000
+"""Between the first of one timed message and of the next: at the same intervals, they would else
+be due at the same moments for ever."""
 HEARTBEAT_HZ: Final = 1.0
 """Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
 
@@ -78,6 +82,7 @@ class Telemetry:
         self._builders = self._own_builders()
         self._timed = [*TIMED_MESSAGES]
         self._take_added()
+        self._polled = False
 
     def _own_builders(self) -> dict[int, Builder]:
         health = self.health
@@ -140,6 +145,9 @@ class Telemetry:
 
     def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
         """Take in a navigation state and its IMU sample, and return the messages due."""
+        if self.state is None:
+            for message_id, stream in self._state_streams:
+                stream.begin(state.time_us + STATE_MESSAGES[message_id])
         self.state, self._sample = state, sample
         self._updated |= messages.IMU_UPDATED
         if sample.mag_b_ut is not None:
@@ -196,6 +204,10 @@ class Telemetry:
 
     def poll(self, now_us: int) -> list[Any]:
         """Return the timed messages that are due."""
+        if not self._polled:
+            self._polled = True
+            for k, message_id in enumerate(self._timed):
+                self.streams[message_id].begin(now_us + k * APART_US)
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)

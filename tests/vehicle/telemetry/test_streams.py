@@ -62,6 +62,15 @@ def test_no_burst_after_a_gap() -> None:
     assert len(late) == 50
 
 
+def test_a_gap_does_not_bring_apart_streams_together() -> None:
+    streams = [Stream(100_000), Stream(100_000)]
+    for k, stream in enumerate(streams):
+        stream.begin(30_000 * k)
+    times = [*range(0, 500_000, 10_000), *range(5_000_000, 5_500_000, 10_000)]
+    sent = [[t for t in times if stream.tick(t)] for stream in streams]
+    assert set(sent[0]) & set(sent[1]) == {5_000_000}
+
+
 @pytest.mark.parametrize("ask", [Stream.offer, Stream.tick])
 def test_off_sends_nothing(ask: object) -> None:
     stream = Stream(interval_us(0.0))
