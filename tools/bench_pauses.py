@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.live.run import loop_comes_first
+from gateway.cli.support.made_ahead import made_ahead
 from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
@@ -71,7 +72,7 @@ def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySetting
 
 async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> None:
     """Run the daemon as `mavgate demo` does."""
-    line = simulate(settings.simulator, unix_time_us()).frames()
+    line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
     daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
     watch.install()
     with loop_comes_first():

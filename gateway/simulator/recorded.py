@@ -177,18 +177,16 @@ class RecordedNode(Node):
         return self._payloads
 
 
-def fly_again(
-    settings: SimulatorSettings,
-    flight: RecordedFlight,
-    on_round: Callable[[int], None],
-    start_unix_us: int = START_UNIX_US,
+def in_rounds(
+    frames: Iterator[TimedFrame], duration_s: float, on_round: Callable[[int], None]
 ) -> Iterator[TimedFrame]:
-    """Fly a recording repeatedly; the nodes' clocks and sequence numbers continue.
+    """Pass on the frames of an endless replay, and report the end of each round.
 
     Parameters
     ----------
-    settings, flight, start_unix_us
-        As for `replay`.
+    frames : iterator of TimedFrame
+    duration_s : float
+        Of the recorded flight.
     on_round : callable
         Called with the number of the round that begins, from 2, before its first frame.
 
@@ -196,10 +194,10 @@ def fly_again(
     ------
     TimedFrame
     """
-    number, end_s = 1, flight.duration_s
-    for frame in replay(settings, flight, start_unix_us, endless=True).frames():
+    number, end_s = 1, duration_s
+    for frame in frames:
         if frame.time_s >= end_s:
-            number, end_s = number + 1, end_s + flight.duration_s
+            number, end_s = number + 1, end_s + duration_s
             on_round(number)
         yield frame
 
@@ -221,7 +219,7 @@ def replay(
     start_unix_us : int
         UTC of the first row, which recordings do not contain.
     endless : bool
-        Restart whenever the recording has ended.
+        Restart whenever the recording has ended; the nodes' clocks and sequence numbers continue.
 
     Returns
     -------

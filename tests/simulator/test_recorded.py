@@ -5,7 +5,7 @@ import pytest
 
 from gateway.edges.disk.tracker_csv import read_flight
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
-from gateway.simulator.recorded import RecordedFlight, fly_again, replay
+from gateway.simulator.recorded import RecordedFlight, in_rounds, replay
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.link import Link
 
@@ -210,7 +210,8 @@ def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
         rounds.append((number, len(found)))
 
     until_s = 2.5 * flight.duration_s
-    for frame in fly_again(QUIET, flight, note):
+    frames = replay(QUIET, flight, endless=True).frames()
+    for frame in in_rounds(frames, flight.duration_s, note):
         if frame.time_s > until_s:
             break
         found.extend(link.feed(frame.data, round(frame.time_s * 1e6)))
@@ -228,5 +229,5 @@ def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
 
 def test_a_flight_without_barometer_and_gps_goes_round_too() -> None:
     bare = RecordedFlight.from_columns(columns(baro_alt_m=None, gps_lat=None))
-    frames = fly_again(QUIET, bare, lambda _: None)
+    frames = replay(QUIET, bare, endless=True).frames()
     assert sum(1 for _, frame in zip(range(3 * ROWS), frames, strict=False)) == 3 * ROWS

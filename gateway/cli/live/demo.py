@@ -20,6 +20,7 @@ from gateway.cli.live.run import (
 )
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.firmware_bench import BenchError, firmware_line
+from gateway.cli.support.made_ahead import made_ahead
 from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.panel_process import PanelProcess, is_installed
 from gateway.cli.support.recording_options import (
@@ -45,7 +46,7 @@ from gateway.flights.reading import ReadOptions
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
-from gateway.simulator.recorded import fly_again
+from gateway.simulator.recorded import in_rounds, replay
 from gateway.simulator.timed_frame import TimedFrame
 
 log = logging.getLogger(__name__)
@@ -94,10 +95,10 @@ def demo(
         if flight is not None:
             line, aircraft = recorded_line(settings, flight, columns, report)
         elif firmware:
-            line = firmware_line(settings.simulator, unix_time_us())
+            line = made_ahead(firmware_line(settings.simulator, unix_time_us()))
             aircraft = calibrated_aircraft(settings)
         else:
-            line = simulate(settings.simulator, unix_time_us()).frames()
+            line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
             aircraft = calibrated_aircraft(settings)
     except (FlightFileError, BenchError, ValueError) as error:
         refuse(str(error))
@@ -148,7 +149,8 @@ def recorded_line(
     def on_round(number: int) -> None:
         report(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")
 
-    frames = fly_again(settings.simulator, flight, on_round, unix_time_us())
+    receiver = replay(settings.simulator, flight, unix_time_us(), endless=True)
+    frames = in_rounds(made_ahead(receiver.frames()), flight.duration_s, on_round)
     return frames, {settings.simulator.vehicle_id: aircraft}
 
 

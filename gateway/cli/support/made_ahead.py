@@ -1,0 +1,61 @@
+"""The frames of a simulated receiver, made by a process of their own."""
+
+import logging
+import signal
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Final
+
+from gateway.analysis.processes import begin_copy
+from gateway.simulator.timed_frame import TimedFrame
+
+log = logging.getLogger(__name__)
+
+AT_ONCE: Final = 16
+"""Frames that cross at once; the pipe holds some hundreds, which are made ahead."""
+
+
+def made_ahead(frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
+    """Let a background process make frames, so that the event loop that plays them need not.
+
+    Parameters
+    ----------
+    frames : iterator of TimedFrame
+        Used in that process alone, which ends with this one.
+
+    Returns
+    -------
+    iterator of TimedFrame
+        The same frames.
+    """
+    receiver, sender = Pipe(duplex=False)
+    begin_copy(_make, (frames, sender, receiver))
+    # So that the pipe ends with that process.
+    sender.close()
+    return _take(receiver)
+
+
+def _take(receiver: Connection) -> Iterator[TimedFrame]:
+    with receiver:
+        while True:
+            try:
+                made = receiver.recv()
+            except EOFError:
+                log.warning("the simulated receiver has ended")
+                return
+            for time_s, data, damaged in made:
+                yield TimedFrame(time_s, data, damaged)
+
+
+def _make(task: tuple[Iterator[TimedFrame], Connection, Connection]) -> None:
+    frames, sender, receiver = task
+    # So that sending fails once nobody takes the frames.
+    receiver.close()
+    # A terminal's Ctrl+C is for the gateway, which ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(BrokenPipeError):
+        while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
+            sender.send(made)
