@@ -183,8 +183,8 @@ def iron_variance(s: FieldState) -> float:
 
 
 @compiled
-def field_similarity(s: FieldState, norm: float, dip: float) -> float:
-    """Weigh a field by how alike it is to the usual one: what bends the one bends the other.
+def field_unlikeness(s: FieldState, norm: float, dip: float) -> float:
+    """Tell how unlike the usual field one is: what bends strength and dip bends the heading.
 
     Parameters
     ----------
@@ -196,13 +196,13 @@ def field_similarity(s: FieldState, norm: float, dip: float) -> float:
     Returns
     -------
     float
-        1 for the usual field itself or while none is known, less the less alike.
+        By what to divide its weight: 1 for the usual field or while none is known, else more.
     """
     if s.mag_norm_ref == 0.0:
         return 1.0
     stronger = (norm / s.mag_norm_ref - 1.0) / LIKE_NORM_SHARE
     steeper = (dip - s.mag_dip_ref) / LIKE_DIP_RAD
-    return 1.0 / (1.0 + stronger * stronger + steeper * steeper)
+    return 1.0 + stronger * stronger + steeper * steeper
 
 
 @compiled

@@ -18,7 +18,7 @@ from gateway.estimation.magfield import (
     NEW_FIELD_S,
     CompassSettings,
     compare_field,
-    field_similarity,
+    field_unlikeness,
     iron_variance,
     note_iron,
 )
@@ -130,13 +130,13 @@ class TestField:
         else:
             assert seen < 0.01
 
-    def test_a_field_counts_by_its_likeness_to_the_usual_one(self) -> None:
+    def test_a_field_counts_by_its_unlikeness_to_the_usual_one(self) -> None:
         state = new_record(ComplementaryState)
-        assert field_similarity(state, 45.0, 1.1) == 1.0
+        assert field_unlikeness(state, 45.0, 1.1) == 1.0
         self.feed(state, 45.0, 10.0)
-        assert field_similarity(state, 45.0, 1.1) == pytest.approx(1.0)
-        assert field_similarity(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(0.5)
-        assert field_similarity(state, 52.0, 1.1) < 0.1
+        assert field_unlikeness(state, 45.0, 1.1) == pytest.approx(1.0)
+        assert field_unlikeness(state, 45.0, 1.1 + LIKE_DIP_RAD) == pytest.approx(2.0)
+        assert field_unlikeness(state, 52.0, 1.1) > 10.0
 
 
 def test_stuck_sensors() -> None:

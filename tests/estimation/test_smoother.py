@@ -21,6 +21,7 @@ from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
     attitude_scores,
     outage_score,
+    outage_scores,
     position_errors_m,
     rms,
     run_eskf,
@@ -135,19 +136,30 @@ def test_a_heading_by_compass_alone_is_no_surer_than_the_iron_lets_it(data_dir, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", [BROAD_30, "px4_mocap_log008"])
+def test_a_disturbed_compass_turns_it_less_than_the_filter(data_dir, name: str) -> None:
+    """A magnet and motors: the disturbance lasts, though the field now and then looks usual."""
+    flight = read_flight(data_dir / f"{name}.csv.gz")
+    live, smoothed = (
+        attitude_scores(flight, run(flight)[:, :4])["yaw"] for run in (run_eskf, run_smoothed)
+    )
+    assert smoothed < live
+
+
+@pytest.mark.slow
 def test_real_fixed_wing(data_dir) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     assert attitude_scores(flight, run_smoothed(flight)[:, :4])["yaw"] < 1.0
-    assert outage_score(flight, run_smoothed, 10.0) < 1.7
+    assert outage_scores(flight, run_smoothed, 10.0)["fix_out10"] < 1.5
     assert outage_score(flight, run_smoothed, 30.0) < 10.0
 
 
 @pytest.mark.slow
 def test_real_car(data_dir) -> None:
-    """Long parked without a heading; the smoother is not worse than the filter there."""
+    """Long parked without a heading; then GPS velocities that lag behind the places by 0.12 s."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
     live, smoothed = (
         rms(position_errors_m(flight, run(flight))) for run in (run_eskf, run_smoothed)
     )
-    assert smoothed < live + 0.1
+    assert smoothed < live
     assert outage_score(flight, run_smoothed, 10.0) < outage_score(flight, run_eskf, 10.0)

@@ -46,7 +46,7 @@ from gateway.estimation.kernel_record import (
     write_vec,
 )
 from gateway.estimation.local_position import BARO_STALE_S, past_state
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_similarity, take_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_unlikeness, take_field
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
 from gateway.geometry.quaternion import (
@@ -318,6 +318,15 @@ def watch_way(s: EskfState, dt: float) -> None:
 
 
 @compiled
+def recent_unlikeness(s: EskfState, p: EskfGains, norm: float, dip: float, dt: float) -> float:
+    """Return by what to divide a field's weight: what disturbs the compass lasts for a while."""
+    now = field_unlikeness(s, norm, dip)
+    kept = p.field_memory_s / (p.field_memory_s + dt)
+    s.mag_unlike = kept * s.mag_unlike + (1.0 - kept) * now
+    return max(now, s.mag_unlike)
+
+
+@compiled
 def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     """Use one magnetometer sample.
 
@@ -341,8 +350,9 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     if norm < MIN_FIELD_UT or level < 0.05 * norm or s.time_s <= s.mag_s:
         return
     dip = math.asin(field[2] / norm)
-    follow_field(s, dip, s.time_s - s.mag_s)
-    weight = take_field(s, p, norm, field[2]) * field_similarity(s, norm, dip)
+    dt = min(s.time_s - s.mag_s, STALE_MAG_S)
+    follow_field(s, dip, dt)
+    weight = take_field(s, p, norm, field[2]) / recent_unlikeness(s, p, norm, dip, dt)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if s.heading_known == 0:

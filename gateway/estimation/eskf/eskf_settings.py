@@ -1,6 +1,6 @@
 """Settings and gains of the error-state Kalman filter."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from gateway.estimation.filtering.filter_state import FilterGains, filter_gains
 from gateway.estimation.kernel_record import filled_record
@@ -9,6 +9,8 @@ from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
+
+VELOCITY_CORRELATION_S: Final = 0.25
 
 
 class EskfSettings(Settings, frozen=True):
@@ -154,9 +156,13 @@ class EskfGains(FilterGains):
     gps_height_wander_var: float
     gps_wander_s: float
     gps_velocity_var: float
+    velocity_correlation_s: float
+    """Errors of GPS velocities are alike for about this time: faster fixes tell no more."""
     gps_climb_var: float
     gps_jitter_sq: float
     mag_var: float
+    field_memory_s: float
+    """A field that was unlike the usual one is doubted for about this time."""
     mag_bias_var: float
     mag_bias_density: float
     baro_var: float
@@ -208,6 +214,8 @@ def make_gains(
         "gps_wander_var": s.gps_wander_m**2,
         "gps_height_wander_var": s.gps_height_wander_m**2,
         "gps_wander_s": s.gps_wander_s,
+        "velocity_correlation_s": VELOCITY_CORRELATION_S,
+        "field_memory_s": 0.0,
         "gps_velocity_var": s.gps_velocity_mps**2,
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,

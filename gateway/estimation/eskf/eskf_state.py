@@ -59,6 +59,8 @@ class EskfState(FilterState):
     aided: int
     """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""
     mag_used_s: float
+    mag_unlike: float
+    """Mean of `field_unlikeness` over the last `field_memory_s`."""
     field_n: Annotated[FloatArray, (3,)]
     """The field that the compass was last used with, NED, uT; all zero before."""
     left_iron_ut: float

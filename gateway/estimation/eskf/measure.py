@@ -48,8 +48,6 @@ UNAIDED_CORRELATION_S: Final = 1.0
 """The true speed that is taken for noise changes in about this time."""
 COMPASS_CORRELATION_S: Final = 0.6
 """The errors of soft iron and current change with the attitude, so in about this time."""
-VELOCITY_CORRELATION_S: Final = 0.25
-"""Errors of successive GPS velocities are alike for about this time: faster fixes tell no more."""
 VELOCITY_GATE_SQ: Final = 9.0
 """A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
 FAR_SQ: Final = 1e12
@@ -199,7 +197,7 @@ def update_by_fix(
         Age of the fix, s.
     """
     late_pos, late_vel = delay_variances(s, p, once, lag)
-    repeated = max(1.0, VELOCITY_CORRELATION_S / max(s.time_s - s.fix_s, 0.05))
+    repeated = max(1.0, p.velocity_correlation_s / max(s.time_s - s.fix_s, 0.05))
     for k in range(3):
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         if math.isfinite(off_vel[k]):

@@ -31,14 +31,19 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.eskf_kernels import FLOWN_S, WAY_S
+from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
 from gateway.estimation.kernel import KernelEstimator, SampleLog
-from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
 from gateway.geometry.geodesy import radii_m
 
-NODE_S: Final = 0.2
+NODE_S: Final = 0.4
 """From node to node; between them the corrections are interpolated."""
+VELOCITY_CORRELATION_S: Final = 0.75
+FIELD_MEMORY_S: Final = 5.0
+"""What lasts is noise to a filter that forgets, and an error to one that averages over minutes:
+the smoother counts fewer GPS velocities as independent, and doubts a disturbed field for longer."""
 LASTING_RAD: Final = 0.005
 """Axes and scales of the sensors are off for a whole flight; averages do not lessen that."""
 LEAST_VAR: Final = 1e-24
@@ -76,7 +81,7 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
     shown = np.zeros((count, SHOWN))
     arguments = (
-        states, estimator.gains, nodes,
+        states, _gains_of(estimator), nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
         out, P, F, foreseen, d, anew, shown,
     )  # fmt: skip
@@ -88,6 +93,14 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     begins, ends, variances = _backward(P, F, foreseen, d, states[0]["P"])
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out
+
+
+def _gains_of(estimator: KernelEstimator[Any, Any]) -> EskfGains:
+    """Return the filter's gains with the noises that count over minutes."""
+    gains: EskfGains = copy_record(estimator.gains)
+    gains.velocity_correlation_s = VELOCITY_CORRELATION_S
+    gains.field_memory_s = FIELD_MEMORY_S
+    return gains
 
 
 def _nodes(time_us: IntArray) -> IntArray:
