@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Generic, TypeVar
+from typing import Generic, TypeVar, cast
 
 import msgspec
 import numpy as np
 
 from gateway.compiled import address_of
 from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -133,6 +134,11 @@ class KernelEstimator(Generic[State, Gains]):
         if getattr(state, "dtype", None) != getattr(self._state, "dtype", None):
             raise TypeError(f"not a state of this estimator: {type(state)}")
         self._use(copy_record(state))
+
+    @property
+    def gps_latency_s(self) -> float:
+        """The latency in use: as set, or as the motion shows where that contradicts it."""
+        return float(cast(LatencyState, self._state).gps_latency_s)
 
     @property
     def gains(self) -> Gains:

@@ -23,7 +23,11 @@ class ReferenceSettings(Settings, frozen=True):
     gps_latency_s: Annotated[
         float,
         setting(
-            "From the moment a fix is valid to its arrival at the gateway.", "s", ge=0.0, le=2.0
+            "From the moment a fix is valid to its arrival at the gateway. Where manoeuvres "
+            "contradict it by more than 0.05 s, complementary and eskf use what they show.",
+            "s",
+            ge=0.0,
+            le=2.0,
         ),
     ] = 0.15
     gps_max_h_acc_m: Annotated[

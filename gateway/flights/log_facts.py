@@ -13,7 +13,7 @@ import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
-from gateway.estimation.alignment.gps_latency import GpsLatency, estimate_latency
+from gateway.estimation.alignment.latency_of_log import GpsLatency, estimate_latency
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.flights.flight_terms import FlightError

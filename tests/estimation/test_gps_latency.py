@@ -1,16 +1,28 @@
 """The latency out of motion alone, on simulated flights whose latency is known."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.estimation.alignment.gps_latency import estimate_latency
-from gateway.estimation.kernel import SampleLog
+from gateway.aircraft import Aircraft, AircraftSettings
+from gateway.estimation.alignment.latency_of_log import estimate_latency
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.flights.log_facts import with_reference
+from gateway.records import Outgoing
+from gateway.simulator.flight import fly
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tools.flights import Flight, read_flight, simulated_flight
+from tools.score_estimators import attitude_scores
 
 TOLD_S = 0.16
+FILTERS = ("complementary", "eskf")
+STATUSTEXT = mavlink.MAVLINK_MSG_ID_STATUSTEXT
 
 
 @pytest.fixture(scope="module", params=[21, 22, 23])
@@ -47,6 +59,57 @@ def test_without_velocities_it_is_unknown(flight: Flight) -> None:
     gps[:, 4:7] = np.nan
     assert estimate_latency(replace(flight.log, gps=gps)) is None
     assert estimate_latency(between(flight.log, 0.0, 0.0)) is None
+
+
+def fused(name: str, flight: Flight, set_s: float) -> tuple[np.ndarray, float]:
+    """Run a filter with a latency that is set; return its states and the latency in use at last."""
+    reference = msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
+    estimator = make_estimator(EstimationSettings(estimator=name, reference=reference))
+    assert isinstance(estimator, KernelEstimator)
+    return estimator.run(flight.log), estimator.gps_latency_s
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_filter_corrects_what_is_set_wrong(flight: Flight, name: str) -> None:
+    late = flight.log.imu_time_us > 0.6 * flight.log.imu_time_us[-1]
+    flight = replace(flight, counts=flight.counts & late)
+    right, kept_s = fused(name, flight, TOLD_S)
+    assert kept_s == TOLD_S
+    wrong, found_s = fused(name, flight, 0.3)
+    assert found_s == pytest.approx(TOLD_S, abs=0.015)
+    right_deg = attitude_scores(flight, right[:, :4])["heading"]
+    assert attitude_scores(flight, wrong[:, :4])["heading"] < right_deg + 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_filter_keeps_what_is_set_until_a_manoeuvre(flight: Flight, name: str) -> None:
+    straight = replace(flight, log=between(flight.log, 0.0, 13.0))
+    assert fused(name, straight, 0.3)[1] == 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "off_deg"), [("complementary", 2.0), ("eskf", 1.5)])
+def test_a_real_fixed_wing_set_to_the_default(data_dir: Path, name: str, off_deg: float) -> None:
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    out, used_s = fused(name, flight, 0.15)
+    assert used_s == pytest.approx(0.28, abs=0.05)
+    assert attitude_scores(flight, out[:, :4])["yaw"] < off_deg
+
+
+@pytest.mark.slow
+def test_the_ground_stations_are_told_once() -> None:
+    aircraft = Aircraft(1, with_reference(AircraftSettings(), gps_latency_s=0.3))
+    reader = mavlink.MAVLink(None)
+    records = fly(SimulatorSettings(seed=41)).records()
+    actions = [action for record in records for action in aircraft.take(record, record.time_us)]
+    sent = [action for action in actions if isinstance(action, Outgoing)]
+    texts = [
+        reader.decode(bytearray(one.frame)).text for one in sent if one.message_id == STATUSTEXT
+    ]
+    [text] = [text for text in texts if "gps_latency_s" in text]
+    assert re.fullmatch(r"GPS is 0\.1\d s late, not 0\.30: set gps_latency_s", text)
 
 
 @pytest.mark.slow

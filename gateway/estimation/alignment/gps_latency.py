@@ -2,8 +2,9 @@
 
 The specific force is summed in the gyroscope's own frame. Over a few seconds, one turn takes all
 its changes from fix to fix to those of the GPS velocity, gravity added: Wahba's problem, whose
-misfit is known without the turn itself [1]_. The latency is the one at which the misfit is least;
-how sharp the least is tells how well it is known. Straight flight has no least.
+misfit is known without the turn itself [1]_. It is known for several latencies at once, and the
+true one is where a parabola through the least has its lowest point; how sharp that is tells how
+well it is known. Straight flight has no least.
 
 References
 ----------
@@ -12,27 +13,21 @@ References
 """
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gateway.compiled.entry_point import dispatched
-from gateway.estimation.columns import ACCEL, GPS_USABLE, GPS_VEL, GYRO
-from gateway.estimation.kernel import SampleLog
-from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise, rotate
+from gateway.compiled import compiled
+from gateway.estimation.history import recall
+from gateway.estimation.kernel_record import FloatArray, as_vec, fill, write_vec
+from gateway.estimation.local_position import NEVER_S, PlaceState
+from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-BoolArray = NDArray[np.bool_]
-
+LAGS: Final = 15
 EARLIEST_S: Final = -0.1
-LATEST_S: Final = 0.6
-"""No receiver is later, and none early; but the clocks of a log may be off by a little."""
-STEP_S: Final = 0.01
-PAIR_S: Final = 0.15
-MAX_PAIR_S: Final = 1.5
+LAG_STEP_S: Final = 0.05
+"""From 0.1 s early, for the clocks of a log may be off, to 0.6 s: no receiver is later."""
+LEAST_PAIR_S: Final = 0.15
+MOST_PAIR_S: Final = 1.5
 """Changes of velocity from fix to fix are compared within these intervals."""
 WINDOW_S: Final = 8.0
 """For so long the gyroscope's frame holds still."""
@@ -40,109 +35,218 @@ WINDOW_PAIRS: Final = 6
 """A window of fewer says little."""
 MANOEUVRE_MPS2: Final = 0.7
 """A window in which the acceleration changes by less is no manoeuvre; rms about its mean."""
-KNOWN_STD_S: Final = 0.02
-"""A latency that is told less well is not known."""
 SHARED: Final = 2.0
 """Changes that follow one another share the noise of a velocity: they tell half as much."""
-LONGEST_STEP_S: Final = 0.5
-"""A longer silence of the IMU is not integrated over."""
-REACH: Final = 3
-"""Steps on either side of the least through which the parabola goes."""
+WINDOW_STD_S: Final = 0.02
+"""A window's own error, however sharp its least: the latency varies, and so does the filter in
+the receiver."""
+WINDOW_KEPT: Final = 0.98
+"""Of what is known, from one manoeuvre to the next."""
+KNOWN_STD_S: Final = 0.012
+"""A latency that is told less well is not known."""
+CONTRADICTED_S: Final = 0.05
+CONTRADICTED_SIGMA: Final = 3.0
+"""What is set stands within this: a position may be a little later than the velocity."""
+SLEW: Final = 0.01
+"""Seconds by which the latency in use changes in a second, so that no fix seems to jump."""
+NEWTON_STEPS: Final = 12
 
 
-@dataclass(frozen=True, slots=True)
-class GpsLatency:
-    """An estimated latency and its standard deviation, s."""
+class LatencyState(PlaceState):
+    """The sums of one window, and what all windows tell."""
 
-    latency_s: float
-    std_s: float
+    gps_latency_s: float
+    """That is in use."""
+    lag_next_s: float
+    lag_next_vel: Annotated[FloatArray, (3,)]
+    """A velocity that waits until the integrals reach to its earliest time, by its arrival."""
+    lag_from_s: float
+    lag_from_vel: Annotated[FloatArray, (3,)]
+    lag_from_force: Annotated[FloatArray, (LAGS, 3)]
+    """Where the next pair begins."""
+    lag_window_s: float
+    lag_pairs: float
+    lag_accel: Annotated[FloatArray, (3,)]
+    lag_accel_sq: float
+    lag_outer: Annotated[FloatArray, (LAGS, 9)]
+    lag_squares: Annotated[FloatArray, (LAGS,)]
+    """Of this window."""
+    found_latency_s: float
+    """Mean of all windows that told it."""
+    found_information: float
+    """Of that mean, 1/s2."""
 
 
-@dispatched
-def sum_force(time_us: IntArray, imu: FloatArray, total: FloatArray) -> None:
-    """Integrate the specific force in the gyroscope's frame, m/s; `total` has shape (n, 3)."""
-    q, x, y, z = (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0
-    for i in range(time_us.shape[0]):
-        dt = (time_us[i] - time_us[i - 1]) * 1e-6 if i > 0 else 0.0
-        g, a = imu[i, GYRO : GYRO + 3], imu[i, ACCEL : ACCEL + 3]
-        told = math.isfinite(g[0] + g[1] + g[2] + a[0] + a[1] + a[2])
-        if told and 0.0 < dt < LONGEST_STEP_S:
-            half = from_rotation_vector((0.5 * g[0] * dt, 0.5 * g[1] * dt, 0.5 * g[2] * dt))
-            q = multiply(q, half)
-            f = rotate(q, (a[0], a[1], a[2]))
-            x, y, z = x + f[0] * dt, y + f[1] * dt, z + f[2] * dt
-            q = normalise(multiply(q, half))
-        total[i, 0], total[i, 1], total[i, 2] = x, y, z
+@compiled
+def begin_latency(s: LatencyState, latency_s: float) -> None:
+    """Begin with the latency that is set."""
+    s.gps_latency_s = latency_s
+    forget_velocities(s)
 
 
-def estimate_latency(log: SampleLog) -> GpsLatency | None:
-    """Estimate the time from the moment for which a fix is valid to its arrival.
+@compiled
+def forget_velocities(s: LatencyState) -> None:
+    """Drop what is tied to the clock; what the windows told stays."""
+    s.lag_next_s = s.lag_from_s = s.lag_window_s = NEVER_S
+
+
+@compiled
+def lag_of(k: int) -> float:
+    """Return one of the latencies that are tried, s."""
+    return EARLIEST_S + LAG_STEP_S * k
+
+
+@compiled
+def watch_latency(s: LatencyState, set_s: float, arrival_s: float, vel: Vec3) -> None:
+    """Take the velocity of a fix, and settle on a latency.
 
     Parameters
     ----------
-    log : SampleLog
-        A whole flight; the fixes' velocities are used.
-
-    Returns
-    -------
-    GpsLatency or None
-        None where no manoeuvre tells it, or the fixes tell no velocity.
+    s : LatencyState
+        Changed in place.
+    set_s : float
+        The latency that is set.
+    arrival_s : float
+        On the filter's own time.
+    vel : tuple of 3 floats
+        NED, m/s.
     """
-    vel = log.gps[:, GPS_VEL : GPS_VEL + 3]
-    told = (log.gps[:, GPS_USABLE] == 1.0) & np.isfinite(vel).all(axis=1)
-    arrival_s, vel = log.gps_time_us[told] * 1e-6, vel[told]
-    dt = np.diff(arrival_s)
-    whole = (dt > PAIR_S) & (dt < MAX_PAIR_S)
-    if whole.sum() < WINDOW_PAIRS or len(log.imu_time_us) == 0:
-        return None
-    gravity = np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2])
-    wanted = np.diff(vel, axis=0)[whole] - gravity * dt[whole, None]
-    window = (arrival_s[:-1][whole] // WINDOW_S).astype(np.int64)
-    moved = _manoeuvres(wanted / dt[whole, None], window)
-    if not moved.any():
-        return None
-    total = np.empty((len(log.imu_time_us), 3))
-    sum_force(log.imu_time_us, log.imu, total)
-    time_s = log.imu_time_us * 1e-6
-    lags_s = np.arange(EARLIEST_S, LATEST_S + 0.5 * STEP_S, STEP_S)
-    misfits = []
-    for lag_s in lags_s:
-        then = np.column_stack([np.interp(arrival_s - lag_s, time_s, column) for column in total.T])
-        felt = np.diff(then, axis=0)[whole]
-        misfits.append(_misfit(wanted[moved], felt[moved], window[moved]))
-    return _least(lags_s, np.array(misfits), 3 * int(moved.sum()))
+    dt = arrival_s - s.lag_next_s
+    if 0.0 <= dt < LEAST_PAIR_S:
+        return
+    if 0.0 < dt < MOST_PAIR_S:
+        add_velocity(s, s.lag_next_s, as_vec(s.lag_next_vel))
+        settle_latency(s, set_s, dt)
+    s.lag_next_s = arrival_s
+    write_vec(s.lag_next_vel, vel)
 
 
-def _manoeuvres(accel: FloatArray, window: IntArray) -> BoolArray:
-    """Tell which intervals lie in windows that hold enough of them, and a manoeuvre."""
-    _, index, pairs = np.unique(window, return_inverse=True, return_counts=True)
-    mean = np.column_stack([np.bincount(index, column) for column in accel.T]) / pairs[:, None]
-    off = ((accel - mean[index]) ** 2).sum(axis=1)
-    enough = np.bincount(index, off) / pairs > MANOEUVRE_MPS2**2
-    return np.asarray((enough & (pairs >= WINDOW_PAIRS))[index])
+@compiled
+def add_velocity(s: LatencyState, arrival_s: float, vel: Vec3) -> None:
+    """Compare the change of velocity since the last one with the force, for every latency."""
+    if not 0.0 <= arrival_s - s.lag_window_s <= WINDOW_S:
+        close_window(s)
+        s.lag_window_s = arrival_s
+    dt = arrival_s - s.lag_from_s
+    whole = 0.0 < dt < MOST_PAIR_S
+    v = s.lag_from_vel
+    wanted = (vel[0] - v[0], vel[1] - v[1], vel[2] - v[2] - STANDARD_GRAVITY_MPS2 * dt)
+    wanted_sq = wanted[0] ** 2 + wanted[1] ** 2 + wanted[2] ** 2
+    for k in range(LAGS):
+        recall(s.ring, s.ring_count, arrival_s - lag_of(k), s.time_s, s.integrals, s.then)
+        for j in range(3):
+            felt = s.then[j] - s.lag_from_force[k, j]
+            s.lag_from_force[k, j] = s.then[j]
+            if whole:
+                s.lag_squares[k] += felt * felt
+                for i in range(3):
+                    s.lag_outer[k, 3 * i + j] += wanted[i] * felt
+        if whole:
+            s.lag_squares[k] += wanted_sq
+    if whole:
+        s.lag_pairs += 1.0
+        s.lag_accel_sq += wanted_sq / (dt * dt)
+        for i in range(3):
+            s.lag_accel[i] += wanted[i] / dt
+    s.lag_from_s = arrival_s
+    write_vec(s.lag_from_vel, vel)
 
 
-def _misfit(wanted: FloatArray, felt: FloatArray, window: IntArray) -> float:
-    """Sum the squares that are left, with the best turn in each window."""
-    _, index = np.unique(window, return_inverse=True)
-    count = index.max() + 1
-    outer = np.zeros((count, 3, 3))
-    np.add.at(outer, index, wanted[:, :, None] * felt[:, None, :])
-    squares = np.bincount(index, (wanted**2 + felt**2).sum(axis=1), count)
-    values = np.linalg.svd(outer, compute_uv=False)
-    values[:, 2] *= np.sign(np.linalg.det(outer))
-    return float((squares - 2.0 * values.sum(axis=1)).sum())
+@compiled
+def close_window(s: LatencyState) -> None:
+    """Learn what a window tells, if there was a manoeuvre and a least misfit; begin a new one."""
+    n = s.lag_pairs
+    if n >= WINDOW_PAIRS and is_manoeuvre(s):
+        least = 0
+        for k in range(LAGS):
+            # What is left of the squares is put in their place.
+            s.lag_squares[k] = max(s.lag_squares[k] - 2.0 * best_fit(s, k), 1e-9)
+            if s.lag_squares[k] < s.lag_squares[least]:
+                least = k
+        if 0 < least < LAGS - 1:
+            learn_latency(s, least, 3.0 * n / (SHARED * s.lag_squares[least]))
+    s.lag_pairs = s.lag_accel_sq = 0.0
+    fill(s.lag_accel, 0.0)
+    fill(s.lag_squares, 0.0)
+    for k in range(LAGS):
+        for i in range(9):
+            s.lag_outer[k, i] = 0.0
 
 
-def _least(lags_s: FloatArray, misfits: FloatArray, numbers: int) -> GpsLatency | None:
-    """Fit a parabola about the least misfit; None at an edge, or where it is too flat."""
-    k = int(np.argmin(misfits))
-    if not REACH <= k < len(lags_s) - REACH:
-        return None
-    near = slice(k - REACH, k + REACH + 1)
-    bend, slope, _ = np.polyfit(lags_s[near] - lags_s[k], misfits[near], 2)
-    if bend <= 0.0:
-        return None
-    std_s = math.sqrt(SHARED * misfits[k] / numbers / bend)
-    latency_s = float(lags_s[k] - 0.5 * slope / bend)
-    return GpsLatency(max(latency_s, 0.0), std_s) if std_s < KNOWN_STD_S else None
+@compiled
+def is_manoeuvre(s: LatencyState) -> bool:
+    """Return whether the acceleration has changed enough in a window."""
+    n, a = s.lag_pairs, s.lag_accel
+    mean_sq = (a[0] ** 2 + a[1] ** 2 + a[2] ** 2) / (n * n)
+    return bool(s.lag_accel_sq / n - mean_sq > MANOEUVRE_MPS2 * MANOEUVRE_MPS2)
+
+
+@compiled
+def best_fit(s: LatencyState, k: int) -> float:
+    """Return the sum of products that the best turn makes of a window's pairs.
+
+    That is the largest eigenvalue of Davenport's matrix, as a root of its characteristic
+    polynomial [1]_; it cannot be more than half of the squares, from where Newton's steps descend.
+    """
+    B = s.lag_outer[k]
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = (
+        B[0], B[1], B[2], B[3], B[4], B[5], B[6], B[7], B[8],
+    )  # fmt: skip
+    norm_sq = b00 * b00 + b01 * b01 + b02 * b02 + b10 * b10 + b11 * b11 + b12 * b12
+    norm_sq += b20 * b20 + b21 * b21 + b22 * b22
+    # The adjugate, transposed: its products are those of two singular values.
+    c00, c01, c02 = b11 * b22 - b12 * b21, b12 * b20 - b10 * b22, b10 * b21 - b11 * b20
+    c10, c11, c12 = b02 * b21 - b01 * b22, b00 * b22 - b02 * b20, b01 * b20 - b00 * b21
+    c20, c21, c22 = b01 * b12 - b02 * b11, b02 * b10 - b00 * b12, b00 * b11 - b01 * b10
+    determinant = b00 * c00 + b01 * c01 + b02 * c02
+    cofactors_sq = c00 * c00 + c01 * c01 + c02 * c02 + c10 * c10 + c11 * c11 + c12 * c12
+    cofactors_sq += c20 * c20 + c21 * c21 + c22 * c22
+    x: float = 0.5 * s.lag_squares[k]
+    for _ in range(NEWTON_STEPS):
+        # (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2, of which the sum of singular values is a root.
+        off = x * x - norm_sq
+        slope = 4.0 * x * off - 8.0 * determinant
+        if slope <= 0.0:
+            break
+        x -= (off * off - 8.0 * x * determinant - 4.0 * cofactors_sq) / slope
+    return x
+
+
+@compiled
+def learn_latency(s: LatencyState, k: int, weight: float) -> None:
+    """Average the lowest point of a parabola through a window's least misfit with the others'."""
+    m = s.lag_squares
+    bend = weight * (m[k - 1] - 2.0 * m[k] + m[k + 1])
+    if not bend > 0.0:
+        return
+    latency_s = lag_of(k) + LAG_STEP_S * 0.5 * weight * (m[k - 1] - m[k + 1]) / bend
+    information = 1.0 / (WINDOW_STD_S * WINDOW_STD_S + 2.0 * LAG_STEP_S * LAG_STEP_S / bend)
+    s.found_information = WINDOW_KEPT * s.found_information + information
+    s.found_latency_s += (latency_s - s.found_latency_s) * information / s.found_information
+
+
+@compiled
+def found_latency_std(s: LatencyState) -> float:
+    """Return how well the latency is found, s."""
+    return 1.0 / math.sqrt(s.found_information) if s.found_information > 0.0 else math.inf
+
+
+@compiled
+def settle_latency(s: LatencyState, set_s: float, dt: float) -> None:
+    """Move the latency in use to the one that is set, or that is found where they contradict.
+
+    Parameters
+    ----------
+    s : LatencyState
+        Changed in place.
+    set_s : float
+        The setting.
+    dt : float
+        Time since it was moved last, s.
+    """
+    wanted, std = set_s, found_latency_std(s)
+    allowed = max(CONTRADICTED_S, CONTRADICTED_SIGMA * std)
+    if std < KNOWN_STD_S and abs(s.found_latency_s - set_s) > allowed:
+        wanted = max(s.found_latency_s, 0.0)
+    most = SLEW * dt
+    s.gps_latency_s += min(max(wanted - s.gps_latency_s, -most), most)

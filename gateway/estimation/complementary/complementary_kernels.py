@@ -4,6 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.complementary.accuracy import watch_accuracy
@@ -71,6 +72,7 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
         s.rate_b[k] = NAN
     begin_drift(s, p)
     s.declination_rad = p.declination_rad
+    begin_latency(s, p.gps_latency_s)
     forget_times(s)
 
 
@@ -80,6 +82,7 @@ def forget_times(s: ComplementaryState) -> None:
     s.accuracy_s = NEVER_S
     s.mag_s = s.fix_s = s.fix_valid_s = s.pair_s = s.baro_s = NEVER_S
     s.reject_last[0] = NEVER_S
+    forget_velocities(s)
     s.reject_s = s.rest_s = s.epoch_s = 0.0
     s.ring_count = s.at_rest = 0
 

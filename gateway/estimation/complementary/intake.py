@@ -99,7 +99,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     if not is_fix_told(s, row):
         return
     s.heading_rad += learn_declination(s, row[GPS_DECLINATION])
-    wanted_s = wanted_time_s(s, p, time_us)
+    wanted_s = wanted_time_s(s, p, time_us, row)
     silent_s = silence_before(s, wanted_s)
     if silent_s > 0.0:
         bridge_gap(s, p, silent_s)

@@ -63,7 +63,7 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     if turn_rad != 0.0:
         turn_heading(s, turn_rad)
     set_wander_variance(s, p, row)
-    wanted_s = wanted_time_s(s, p, time_us)
+    wanted_s = wanted_time_s(s, p, time_us, row)
     silent_s = silence_before(s, wanted_s)
     if silent_s > 0.0:
         bridge_gap(s, p, silent_s)

@@ -4,6 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.eskf.covariance import propagate, renew
@@ -50,6 +51,7 @@ def start(s: EskfState, p: EskfGains) -> None:
         s.rate_b[k] = NAN
     s.declination_rad = p.declination_rad
     s.left_iron_ut = math.sqrt(p.mag_bias_var)
+    begin_latency(s, p.gps_latency_s)
     forget_times(s)
 
 
@@ -58,6 +60,7 @@ def forget_times(s: EskfState) -> None:
     """Drop all that is tied to the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.pair_s = s.baro_s = s.pseudo_s = NEVER_S
     s.reject_last[0] = NEVER_S
+    forget_velocities(s)
     s.reject_s = s.rest_s = 0.0
     s.ring_count = s.at_rest = 0
 

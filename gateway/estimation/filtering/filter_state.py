@@ -1,6 +1,7 @@
 """What both filters remember and are set to, whatever their model."""
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.flagbits import (
@@ -11,7 +12,7 @@ from gateway.estimation.flagbits import (
     USING_BARO,
     USING_MAG,
 )
-from gateway.estimation.local_position import BARO_STALE_S, PlaceState
+from gateway.estimation.local_position import BARO_STALE_S
 from gateway.estimation.magfield import (
     STALE_MAG_S,
     CompassSettings,
@@ -46,7 +47,7 @@ def filter_gains(
     }
 
 
-class FilterState(HealthState, RestState, FieldState, PlaceState, ReviewState, WayState):
+class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState, WayState):
     """The part of a filter's state that says nothing of its model."""
 
     started: int

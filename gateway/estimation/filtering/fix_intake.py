@@ -3,6 +3,8 @@
 import math
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_latency import watch_latency
+from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import MOVING_MPS
 from gateway.estimation.alignment.wahba import align_by_velocity
 from gateway.estimation.columns import GPS_LAT, GPS_LON, GPS_USABLE
@@ -10,6 +12,7 @@ from gateway.estimation.filtering.filter_state import FilterGains, FilterState
 from gateway.estimation.history import recall
 from gateway.estimation.kernel_record import FloatArray, as_vec
 from gateway.estimation.local_position import NEVER_S, fix_position, fix_velocity, move_origin
+from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
 
 
@@ -21,9 +24,12 @@ def is_fix_told(s: FilterState, row: FloatArray) -> bool:
 
 
 @compiled
-def wanted_time_s(s: FilterState, p: FilterGains, arrival_us: int) -> float:
-    """Return when a fix was valid, on the filter's own time."""
-    return (arrival_us - s.base_us) * 1e-6 - p.gps_latency_s
+def wanted_time_s(s: FilterState, p: FilterGains, arrival_us: int, row: FloatArray) -> float:
+    """Return when a fix was valid, on the filter's own time; its velocity may tell the latency."""
+    arrival_s, vel = (arrival_us - s.base_us) * 1e-6, fix_velocity(row)
+    if is_sound(vel, FASTEST_MPS):
+        watch_latency(s, p.gps_latency_s, arrival_s, vel)
+    return arrival_s - s.gps_latency_s
 
 
 @compiled
