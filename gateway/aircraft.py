@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gateway import __version__
 from gateway.compiled.entry_point import NotCompiledError
-from gateway.estimation.alignment.gps_latency import CONTRADICTED_S
 from gateway.estimation.columns import NAV_COLUMNS, imu_rows, nav_row, nav_state
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
@@ -58,7 +57,7 @@ from gateway.vehicle.home import Home, Place
 from gateway.vehicle.signing import SigningClock
 from gateway.vehicle.stamp_book import StampBook
 from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.events import NOTICE, WARNING, StatusText
+from gateway.vehicle.telemetry.events import WARNING, StatusText
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -136,8 +135,6 @@ class Aircraft:
         )
         self._chain, self._estimator = make_fusion(settings)
         self._correct = correct
-        self._gps_latency_s = settings.estimation.reference.gps_latency_s
-        self._announced_latency_s = self._gps_latency_s
 
     @property
     def fusion_state(self) -> FusionState:
@@ -174,23 +171,12 @@ class Aircraft:
                 return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
             case GpsFix():
                 self._estimator.update_gps(record)
-                wanted = self.vehicle.on_gps(record, now_us) + self._review_latency(now_us)
+                wanted = self.vehicle.on_gps(record, now_us)
+                if isinstance(self._estimator, KernelEstimator):
+                    wanted += self.vehicle.on_latency(*self._estimator.gps_latency_s, now_us)
                 return self._recorded(record, wanted, now_us)
             case NodeStatus():
                 return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
-
-    def _review_latency(self, now_us: int) -> list[VehicleAction]:
-        """Announce that the motion contradicts the GPS latency that is set, once it is settled."""
-        if not isinstance(self._estimator, KernelEstimator):
-            return []
-        used_s, before_s = self._estimator.gps_latency_s, self._gps_latency_s
-        self._gps_latency_s = used_s
-        if used_s != before_s or abs(used_s - self._announced_latency_s) < CONTRADICTED_S:
-            return []
-        self._announced_latency_s = used_s
-        set_s = self.settings.estimation.reference.gps_latency_s
-        text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
-        return self.vehicle.say(StatusText(NOTICE, text), now_us)
 
     @property
     def chain(self) -> SensorChain:

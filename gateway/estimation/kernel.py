@@ -136,9 +136,10 @@ class KernelEstimator(Generic[State, Gains]):
         self._use(copy_record(state))
 
     @property
-    def gps_latency_s(self) -> float:
-        """The latency in use: as set, or as the motion shows where that contradicts it."""
-        return float(cast(LatencyState, self._state).gps_latency_s)
+    def gps_latency_s(self) -> tuple[float, float]:
+        """The latency in use, which the motion may have corrected, and the one that is set."""
+        used_s = float(cast(LatencyState, self._state).gps_latency_s)
+        return used_s, self._reference.gps_latency_s
 
     @property
     def gains(self) -> Gains:

@@ -24,7 +24,7 @@ class ReferenceSettings(Settings, frozen=True):
         float,
         setting(
             "From the moment a fix is valid to its arrival at the gateway. Where manoeuvres "
-            "contradict it by more than 0.05 s, complementary and eskf use what they show.",
+            "contradict it by more than 0.07 s, complementary and eskf use what they show.",
             "s",
             ge=0.0,
             le=2.0,

@@ -220,6 +220,11 @@ class Vehicle:
         found += self._replies(self._announcements.on_fix(now_us))
         return self._finish(found)
 
+    def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:
+        """Take in the GPS latency that the estimator uses, and the one that is set, s."""
+        found = self._announcements.on_latency(used_s, set_s, now_us)
+        return self._finish(self._replies(found))
+
     def on_node_status(self, status: NodeStatus, now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
         findings = self.health.on_node_status(status)

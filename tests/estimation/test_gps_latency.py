@@ -66,7 +66,7 @@ def fused(name: str, flight: Flight, set_s: float) -> tuple[np.ndarray, float]:
     reference = msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
     estimator = make_estimator(EstimationSettings(estimator=name, reference=reference))
     assert isinstance(estimator, KernelEstimator)
-    return estimator.run(flight.log), estimator.gps_latency_s
+    return estimator.run(flight.log), estimator.gps_latency_s[0]
 
 
 @pytest.mark.slow

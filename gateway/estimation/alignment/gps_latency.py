@@ -44,7 +44,7 @@ WINDOW_KEPT: Final = 0.98
 """Of what is known, from one manoeuvre to the next."""
 KNOWN_STD_S: Final = 0.012
 """A latency that is told less well is not known."""
-CONTRADICTED_S: Final = 0.05
+CONTRADICTED_S: Final = 0.07
 CONTRADICTED_SIGMA: Final = 3.0
 """What is set stands within this: a position may be a little later than the velocity."""
 SLEW: Final = 0.01

@@ -4,7 +4,14 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from gateway.records import LinkReport, NavFlags
-from gateway.vehicle.telemetry.events import CRITICAL, INFO, WARNING, Announcer, StatusText
+from gateway.vehicle.telemetry.events import (
+    CRITICAL,
+    INFO,
+    NOTICE,
+    WARNING,
+    Announcer,
+    StatusText,
+)
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.node_health import Finding
 
@@ -56,6 +63,7 @@ class Announcements:
         self._announcer = Announcer()
         self._flags = NavFlags(0)
         self._restarts: dict[int, int] = {}
+        self._latency_s: float | None = None
 
     def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
         """Announce the estimator's changes."""
@@ -76,6 +84,17 @@ class Announcements:
         fixed = self._health.has_fix(now_us)
         text = StatusText(INFO, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
+
+    def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
+        """Announce once that fixes come later or sooner than is set, when it is known by how much.
+
+        The latency in use moves slowly to what the motion shows.
+        """
+        is_settled, self._latency_s = used_s == self._latency_s, used_s
+        if used_s == set_s or not is_settled:
+            return []
+        text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
+        return self._announcer.track("latency", set_s, StatusText(NOTICE, text), now_us)
 
     def on_boards(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
         """Announce changes in the state of the boards."""
