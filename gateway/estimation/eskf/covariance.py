@@ -77,17 +77,15 @@ def propagate(s: EskfState, p: EskfGains) -> None:
 @compiled
 def apply_transition(s: EskfState, P: FloatArray) -> None:
     """Multiply `P` by the transition matrix from the left."""
-    R, W, dt = s.pending_turn, s.pending_scaled, s.pending_s
-    f0, f1, f2 = s.pending_force_n[0], s.pending_force_n[1], s.pending_force_n[2]
-    for j in range(STATES):
-        t0, t1, t2 = P[TILT, j], P[TILT + 1, j], P[TILT + 2, j]
-        for k in range(3):
+    R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        for j in range(STATES):
             P[POS + k, j] += dt * P[VEL + k, j]
-        P[VEL, j] += t1 * f2 - t2 * f1
-        P[VEL + 1, j] += t2 * f0 - t0 * f2
-        P[VEL + 2, j] += t0 * f1 - t1 * f0
-        for i in range(3):
-            for k in range(3):
+            P[VEL + k, j] += P[TILT + a, j] * f[b] - P[TILT + b, j] * f[a]
+    for i in range(3):
+        for k in range(3):
+            for j in range(STATES):
                 P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
                 P[TILT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
 
@@ -145,13 +143,14 @@ def residual(s: EskfState, innovation: float) -> float:
 @compiled
 def innovation_variance(s: EskfState, variance: float) -> float:
     """Compute `P h` and the variance of the innovation, `h^T P h` and the noise."""
+    fill(s.Ph, 0.0)
+    for j in range(STATES):
+        if s.h[j] != 0.0:
+            for i in range(STATES):
+                s.Ph[i] += s.P[i, j] * s.h[j]
     total = variance
     for i in range(STATES):
-        sum_ = 0.0
-        for j in range(STATES):
-            sum_ += s.P[i, j] * s.h[j]
-        s.Ph[i] = sum_
-        total += s.h[i] * sum_
+        total += s.h[i] * s.Ph[i]
     return total
 
 
