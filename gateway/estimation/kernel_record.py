@@ -135,6 +135,7 @@ def unpack_record(declaration: type[Declared], packed: Packed) -> Declared:
     return cast(Declared, np.frombuffer(data, wanted, 1)[0].copy())
 
 
+@cache
 def _mark(wanted: np.dtype[Any]) -> int:
     return zlib.crc32(repr(wanted.descr).encode())
 

@@ -7,6 +7,7 @@ tracker for the receiver and one for each node, and counts everything that is lo
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import takewhile
 from typing import Final
 
 from gateway.records import (
@@ -362,7 +363,8 @@ def _receiver_status(status: payloads.ReceiverStatusFrame, time_us: int) -> Rece
 
 def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:
     counter = node.sequence
-    recent = sum(1 for t in node.arrivals_us if t > now_us - RATE_SPAN_US)
+    newest_first = reversed(node.arrivals_us)
+    recent = sum(1 for _ in takewhile(lambda us: us > now_us - RATE_SPAN_US, newest_first))
     return NodeLink(
         node=node_id,
         pipe=node.pipe,
