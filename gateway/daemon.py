@@ -5,6 +5,8 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -112,10 +114,12 @@ class Daemon:
         self._budget = RecordingBudget()
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
+        self._files = ThreadPoolExecutor(1, "settings")
         self._metrics = MetricsServer(self._metrics_text)
         self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
         self._notifier = ServiceNotifier()
-        self._serial = SerialPort(serial, self._on_bytes, self._on_open, self._on_lost, self.now_us)
+        heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
+        self._serial = SerialPort(serial, *heard, self.now_us)
         self._sent: Counter[int] = Counter()
         self._timer: asyncio.TimerHandle | None = None
 
@@ -155,7 +159,7 @@ class Daemon:
             await asyncio.shield(self._opening)
         return self._control.path
 
-    def reload(self) -> str:
+    async def reload(self) -> str:
         """Apply changed settings of the hub and of signing; other clients stay connected.
 
         Other changes apply at the next start: ground stations may have changed them meanwhile.
@@ -170,12 +174,15 @@ class Daemon:
         ConfigError
             If the settings are wrong; then nothing is changed.
         """
-        settings = self._read()
+        # In a thread, as in `_save`: files take some milliseconds, or longer on a slow disk.
+        loop = asyncio.get_running_loop()
+        settings = await loop.run_in_executor(self._files, self._read)
         passphrase = settings.vehicle.signing_passphrase
         now = self._settings
         vehicle = msgspec.structs.replace(now.vehicle, signing_passphrase=passphrase)
         now = msgspec.structs.replace(now, hub=settings.hub, vehicle=vehicle)
-        own = {k: a.vehicle.signing_passphrase for k, a in load_aircraft(now).items()}
+        aircraft = await loop.run_in_executor(self._files, load_aircraft, now)
+        own = {k: a.vehicle.signing_passphrase for k, a in aircraft.items()}
         self._notifier.reloading()
         if settings.hub.realtime_priority != self._settings.hub.realtime_priority:
             set_realtime_priority(settings.hub.realtime_priority)
@@ -200,6 +207,7 @@ class Daemon:
         if self._opening is not None:
             self._opening.cancel()
         self._control.close()
+        self._files.shutdown()
         self._recorder.close()
         self._places.close()
         self._stamps.close(self._pipeline.newest_stamps())
@@ -248,20 +256,14 @@ class Daemon:
         idle = self._recorder.status().state == SessionState.IDLE
         (self._recorder.record if idle else self._recorder.stop)()
 
-    def _reload_or_refuse(self) -> str:
+    async def _reload_or_refuse(self) -> str:
         try:
-            return self.reload()
+            return await self.reload()
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
 
     def _mark(self, place: Place | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
-
-    def _on_open(self, port: str) -> None:
-        self._pipeline.connect(port)
-
-    def _on_lost(self, port: str) -> None:
-        self._pipeline.disconnect(port)
 
     def _on_trouble(self, text: str) -> None:
         self._announce(True, text)
@@ -344,9 +346,15 @@ class Daemon:
 
     def _save(self, vehicle_id: int) -> None:
         """Write an aircraft's settings to its file, and announce the result."""
-        aircraft = self._pipeline.find(vehicle_id)
+        aircraft, loop = self._pipeline.find(vehicle_id), asyncio.get_running_loop()
+        what = (self._settings, vehicle_id, aircraft.settings)
+        saving = loop.run_in_executor(self._files, save_aircraft, *what)
+        saving.add_done_callback(partial(self._announce_saved, aircraft))
+
+    def _announce_saved(self, aircraft: Aircraft, saving: asyncio.Future[Path]) -> None:
+        vehicle_id = aircraft.vehicle_id
         try:
-            file = save_aircraft(self._settings, vehicle_id, aircraft.settings)
+            file = saving.result()
         except OSError as error:
             log.warning("settings of aircraft %d cannot be saved: %s", vehicle_id, error)
             status = StatusText(WARNING, f"Settings not saved: {error.strerror}")

@@ -1,6 +1,8 @@
 """The composition root: what is recorded of whom."""
 
 import asyncio
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +10,13 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+import gateway.daemon
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
+from gateway.vehicle.actions import SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -122,8 +126,35 @@ async def test_a_reload_tells_of_what_needs_a_new_start(
     now = daemon._settings
     changed = replace(now, estimation=replace(now.estimation, estimator=estimator))
     monkeypatch.setattr(daemon, "_read", lambda: changed)
-    told = daemon.reload()
+    told = await daemon.reload()
     assert told.startswith("settings of the hub and of signing applied")
     assert ("others need a new start" in told) == (estimator != now.estimation.estimator)
+    daemon._metrics.close()
+    daemon._hub.close()
+
+
+async def test_files_of_settings_are_read_and_written_beside_the_loop(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    threads: list[int] = []
+
+    def noting(call: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(*arguments: Any) -> Any:
+            threads.append(threading.get_ident())
+            return call(*arguments)
+
+        return noted
+
+    for name in ("load_aircraft", "save_aircraft"):
+        monkeypatch.setattr(f"gateway.daemon.{name}", noting(getattr(gateway.daemon, name)))
+    monkeypatch.setattr(daemon, "_read", noting(daemon._read))
+    announced = asyncio.get_running_loop().create_future()
+    monkeypatch.setattr(daemon, "_announce_for", lambda _, status: announced.set_result(status))
+    daemon._perform([SaveSettings(1, ())])
+    await daemon.reload()
+    assert (await announced).text == "Settings saved: 1.toml"
+    assert (tmp_path / "1.toml").exists()
+    assert len(threads) == 3
+    assert threading.get_ident() not in threads
     daemon._metrics.close()
     daemon._hub.close()

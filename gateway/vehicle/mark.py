@@ -5,9 +5,9 @@ point, a region of interest, a home set by hand, or the command line.
 """
 
 import math
-from typing import Any
+from typing import Any, Final
 
-import pymap3d.vincenty as vincenty
+from geographiclib.geodesic import Geodesic
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NAN, NavState
@@ -15,6 +15,8 @@ from gateway.vehicle.client_place import is_on_earth
 from gateway.vehicle.home import Place
 from gateway.vehicle.services.missions.mission_items import Item
 from gateway.vehicle.telemetry import fields
+
+WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
 
 
 class Mark:
@@ -73,9 +75,7 @@ class Mark:
         if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
         here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        way = distance_and_bearing(here, self.place)
-        # The iteration need not converge between opposite ends of the earth.
-        return way if math.isfinite(sum(way)) else None
+        return distance_and_bearing(here, self.place)
 
     def nav_controller_output(self, state: NavState | None) -> Any:
         """Encode distance and bearing to the mark; None without a mark or a position.
@@ -107,10 +107,7 @@ def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
     Returns
     -------
     tuple of 2 floats
-        Distance along the ellipsoid in metres, and bearing at `here` in rad from north; NaN where
-        the iteration does not converge.
+        Distance along the ellipsoid in metres, and bearing at `here` in rad from north, -pi to pi.
     """
-    distance_m, bearing_deg = vincenty.vdist(
-        here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg
-    )
-    return (float(distance_m), math.radians(float(bearing_deg)))
+    way = Geodesic.WGS84.Inverse(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg, WANTED)
+    return (way["s12"], math.radians(way["azi1"]))

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 VIEW_INTERVAL_S: Final = 0.5
 """Twice a second: drawing takes some milliseconds, during which no frame is sent."""
 LOG_INTERVAL_S: Final = 10.0
-SWITCH_S: Final = 0.0005
+SWITCH_S: Final = 0.0001
 
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
 EndpointOption = Annotated[
@@ -117,7 +117,7 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, _reload, daemon)
+    _reload_on_hangup(daemon)
     if compiling is not None:
         compiling.watch()
     with loop_comes_first():
@@ -141,7 +141,8 @@ def loop_comes_first() -> Iterator[None]:
     # Freeze what exists by now: a full garbage collection of it stops telemetry for 0.1 s.
     gc.collect()
     gc.freeze()
-    # The disk's thread may keep the interpreter for so long; the default is 5 ms.
+    # The threads of the files may keep the interpreter for so long whenever the loop has let it go,
+    # as it does with every frame that it sends; the default is 5 ms.
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -160,9 +161,20 @@ def _open_view() -> "LiveView":
     return view
 
 
-def _reload(daemon: Daemon) -> None:
+def _reload_on_hangup(daemon: Daemon) -> None:
+    loop, running = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+
+    def begin() -> None:
+        task = loop.create_task(_reload(daemon))
+        running.add(task)
+        task.add_done_callback(running.discard)
+
+    loop.add_signal_handler(signal.SIGHUP, begin)
+
+
+async def _reload(daemon: Daemon) -> None:
     try:
-        daemon.reload()
+        await daemon.reload()
     except ConfigError as error:
         log.warning("settings not reloaded: %s", error)
 

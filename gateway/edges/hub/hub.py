@@ -308,9 +308,12 @@ class Hub:
         for client in list(self._clients.values()):
             self._tick_one(client, now_us)
         self._router.tick(now_us)
-        self._report_trouble(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
-        if interval_us and now_us - self._ping_us >= interval_us:
+        # One at a tick: either takes as long as several frames.
+        if now_us - self._trouble_us >= US_PER_S:
+            self._trouble_us = now_us
+            self._report_trouble(now_us)
+        elif interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
             self._ask_round_trips(now_us)
 
@@ -324,9 +327,6 @@ class Hub:
                 link.fail(error)
 
     def _report_trouble(self, now_us: int) -> None:
-        if now_us - self._trouble_us < US_PER_S:
-            return
-        self._trouble_us = now_us
         for line in self._visits.poll(now_us):
             log.info("%s", line)
         for text in self._trouble.update(self.clients(), self.listeners(), now_us):

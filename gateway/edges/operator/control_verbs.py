@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 import msgspec
 
@@ -179,11 +179,11 @@ class HubVerbs:
     snapshot : callable
         Returns the present state of the gateway.
     reload : callable
-        Applies changed settings and returns a text; raises ControlError.
+        Applies changed settings and returns a text, to be awaited; raises ControlError.
     """
 
     def __init__(
-        self, hub: Hub, snapshot: Callable[[], Snapshot], reload: Callable[[], str]
+        self, hub: Hub, snapshot: Callable[[], Snapshot], reload: Callable[[], Awaitable[str]]
     ) -> None:
         self._hub = hub
         self._snapshot = snapshot

@@ -128,9 +128,10 @@ class MetricsServer:
             return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
         pieces = []
         for piece in self._text():
-            pieces.append(piece.encode())
             # All of them take some milliseconds, so telemetry goes on between two.
             await asyncio.sleep(0)
+            pieces.append(piece.encode())
+        await asyncio.sleep(0)
         body = b"".join(pieces)
         head = (
             f"HTTP/1.1 200 OK\r\nContent-Type: {CONTENT_TYPE}\r\n"

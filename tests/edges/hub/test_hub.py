@@ -388,3 +388,20 @@ class TestListeningPorts:
             caller.say(caller.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 1)
         assert hub.listeners()[0].state == "open"
+
+
+async def test_reports_and_round_trips_take_turns(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them takes as long as several frames."""
+    hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=1.0)
+    done: list[tuple[str, int]] = []
+    for name in ("_report_trouble", "_ask_round_trips"):
+        monkeypatch.setattr(hub, name, lambda now_us, name=name: done.append((name, now_us)))
+    for _ in range(40):
+        rig.clock.us += 250_000
+        rig.tick(hub)
+    moments = [now_us for _, now_us in done]
+    assert len(set(moments)) == len(moments)
+    for name in ("_report_trouble", "_ask_round_trips"):
+        assert sum(1 for named, _ in done if named == name) >= 9

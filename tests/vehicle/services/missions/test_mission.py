@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.vehicle.home import Place
+from gateway.vehicle.mark import distance_and_bearing
 from gateway.vehicle.services.missions.mission_items import MAX_ITEMS
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.samples import STATE
@@ -304,6 +306,11 @@ class TestMark:
         assert found.target_bearing == found.nav_bearing == 0
         assert found.alt_error == pytest.approx(100.0, abs=0.1)
         assert math.isnan(found.nav_roll)
+
+    def test_the_other_end_of_the_earth_has_a_distance_too(self) -> None:
+        """From Karney's article, where Vincenty's iteration does not converge."""
+        way = distance_and_bearing(Place(0.0, 0.0, 0.0), Place(0.5, 179.7, 0.0))
+        assert way == pytest.approx((19_944_127.421, math.radians(15.556883)), abs=1e-3)
 
     @pytest.mark.parametrize(
         ("north", "east", "bearing"), [(0.0, 0.01, 90), (-0.01, 0.0, -180), (0.0, -0.01, -90)]
