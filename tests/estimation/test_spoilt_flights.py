@@ -209,11 +209,14 @@ def test_a_fix_without_height_leaves_the_rest_of_it(flight: Flight, name: str) -
     assert np.isfinite(out[settled][:, NAV_LAT : NAV_LAT + 2]).all()
 
 
-def test_turns_without_gps_are_not_taken_for_level(flight: Flight) -> None:
-    """A speed that the gyroscope cannot explain by tilt is flown, and doubts the levelling."""
+@pytest.mark.parametrize("name", RUNS)
+def test_turns_without_gps_are_not_taken_for_level(flight: Flight, name: str) -> None:
+    """What pulls without the gyroscope turning is flown, and doubts the levelling."""
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
-    out = run_eskf(alone)
-    assert attitude_scores(alone, out[:, :4])["heading"] < 3.0
+    out = RUNS[name](alone)
+    found = attitude_scores(alone, out[:, :4])
+    assert found["heading"] < 3.0
+    assert found["inclination"] < 6.0
     within = two_sigma(alone, out)
     assert share(within["tilt"]) > 0.85
     assert share(within["heading"]) > 0.9
@@ -232,16 +235,31 @@ def test_a_take_off_run_without_gps_is_neither_tilt_nor_rest(flight: Flight) -> 
     assert not (out[use, NAV_FLAGS].astype(int) & int(NavFlags.AT_REST)).any()
 
 
-def test_real_turns_without_gps_are_reported_as_unsure(data_dir: Path) -> None:
+@pytest.mark.parametrize("name", RUNS)
+def test_real_turns_without_gps_are_reported_as_unsure(data_dir: Path, name: str) -> None:
     """The declination of the log's header counts before any fix."""
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
-    out = run_eskf(alone)
+    out = RUNS[name](alone)
     assert attitude_scores(alone, out[:, :4])["heading"] < 3.5
     within = two_sigma(alone, out)
     assert share(within["tilt"]) > 0.9
     assert share(within["heading"]) > 0.9
     assert (out[-1000:, NAV_FLAGS].astype(int) & int(NavFlags.HEADING_VALID)).all()
+
+
+def test_a_long_outage_does_not_level_by_turns(flight: Flight) -> None:
+    """What GPS has shown of the flight tells how it pulls afterwards."""
+    out, inside, _ = next(outages(flight, run_complementary, 60.0))
+    found = attitude_scores(replace(flight, counts=inside), out[:, :4])
+    assert found["inclination"] < 4.5
+    assert share(two_sigma(flight, out)["tilt"][inside]) > 0.85
+
+
+def test_a_level_that_was_found_in_motion_is_kept(data_dir: Path) -> None:
+    """Begun while carried: the first seconds level better than all that the alignment gathers."""
+    flight = read_flight(data_dir / "broad_15_undisturbed_fast_translation_A.csv.gz")
+    check_back(flight, "complementary", "mid_air")
 
 
 @pytest.mark.parametrize(

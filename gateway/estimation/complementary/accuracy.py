@@ -17,10 +17,8 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import (
-    FORCE,
     HEADING,
     TILT,
-    bias_std,
     carry_drift,
     expected_variance,
 )
@@ -30,6 +28,7 @@ from gateway.estimation.complementary.manoeuvre import (
     write_force_row,
 )
 from gateway.estimation.complementary.navigation import REST_DECAY_S
+from gateway.estimation.complementary.unaided import unaided_level_std, watch_level
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -53,9 +52,11 @@ def watch_accuracy(s: ComplementaryState, p: ComplementaryGains) -> None:
     if 0.0 <= dt < STEP_S:
         return
     s.accuracy_s = s.time_s
-    carry_drift(s, p)
-    write_attitude_std(s, p)
     dt = dt if 0.0 < dt < GAP_S else STEP_S
+    if s.lost == 0:
+        watch_level(s, p, dt)
+    carry_drift(s, p)
+    write_attitude_std(s)
     if s.at_rest == 1:
         kept = math.exp(-dt / REST_DECAY_S)
         s.fix_speed_mps *= kept
@@ -92,7 +93,7 @@ def acceleration_std(s: ComplementaryState, dt: float) -> float:
 
 
 @compiled
-def write_attitude_std(s: ComplementaryState, p: ComplementaryGains) -> None:
+def write_attitude_std(s: ComplementaryState) -> None:
     """Write the standard deviations about north, east and down."""
     P, told = s.drift_cov, s.told_std
     if s.lost == 1:
@@ -103,8 +104,9 @@ def write_attitude_std(s: ComplementaryState, p: ComplementaryGains) -> None:
         both = 2.0 * sine * cosine * c
         told[0] = math.sqrt(max(cosine * cosine * a + sine * sine * b - both, 0.0))
         told[1] = math.sqrt(max(sine * sine * a + cosine * cosine * b + both, 0.0))
+        s.unaided_level_sq = max(a, b)
     else:
-        told[0] = told[1] = gravity_std(s, p)
+        told[0] = told[1] = unaided_level_std(s)
     heading_var = P[HEADING, HEADING]
     if s.level_by_gps == 0:
         # A field that is turned by a wrong tilt points elsewhere, the more the steeper it is.
@@ -112,15 +114,6 @@ def write_attitude_std(s: ComplementaryState, p: ComplementaryGains) -> None:
     if s.heading_true == 0:
         heading_var += NO_DECLINATION_RAD * NO_DECLINATION_RAD
     told[2] = min(math.sqrt(heading_var), ANY_HEADING_RAD)
-
-
-@compiled
-def gravity_std(s: ComplementaryState, p: ComplementaryGains) -> float:
-    """Return how far the low-pass of gravity is off upright, about one axis, rad."""
-    force = s.drift_cov[FORCE, FORCE] / STANDARD_GRAVITY_MPS2**2
-    pull = math.hypot(s.pull_mps2, s.turning_mps2) / STANDARD_GRAVITY_MPS2
-    lag = bias_std(s) * p.tau_accel_s
-    return math.sqrt(force + 0.5 * pull * pull + lag * lag)
 
 
 @compiled

@@ -27,8 +27,6 @@ from gateway.units import RAD_PER_DEG
 
 SETTLED_S: Final = 5.0
 """What levels a new attitude in this time is its own error rather than the bias."""
-HAND_MPS2: Final = 1.0
-"""Without an acceleration from GPS, turns that pull by this much make the level worth half."""
 CLIP_RADPS: Final = 2.0 * RAD_PER_DEG
 """No single observation moves the bias by more than its gain times this."""
 
@@ -55,8 +53,6 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
         update_bias_at_rest(s, p, dt)
     elif settled:
         variance = noise_for(p.bias_motion_radps, BIAS_WALK_RAD2PS3 * dt)
-        if s.by_gps == 0:
-            variance *= 1.0 + (s.turning_mps2 / HAND_MPS2) ** 2
         for k in range(2):
             row = (s.turn_lp[3 * k], s.turn_lp[3 * k + 1], s.turn_lp[3 * k + 2])
             # The low-passed frame falls behind by the bias error, and gravity pulls it back.

@@ -71,6 +71,7 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     for k in range(3):
         s.rate_b[k] = NAN
     begin_drift(s, p)
+    s.gravity_tau_s = p.tau_accel_s
     s.declination_rad = p.declination_rad
     begin_latency(s, p.gps_latency_s)
     forget_times(s)
@@ -170,12 +171,12 @@ def advance(
     if sound_accel and not (by_gps and is_heading_good(s)):
         if s.level_by_gps == 1:
             end_level(s, p)
-            go_on_by_gravity(s, p)
-        take_gravity(s, rotate(as_quat(s.q_ib), accel), p.tau_accel_s, dt)
+            go_on_by_gravity(s)
+        take_gravity(s, rotate(as_quat(s.q_ib), accel), s.gravity_tau_s, dt)
         s.epoch_s += dt
         if s.epoch_s >= EPOCH_S:
             if s.by_gps == 0 or s.pull_mps2 < PULL_MPS2:
-                update_bias(s, p, p.tau_accel_s, s.epoch_s)
+                update_bias(s, p, s.gravity_tau_s, s.epoch_s)
             s.epoch_s = 0.0
     dead_reckon(s, accel, dt)
     if s.at_rest == 1 and since_fix > FRESH_GPS_S:
@@ -185,10 +186,10 @@ def advance(
 
 
 @compiled
-def go_on_by_gravity(s: ComplementaryState, p: ComplementaryGains) -> None:
+def go_on_by_gravity(s: ComplementaryState) -> None:
     """Let gravity's low-pass, which rested, hold the level from where it is."""
     hold_level(s)
-    s.force_lp_s = max(s.force_lp_s, p.tau_accel_s)
+    s.force_lp_s = max(s.force_lp_s, s.gravity_tau_s)
     s.turn_begins = 1
 
 

@@ -20,9 +20,9 @@ class ComplementarySettings(Settings, frozen=True):
     tau_accel_s: Annotated[
         float,
         setting(
-            "Time constant of the accelerometer's low-pass in the inertial frame, without GPS. "
-            "Small follows accelerations, large trusts the gyroscope; cutoff = sqrt(2) / "
-            "(2 pi tau).",
+            "Time constant of the accelerometer's low-pass in the inertial frame, without GPS; in "
+            "turns it becomes longer by itself. Small follows accelerations, large trusts the "
+            "gyroscope; cutoff = sqrt(2) / (2 pi tau).",
             "s",
             ge=0.1,
             le=60.0,
@@ -158,6 +158,16 @@ class ComplementaryState(FilterState):
     tilt_sum: Annotated[FloatArray, (2,)]
     """Level corrections since the bias was last updated."""
     epoch_s: float
+    gravity_tau_s: float
+    """Time constant of gravity's low-pass, and what it follows from: see `unaided`."""
+    unaided_radps: float
+    """Mean rate of turning."""
+    unaided_pull: Annotated[FloatArray, (2,)]
+    """What pulls across the level beside gravity, m/s2."""
+    unaided_pull_sq: float
+    """Mean square of it, m2/s4."""
+    unaided_level_sq: float
+    """Variance of the level by it, about one axis, rad2."""
 
     heading_rad: float
     """Turn about down from the level frame to NED."""

@@ -21,6 +21,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.estimation.magfield import iron_variance
+from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -63,6 +64,7 @@ def begin_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         s.drift_cov[k, k] = p.bias_initial_radps**2
         s.drift_cov[FORCE + k, FORCE + k] = FORCE_BIAS_MPS2**2
     forget_heading(s, p)
+    forget_compass(s, p)
 
 
 @compiled
@@ -75,11 +77,24 @@ def begin_state(s: ComplementaryState, k: int, variance: float) -> None:
 
 @compiled
 def forget_heading(s: ComplementaryState, p: ComplementaryGains) -> None:
-    """Know nothing of the heading, nor of the compass's error."""
+    """Know nothing of the heading."""
     start_heading(s, p, s.heading_rad, UNKNOWN_VAR)
+
+
+@compiled
+def forget_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Know nothing of the compass's error."""
     s.compass_rad = 0.0
     s.compass_var = p.heading_noise_rad**2
     begin_state(s, COMPASS, s.compass_var)
+
+
+@compiled
+def doubt_sensors(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Doubt what gyroscope and compass have shown by an attitude that was wrong."""
+    carry_drift(s, p)
+    raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
+    forget_compass(s, p)
 
 
 @compiled

@@ -31,8 +31,6 @@ from gateway.units import RAD_PER_DEG
 
 MAG_NOISE_DEG: Final = 3.2
 """Error of the compass that is another within a second or so."""
-UNAIDED_NOISE_DEGPMPS2: Final = 10.0
-"""What it adds that turns tilt the horizon where there is no GPS, by the dip of the field."""
 GOOD_VAR: Final = 0.3
 """Up to 30 deg of standard deviation, the GPS acceleration may be turned by the heading."""
 
@@ -72,10 +70,13 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         measured += declination
     carry_drift(s, p)
     if s.heading_known == 0:
-        s.heading_rad, s.heading_known = wrap_pi(measured), 1
+        s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
     innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
-    unaided = UNAIDED_NOISE_DEGPMPS2 * s.turning_mps2 if s.by_gps == 0 else 0.0
-    density = (MAG_NOISE_DEG**2 + unaided**2) * RAD_PER_DEG**2
+    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2
+    if s.level_by_gps == 0:
+        # A level that is off turns the field for as long, the more the steeper it is.
+        steep = math.tan(s.mag_dip_ref)
+        density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
     correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED)

@@ -21,7 +21,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import raise_attitude_variance
+from gateway.estimation.complementary.drift import doubt_sensors, raise_attitude_variance
 from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
@@ -133,6 +133,7 @@ def align(
     if not is_sound(vel, FASTEST_MPS):
         return
     if s.time_s - s.fix_s > DEAD_RECKONING_MAX_S and is_flown_unaided(s, vel):
+        doubt_sensors(s, p)
         lose_attitude(s, p)
     dt = pair_with(s, at_s, vel, noise_mps)
     if dt > 0.0:

@@ -17,11 +17,10 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import (
-    DOUBT,
     bias_std,
+    doubt_sensors,
     forget_heading,
     heading_variance,
-    raise_bias_variance,
     start_heading,
     start_level,
 )
@@ -29,7 +28,6 @@ from gateway.estimation.complementary.manoeuvre import LEVEL_STD_RAD
 from gateway.estimation.complementary.tilt import hold_level, refresh
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
-from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import multiply, normalise
 
 LEAST_LEVEL_RAD: Final = 0.02
@@ -69,11 +67,25 @@ def found_heading_std(s: ComplementaryState) -> float:
 
 
 @compiled
+def find_by_gravity(s: ComplementaryState) -> None:
+    """Believe the level that gravity's low-pass has found meanwhile, as far as the pairs do."""
+    s.lost, s.doubt_s = 0, 0.0
+    s.unaided_level_sq = s.level_std * s.level_std
+    hold_level(s)
+
+
+@compiled
 def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     q = as_quat(s.q_nb)
     heading_told = math.sqrt(heading_variance(s))
-    if not is_to_be_taken(s, q, LEVEL_STD_RAD, heading_told, 0.0, dt):
+    lost = s.lost == 1
+    taken = is_to_be_taken(s, q, LEVEL_STD_RAD, heading_told, 0.0, dt)
+    if lost and s.by_gps == 0:
+        if taken or s.force_lp_s > p.tau_accel_s:
+            find_by_gravity(s)
+        return
+    if not taken:
         if tells_heading(s) and s.at_rest == 0:
             forget_heading(s, p)
             turn_rad = heading_difference(as_quat(s.found_q_nb), q)
@@ -82,7 +94,8 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
             refresh(s)
         return
     found = find(s, q)
-    raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
+    if not lost:
+        doubt_sensors(s, p)
     forget_heading(s, p)
     if s.at_rest == 1:
         # At rest a heading from GPS is only noise.

@@ -125,8 +125,16 @@ def level(s: ComplementaryState) -> None:
 @compiled
 def hold_level(s: ComplementaryState) -> None:
     """Let gravity's low-pass go on from the present level."""
-    gravity = rotate_inverse(as_quat(s.q_ei), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    begin_pull(s)
     for k in range(3):
-        s.force_lp_i[k] = s.force_in_i[k] = gravity[k]
+        s.force_lp_i[k] = s.force_in_i[k] = s.force_mean_i[k]
         s.force_lp_rate_i[k] = 0.0
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+
+
+@compiled
+def begin_pull(s: ComplementaryState) -> None:
+    """Let the mean force begin with the gravity of the present level, and nothing that pulls."""
+    gravity = rotate_inverse(as_quat(s.q_ei), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    write_vec(s.force_mean_i, gravity)
+    s.unaided_pull[0] = s.unaided_pull[1] = 0.0

@@ -1,0 +1,92 @@
+"""The level without GPS: for how long gravity is averaged, and how far the level is off.
+
+What pulls beside gravity tilts the average, and a drift of the gyroscope lets it fall behind. What
+flies cannot pull one way for long: an acceleration `a` that turns about in the time `T` tilts the
+low-pass of the time constant `tau` by `2 a / g (T / tau)**2`, a drift `b` by `b tau`. So nothing
+that pulls makes the average short; the harder it pulls, the longer the gyroscope is trusted.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.complementary.complementary_state import (
+    ComplementaryGains,
+    ComplementaryState,
+)
+from gateway.estimation.complementary.drift import (
+    ATTITUDE_WALK_RAD2PS,
+    FORCE,
+    TURN_WALK_RAD,
+    bias_std,
+)
+from gateway.estimation.complementary.tilt import begin_pull
+from gateway.estimation.kernel_record import as_quat, as_vec
+from gateway.geometry.quaternion import rotate
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+TURN_S: Final = 4.0
+"""The pull of a flight turns about in this time."""
+FLOWN_S: Final = 20.0
+"""What has pulled in this time is to be expected."""
+PULL_TAU_S: Final = 1.5
+"""What a hand does averages out in this time."""
+
+
+@compiled
+def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
+    """Note what pulls, by GPS or without, and choose the time constant of gravity's low-pass.
+
+    Parameters
+    ----------
+    s : ComplementaryState
+        Changed in place.
+    p : ComplementaryGains
+        Constants.
+    dt : float
+        Time since the last call, s.
+    """
+    share, tau, g = dt / FLOWN_S, s.gravity_tau_s, STANDARD_GRAVITY_MPS2
+    x, y, z = as_vec(s.rate_b)
+    s.unaided_radps += share * (math.sqrt(x * x + y * y + z * z) - s.unaided_radps)
+    drift_sq = level_drift_sq(s)
+    pull_sq = unaided_pull_sq(s, drift_sq, dt)
+    s.unaided_pull_sq += share * (pull_sq - s.unaided_pull_sq)
+    drift = math.sqrt(drift_sq) / tau
+    # Here the sum of both errors is least.
+    best = (4.0 * TURN_S**2 * math.sqrt(s.unaided_pull_sq) / (g * drift)) ** (1.0 / 3.0)
+    s.gravity_tau_s = tau = max(p.tau_accel_s, best)
+    passed = min(1.0, 2.0 * (TURN_S / tau) ** 2) / g
+    tilted = passed * passed * max(pull_sq, s.unaided_pull_sq)
+    faded = math.exp(-2.0 * dt / tau)
+    s.unaided_level_sq = tilted + faded * max(s.unaided_level_sq - tilted, 0.0)
+
+
+@compiled
+def level_drift_sq(s: ComplementaryState) -> float:
+    """Return the variance by which gravity's low-pass falls behind, about one axis, rad2."""
+    tau = s.gravity_tau_s
+    lag = bias_std(s) * tau
+    return lag * lag + (ATTITUDE_WALK_RAD2PS + TURN_WALK_RAD * s.unaided_radps) * tau
+
+
+@compiled
+def unaided_pull_sq(s: ComplementaryState, drift_sq: float, dt: float) -> float:
+    """Return the square of what pulls beside gravity, less what drift explains, m2/s4."""
+    if s.by_gps == 1:
+        begin_pull(s)
+        return s.pull_mps2 * s.pull_mps2
+    mean = rotate(as_quat(s.q_ei), as_vec(s.force_mean_i))
+    pull_sq = 0.0
+    for k in range(2):
+        s.unaided_pull[k] += dt / PULL_TAU_S * (mean[k] - s.unaided_pull[k])
+        pull_sq += s.unaided_pull[k] ** 2
+    explained = s.drift_cov[FORCE, FORCE] + STANDARD_GRAVITY_MPS2**2 * drift_sq
+    return float(max(pull_sq - 2.0 * explained, 0.0))
+
+
+@compiled
+def unaided_level_std(s: ComplementaryState) -> float:
+    """Return how far the low-pass of gravity is off upright, about one axis, rad."""
+    force_sq = s.drift_cov[FORCE, FORCE] / STANDARD_GRAVITY_MPS2**2
+    return math.sqrt(force_sq + level_drift_sq(s) + s.unaided_level_sq)
