@@ -5,7 +5,6 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -24,6 +23,7 @@ from gateway.edges.clock import GatewayClock, unix_time_us
 from gateway.edges.disk.place_files import PlaceFiles
 from gateway.edges.disk.recorder import Recorder
 from gateway.edges.disk.stamp_file import StampFile
+from gateway.edges.disk.worker import begin_worker
 from gateway.edges.hub.hub import Hub
 from gateway.edges.operator.control_socket import ControlError, ControlServer, socket_path
 from gateway.edges.operator.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
@@ -114,7 +114,7 @@ class Daemon:
         self._budget = RecordingBudget()
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
-        self._files = ThreadPoolExecutor(1, "settings")
+        self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
         self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
         self._notifier = ServiceNotifier()

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 WORST = 5
 """Turns that are kept."""
+LONG_US = 2000.0
+"""Turns that are counted by the program's own doing take longer."""
 IDLE_TURN_S = 0.005
 
 
@@ -38,6 +40,7 @@ class TurnWatch(selectors.EpollSelector):
         super().__init__()
         self.worst: list[Turn] = []
         """The longest by the program's own doing; a heap."""
+        self.turns = self.long_turns = 0
         self.longest_wall_us = 0.0
         self.longest_collection_us = [0.0, 0.0, 0.0]
         """Of the garbage collector, by generation."""
@@ -52,6 +55,7 @@ class TurnWatch(selectors.EpollSelector):
         """Begin, and forget what was seen."""
         self._is_on = True
         self.worst.clear()
+        self.turns = self.long_turns = 0
         self.longest_wall_us = 0.0
         self.longest_collection_us[:] = 0.0, 0.0, 0.0
         self._began_ns = time.perf_counter_ns()
@@ -90,6 +94,8 @@ class TurnWatch(selectors.EpollSelector):
         wall_us = (now_ns - begin_ns) / 1e3
         own_us = wall_us - (self._ready_ns() - self._waited_ns) / 1e3
         self.longest_wall_us = max(self.longest_wall_us, wall_us)
+        self.turns += 1
+        self.long_turns += own_us > LONG_US
         if len(self.worst) < WORST or own_us > self.worst[0].own_us:
             turn = Turn(own_us, wall_us, (now_ns - self._began_ns) / 1e9, _name(self._longest[1]))
             (heapq.heappush if len(self.worst) < WORST else heapq.heapreplace)(self.worst, turn)
@@ -109,7 +115,8 @@ class TurnWatch(selectors.EpollSelector):
     def report(self) -> str:
         """Say in some lines what was seen."""
         lines = [
-            f"  longest turn, the machine's doing included: {self.longest_wall_us / 1e3:.2f} ms"
+            f"  {self.long_turns} of {self.turns} turns took more than {LONG_US / 1e3:.0f} ms",
+            f"  longest turn, the machine's doing included: {self.longest_wall_us / 1e3:.2f} ms",
         ]
         lines += [
             f"  own {turn.own_us / 1e3:6.2f} ms of {turn.wall_us / 1e3:6.2f} ms at "
@@ -132,12 +139,21 @@ async def _idle() -> None:
         await asyncio.sleep(IDLE_TURN_S)
 
 
-def idle_turns(seconds: float) -> tuple[float, float]:
-    """Return the longest turns of a loop that only wakes up, in µs: by its own doing, and all."""
+def idle_turns(seconds: float) -> tuple[float, float, int, int]:
+    """Watch a loop that only wakes up.
+
+    Returns
+    -------
+    own_us, wall_us : float
+        Its longest turns: by its own doing, and all.
+    long_turns, turns : int
+        How many took more than `LONG_US`, and how many there were.
+    """
     watch = TurnWatch()
     with (
         contextlib.suppress(TimeoutError),
         asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner,
     ):
         runner.run(asyncio.wait_for(_idle(), seconds))
-    return max(turn.own_us for turn in watch.worst), watch.longest_wall_us
+    longest_us = max(turn.own_us for turn in watch.worst)
+    return longest_us, watch.longest_wall_us, watch.long_turns, watch.turns

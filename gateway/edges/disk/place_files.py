@@ -10,10 +10,10 @@ import contextlib
 import logging
 import re
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
+from gateway.edges.disk.worker import begin_worker
 from gateway.edges.reasons import reason_of
 from gateway.output import write_new
 from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
@@ -46,7 +46,7 @@ class PlaceFiles:
         self._pending: dict[int, StoredPlaces] = {}
         self._failed: dict[int, StoredPlaces] = {}
         """Places whose last write failed."""
-        self._worker = ThreadPoolExecutor(1, "places")
+        self._worker = begin_worker("places")
         self._task: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
 

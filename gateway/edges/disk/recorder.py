@@ -15,7 +15,6 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -24,6 +23,7 @@ import msgspec
 from gateway.edges.disk.part_files import DiskState, PartFiles, free_bytes_near, reason_of
 from gateway.edges.disk.recordings import RecordingError, part_of, rename_recording
 from gateway.edges.disk.restamp import Restamper, clear_copies
+from gateway.edges.disk.worker import begin_worker
 from gateway.flightlog.session import (
     Announce,
     ClosePart,
@@ -88,7 +88,7 @@ class Recorder:
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
-        self._worker = ThreadPoolExecutor(1, "recorder")
+        self._worker = begin_worker("recorder")
         self._wake = asyncio.Event()
         self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None

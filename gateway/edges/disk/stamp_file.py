@@ -2,12 +2,12 @@
 
 import logging
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
 
+from gateway.edges.disk.worker import begin_worker
 from gateway.edges.reasons import reason_of
 from gateway.output import PRIVATE, write_new
 
@@ -32,7 +32,7 @@ class StampFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / NAME
-        self._worker = ThreadPoolExecutor(1, "stamps")
+        self._worker = begin_worker("stamps")
         self._waiting: Kept | None = None
         self._is_told = False
 

@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 FIRST_RETRY_S: Final = 0.25
 LONGEST_RETRY_S: Final = 4.0
-READ_SIZE: Final = 64
-"""A sample, or two. A backlog, of which the kernel keeps 4096 bytes, takes several turns of the
-loop, so that clients are not kept waiting until all of it is worked off."""
+READ_SIZE: Final = 48
+"""A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
+of the loop, so that clients are not kept waiting until all of it is worked off."""
 
 KNOWN_ADAPTERS: Final = {
     (0x0403, 0x6001): "FTDI FT232R",

@@ -1,0 +1,13 @@
+"""The threads for files."""
+
+import threading
+
+from gateway.edges.disk.worker import begin_worker
+
+
+def test_the_thread_is_there_before_its_first_job() -> None:
+    worker = begin_worker("files")
+    before = {thread for thread in threading.enumerate() if thread.name.startswith("files")}
+    assert len(before) == 1
+    assert worker.submit(threading.current_thread).result() in before
+    worker.shutdown()
