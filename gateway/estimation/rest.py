@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, write_vec
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
@@ -133,7 +133,7 @@ def watch_rest(
 
 @compiled
 def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: float) -> float:
-    """Return how firmly a bias that was learned at rest may be believed in flight.
+    """Return how firmly a bias that was learned at rest may be believed in flight, or reversed.
 
     Parameters
     ----------
@@ -152,14 +152,17 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
     -------
     float
         Standard deviation in rad/s at the start of a motion: what the bias has changed by from
-        motion to rest before, or may change by where that is not known; 0 at other times.
+        motion to rest before, or may change by where that is not known. At the start of a rest: by
+        how much the rate differs from the bias of the motion. 0 at other times.
     """
     if s.at_rest == 1:
+        change = 0.0
         if not rested and s.flown_s > FLOWN_S:
             s.flown_known = 1
             write_vec(s.flown_bias_b, bias_b)
+            change = largest_difference(bias_b, as_vec(s.gyro_rest))
         s.flown_s, s.bias_of_rest = 0.0, 1
-        return 0.0
+        return change
     if not moving:
         return 0.0
     s.flown_s += dt
@@ -168,7 +171,11 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
     s.bias_of_rest = 0
     if s.flown_known == 0:
         return BIAS_CHANGE_RADPS
-    change = 0.0
-    for k in range(3):
-        change = max(change, abs(bias_b[k] - s.flown_bias_b[k]))
+    change = largest_difference(bias_b, as_vec(s.flown_bias_b))
     return min(max(change, LEAST_CHANGE_RADPS), BIAS_CHANGE_RADPS)
+
+
+@compiled
+def largest_difference(a: Vec3, b: Vec3) -> float:
+    """Return the largest difference of two vectors along an axis."""
+    return max(abs(a[0] - b[0]), abs(a[1] - b[1]), abs(a[2] - b[2]))

@@ -7,6 +7,7 @@ import pytest
 
 from gateway.estimation.columns import (
     GPS_LAT,
+    GYRO,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
     NAV_FLAGS,
@@ -19,11 +20,13 @@ from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import LASTING_RAD, _backward, smooth
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
+    Run,
     attitude_scores,
     outage_score,
     outage_scores,
     position_errors_m,
     rms,
+    run_complementary,
     run_eskf,
     run_smoothed,
 )
@@ -93,6 +96,20 @@ def test_it_beats_the_filter_without_gps_too(flight: Flight) -> None:
     assert after["heading"] < before["heading"]
     # Without a fix the declination is not known, and hindsight does not tell it.
     assert (smoothed[flight.counts, NAV_ATTITUDE_STD + 2] > NO_DECLINATION_RAD).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("run", "yaw_deg"), [(run_complementary, 1.0), (run_eskf, 1.0), (run_smoothed, 0.6)]
+)
+def test_a_gyroscope_that_differs_on_the_ground_spoils_no_flight(
+    flight: Flight, run: Run, yaw_deg: float
+) -> None:
+    """By half a degree a second, before the flight and after it, by heat or vibration."""
+    imu, stands = flight.log.imu.copy(), np.linalg.norm(flight.truth["vel"], axis=1) < 0.1
+    imu[stands, GYRO : GYRO + 3] += np.radians(0.5)
+    spoilt = replace(flight, log=replace(flight.log, imu=imu))
+    assert attitude_scores(spoilt, run(spoilt)[:, :4])["yaw"] < yaw_deg
 
 
 @pytest.mark.slow

@@ -94,6 +94,8 @@ class EskfState(FilterState):
     fix_vel: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
+    bias_raised: Annotated[FloatArray, (3,)]
+    """Sum of what doubt has added to the variance of the gyroscope's bias, rad2/s2."""
     renewals: Annotated[FloatArray, (STATES,)]
     """How often each state began anew: what it was before says nothing of what it is since."""
     off_last_m: float

@@ -31,8 +31,10 @@ OWN_FRAME_VAR: Final = 0.0
 @compiled
 def raise_bias_variance(s: EskfState, std: float) -> None:
     """Believe the gyroscope's bias no more firmly than to a standard deviation in rad/s."""
-    for k in range(GYRO_BIAS, GYRO_BIAS + 3):
-        s.P[k, k] = max(s.P[k, k], std * std)
+    for k in range(3):
+        more = max(std * std - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0)
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += more
+        s.bias_raised[k] += more
 
 
 @compiled

@@ -119,6 +119,14 @@ def is_renewed(s: EskfState, copy: EskfState) -> bool:
 
 
 @compiled
+def share_doubt(s: EskfState, copy: EskfState) -> None:
+    """Let the copy doubt the gyroscope's bias as the filter does, from rest to motion and back."""
+    for k in range(3):
+        copy.P[GYRO_BIAS + k, GYRO_BIAS + k] += s.bias_raised[k] - copy.bias_raised[k]
+        copy.bias_raised[k] = s.bias_raised[k]
+
+
+@compiled
 def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
     """Leave of the standard deviations told only what they hold beyond the covariance."""
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
@@ -197,6 +205,7 @@ def run_forward(
             take_earlier(s, p, now, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
             take_imu(s, p, now, imu[i])
             move_copy(copy, p, now, imu[i], F[k])
+            share_doubt(s, copy)
             anew[i] = is_renewed(s, copy)
             told = s if anew[i] else copy
             write_output(told, out[i])
