@@ -44,9 +44,9 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
 )
 
-APART_US: Final = 10_000
-"""Between the first of one timed message and of the next: at the same intervals, they would else
-be due at the same moments for ever."""
+APART_US: Final = 13_000
+"""Between the first of one timed message and of the next: with equal intervals, they would else be
+due at the same moments for ever. No multiple of 10 ms: they would come with samples at 100 Hz."""
 HEARTBEAT_HZ: Final = 1.0
 """Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
 
