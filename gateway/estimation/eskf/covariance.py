@@ -30,6 +30,8 @@ from gateway.estimation.eskf.eskf_state import (
 from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
+MOVED: Final = POS + 3
+"""The transition changes the first states alone: attitude, velocity, place."""
 SCALE_S: Final = 1.0
 """An acceleration keeps its axis in the body for about this time, and its error its sign."""
 MAX_WANDER_SIGMA: Final = 3.0
@@ -49,9 +51,9 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     dt = s.pending_s
     if dt <= 0.0:
         return
-    apply_transition(s, s.P)
-    transpose(s.P)
-    apply_transition(s, s.P)
+    apply_transition(s, s.P, STATES)
+    mirror(s.P)
+    apply_transition(s, s.P, MOVED)
     symmetrise(s.P)
     turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
@@ -75,27 +77,34 @@ def propagate(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def apply_transition(s: EskfState, P: FloatArray) -> None:
-    """Multiply `P` by the transition matrix from the left."""
+def apply_transition(s: EskfState, P: FloatArray, columns: int) -> None:
+    """Multiply the first columns of `P` by the transition matrix from the left."""
     R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
-        for j in range(STATES):
+        for j in range(columns):
             P[POS + k, j] += dt * P[VEL + k, j]
             P[VEL + k, j] += P[TILT + a, j] * f[b] - P[TILT + b, j] * f[a]
     for i in range(3):
         for k in range(3):
-            for j in range(STATES):
+            for j in range(columns):
                 P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
                 P[TILT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
 
 
 @compiled
-def transpose(P: FloatArray) -> None:
-    """Transpose in place, for a product from the right."""
-    for i in range(STATES):
-        for j in range(i):
-            P[i, j], P[j, i] = P[j, i], P[i, j]
+def mirror(P: FloatArray) -> None:
+    """Turn the product from the left about the diagonal, for one from the right.
+
+    That changes the columns of the states that move. The rows of these keep what is final: their
+    covariances with the others.
+    """
+    for j in range(MOVED):
+        for i in range(j + 1, STATES):
+            upper = P[j, i]
+            if i < MOVED:
+                P[j, i] = P[i, j]
+            P[i, j] = upper
 
 
 @compiled

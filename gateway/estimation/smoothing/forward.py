@@ -52,7 +52,7 @@ take_earlier: Final = KERNELS.earlier
 @compiled
 def foresee(s: EskfState, p: EskfGains, F: FloatArray) -> None:
     """Propagate the copy's covariance, and the transition with it."""
-    apply_transition(s, F)
+    apply_transition(s, F, STATES)
     kept = math.exp(-s.pending_s / p.gps_wander_s)
     for j in range(STATES):
         for k in range(3):

@@ -30,6 +30,7 @@ from gateway.estimation.columns import (
     NAV_VEL,
     NAV_VEL_STD,
 )
+from gateway.estimation.eskf.covariance import MOVED
 from gateway.estimation.eskf.eskf_kernels import FLOWN_S, WAY_S
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
@@ -90,7 +91,8 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
         shown[:] = _hindsight(shown)
         states[0] = state
         run_forward(*arguments)
-    begins, ends, variances = _backward(P, F, foreseen, d, states[0]["P"])
+    found = _backward(P, F, foreseen, d, states[0]["P"])
+    begins, ends, variances = (numbers[:, :MOVED] for numbers in found)
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out
 
@@ -187,7 +189,10 @@ def _correct(
     variances: FloatArray,
     anew: BoolArray,
 ) -> None:
-    """Move what was foreseen by the corrections between the nodes, and tell the new accuracies."""
+    """Move what was foreseen by the corrections between the nodes, and tell the new accuracies.
+
+    Those are of attitude, velocity and place.
+    """
     stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
     if len(stretch) == 0:
         return
