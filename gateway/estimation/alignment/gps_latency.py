@@ -45,7 +45,6 @@ WINDOW_KEPT: Final = 0.98
 KNOWN_STD_S: Final = 0.012
 """A latency that is told less well is not known."""
 CONTRADICTED_S: Final = 0.07
-CONTRADICTED_SIGMA: Final = 3.0
 """What is set stands within this: a position may be a little later than the velocity."""
 SLEW: Final = 0.01
 """Seconds by which the latency in use changes in a second, so that no fix seems to jump."""
@@ -244,9 +243,8 @@ def settle_latency(s: LatencyState, set_s: float, dt: float) -> None:
     dt : float
         Time since it was moved last, s.
     """
-    wanted, std = set_s, found_latency_std(s)
-    allowed = max(CONTRADICTED_S, CONTRADICTED_SIGMA * std)
-    if std < KNOWN_STD_S and abs(s.found_latency_s - set_s) > allowed:
+    wanted, is_known = set_s, found_latency_std(s) < KNOWN_STD_S
+    if is_known and abs(s.found_latency_s - set_s) > CONTRADICTED_S:
         wanted = max(s.found_latency_s, 0.0)
     most = SLEW * dt
     s.gps_latency_s += min(max(wanted - s.gps_latency_s, -most), most)
