@@ -23,7 +23,7 @@ SmoothOption = Annotated[
     typer.Option(
         "--smooth",
         help="Smooth from both ends (Kalman filter, Rauch-Tung-Striebel); "
-        "an hour of flight takes 150 MB of memory.",
+        "an hour of flight takes 120 MB of memory.",
     ),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]

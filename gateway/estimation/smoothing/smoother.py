@@ -39,7 +39,7 @@ from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
 from gateway.geometry.geodesy import radii_m
 
-NODE_S: Final = 0.4
+NODE_S: Final = 0.5
 """From node to node; between them the corrections are interpolated."""
 VELOCITY_CORRELATION_S: Final = 0.75
 FIELD_MEMORY_S: Final = 5.0
