@@ -10,6 +10,7 @@ whole time, is a loop that only wakes up.
 
 import argparse
 import asyncio
+import gc
 import os
 import socket
 import subprocess
@@ -77,6 +78,7 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
     watch.install()
     with loop_comes_first():
         daemon.start()
+        gc.freeze()
         watch.restart()
         try:
             await asyncio.sleep(seconds)

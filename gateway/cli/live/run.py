@@ -122,6 +122,8 @@ async def serve(
         compiling.watch()
     with loop_comes_first():
         daemon.start()
+        # What the start has loaded, the library of the metrics for one, is there to stay as well.
+        gc.freeze()
         if panel is not None:
             panel.start(daemon.control_socket)
         try:
