@@ -96,6 +96,39 @@ def test_gravity_tells_the_level_alone() -> None:
     assert heading_std > 1.0
 
 
+@pytest.mark.parametrize(("swing_hz", "pulled"), [(1.0, False), (0.0, True)])
+def test_what_swings_in_a_hand_is_no_pull_but_what_lasts_is(swing_hz: float, pulled: bool) -> None:
+    """Up and down by 3 m/s2, or for good."""
+    state = new_record(AlignmentState)
+    state.pair_s = -1e9
+    state.force_first_i[2] = state.force_mean_i[2] = -STANDARD_GRAVITY_MPS2
+    down = 0.0
+    largest = 0.0
+    for k in range(3000):
+        align_by_gravity(state, 0.01 * k, (0.0, 0.0, down), 0.1, True)
+        lift = 3.0 * math.cos(2.0 * math.pi * swing_hz * 0.01 * k)
+        down -= 0.01 * (STANDARD_GRAVITY_MPS2 + lift)
+        largest = max(largest, state.pull_mps2)
+    assert (largest > 1.0) == pulled
+    assert (state.turning_mps2 > 0.5) == pulled
+
+
+def test_gravity_is_found_through_any_shaking_that_gets_nowhere() -> None:
+    """The pairs fit badly, and yet the mean force is right but for the change of velocity."""
+    state = new_record(AlignmentState)
+    state.pair_s = -1e9
+    rng = np.random.default_rng(1)
+    vel = rng.normal(0.0, 1.0, (60, 3))
+    for k in range(60):
+        force = vel[k] - [0.0, 0.0, STANDARD_GRAVITY_MPS2 * 0.1 * k]
+        align_by_gravity(state, 0.1 * k, tuple(force), 0.09)
+    q = solve_alignment(state)
+    fitted, known = (alignment_std(state, misfit(state, q), 0.0, v)[0] for v in (0.0, 1.8))
+    off = level_difference(q, (1.0, 0.0, 0.0, 0.0))
+    assert off < 2.0 * known
+    assert known < 0.8 * fitted
+
+
 class TestVelocityOfFix:
     def test_told_is_taken(self) -> None:
         state = new_record(WayState)

@@ -26,7 +26,7 @@ from tools.score_estimators import (
     run_eskf,
 )
 from tools.score_honesty import share, two_sigma
-from tools.spoil_flight import RECOVERY_S, SPOILS, applies, departure, mid_air, no_mag
+from tools.spoil_flight import RECOVERY_S, SPOILS, applies, cut, departure, mid_air, no_mag
 
 pytestmark = pytest.mark.slow
 
@@ -263,12 +263,48 @@ def test_a_level_that_was_found_in_motion_is_kept(data_dir: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("broad_15_undisturbed_fast_translation_A", "silence"),
+        ("broad_15_undisturbed_fast_translation_A", "mid_air"),
+        ("broad_30_disturbed_stationary_magnet_C", "silence"),
+    ],
+)
+def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(
+    data_dir: Path, name: str, how: str
+) -> None:
+    check_back(read_flight(data_dir / f"{name}.csv.gz"), "eskf", how)
+
+
+@pytest.mark.parametrize("begin_s", [65.0, 97.0])
+@pytest.mark.parametrize(
     "name", ["broad_15_undisturbed_fast_translation_A", "broad_30_disturbed_stationary_magnet_C"]
 )
-def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(data_dir: Path, name: str) -> None:
-    tilt_deg, heading_deg, _ = off(read_flight(data_dir / f"{name}.csv.gz"), "eskf", "silence")
-    assert tilt_deg < 5.0
-    assert heading_deg < 8.0
+def test_the_level_is_found_while_a_hand_shakes_it(
+    data_dir: Path, name: str, begin_s: float
+) -> None:
+    """Its velocity only swings: within seconds, the mean of the force is gravity."""
+    flight = read_flight(data_dir / f"{name}.csv.gz")
+    time_s = flight.log.imu_time_us * 1e-6
+    shaken = cut(flight, (time_s > begin_s) & (time_s < begin_s + 12.0))
+    shaken = replace(shaken, counts=shaken.log.imu_time_us * 1e-6 > begin_s + 7.0)
+    out = run_eskf(shaken)
+    assert attitude_scores(shaken, out[:, :4])["inclination"] < LIMIT_DEG
+    assert share(two_sigma(shaken, out)["tilt"]) > 0.9
+
+
+@pytest.mark.parametrize(("begin_s", "length_s"), [(71.2, 8.0), (112.2, 4.0)])
+def test_what_is_picked_up_in_a_silence_is_found_again(
+    data_dir: Path, begin_s: float, length_s: float
+) -> None:
+    """Before, it rests or hardly moves; after, nothing is as it was."""
+    flight = read_flight(data_dir / "broad_30_disturbed_stationary_magnet_C.csv.gz")
+    time_s = flight.log.imu_time_us * 1e-6
+    ends_s = begin_s + length_s
+    spoilt = cut(flight, ((time_s < begin_s) | (time_s > ends_s)) & (time_s < ends_s + 20.0))
+    late = spoilt.log.imu_time_us * 1e-6 > ends_s + 10.0
+    out = run_eskf(spoilt)
+    assert attitude_scores(replace(spoilt, counts=late), out[:, :4])["inclination"] < LIMIT_DEG
 
 
 @pytest.mark.parametrize(

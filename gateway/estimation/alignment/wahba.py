@@ -38,6 +38,8 @@ DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 RAMP_SHARE: Final = 1.0 / math.sqrt(12.0)
 """Of what a steady drift comes to, its deviation from the mean."""
 PULL_TAU_S: Final = 3.0
+SWING_TAU_S: Final = 1.8
+"""Of either of two low-passes, where a hand's swings are to average out."""
 TURNING_TAU_S: Final = 20.0
 PULL_KEPT: Final = 0.7
 """Of an acceleration that is over, from one pair to the next."""
@@ -70,8 +72,9 @@ class AlignmentState:
     """How many pairs the sums are made of."""
     gathered_s: float
     """Over which time, what has faded left out."""
+    force_first_i: Annotated[FloatArray, (3,)]
     force_mean_i: Annotated[FloatArray, (3,)]
-    """Low-pass of the specific force in the gyroscope's frame."""
+    """Low-pass of the specific force in the gyroscope's frame, and a second one of that."""
     turning_mps2: float
     """Mean of what gives itself away: of a hand little, of a flight in turns much."""
     pull_mps2: float
@@ -174,7 +177,9 @@ def align_by_velocity(
 
 
 @compiled
-def align_by_gravity(s: AlignmentState, now_s: float, force_i: Vec3, period_s: float) -> float:
+def align_by_gravity(
+    s: AlignmentState, now_s: float, force_i: Vec3, period_s: float, swings: bool = False
+) -> float:
     """Take gravity for the reference where GPS tells no velocity.
 
     Parameters
@@ -187,6 +192,8 @@ def align_by_gravity(s: AlignmentState, now_s: float, force_i: Vec3, period_s: f
         Integral of the specific force in the gyroscope's frame, m/s.
     period_s : float
         Length of a pair.
+    swings : bool
+        Whether what swings to and fro, as in a hand, is no pull: it is smoothed twice then.
 
     Returns
     -------
@@ -202,9 +209,11 @@ def align_by_gravity(s: AlignmentState, now_s: float, force_i: Vec3, period_s: f
     if s.by_gps == 1 or dt < period_s:
         return 0.0
     force = mean_force(s, force_i, dt)
-    share = min(1.0, dt / PULL_TAU_S)
+    share = min(1.0, dt / (SWING_TAU_S if swings else PULL_TAU_S))
     for k in range(3):
-        s.force_mean_i[k] += share * (force[k] - s.force_mean_i[k])
+        s.force_first_i[k] += share * (force[k] - s.force_first_i[k])
+        newest = s.force_first_i[k] if swings else force[k]
+        s.force_mean_i[k] += share * (newest - s.force_mean_i[k])
     s.pull_mps2 = unseen_acceleration(s)
     s.turning_mps2 += min(1.0, dt / TURNING_TAU_S) * (s.pull_mps2 - s.turning_mps2)
     weight = 1.0 / (GRAVITY_NOISE_MPS2 * GRAVITY_NOISE_MPS2)
@@ -279,7 +288,9 @@ def misfit(s: AlignmentState, q_ni: Quat) -> float:
 
 
 @compiled
-def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[float, float]:
+def alignment_std(
+    s: AlignmentState, excess: float, bias_radps: float, hand_mps: float = 0.0
+) -> tuple[float, float]:
     """Return how well the pairs say the level and the heading.
 
     Parameters
@@ -290,6 +301,9 @@ def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[
         See `misfit`.
     bias_radps : float
         Standard deviation of the gyroscope's bias.
+    hand_mps : float
+        By how much the velocity may have changed meanwhile, where gravity is the reference;
+        0 where nothing is known of it.
 
     Returns
     -------
@@ -312,8 +326,12 @@ def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[
         off_level = bias_radps * RAMP_SHARE * s.gathered_s
         pulled = math.sqrt(level) * off_level * off_level
         heading_var = (excess + pulled) * level / determinant + drift
+    level_var *= excess
+    if s.by_gps == 0 and hand_mps > 0.0:
+        # However it is shaken: over the time, the mean force is gravity but for that change.
+        level_var = min(level_var, (hand_mps / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
     return (
-        math.sqrt(min(excess * level_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
+        math.sqrt(min(level_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
         math.sqrt(min(heading_var, UNKNOWN_RAD * UNKNOWN_RAD)),
     )
 

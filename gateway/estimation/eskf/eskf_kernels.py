@@ -10,19 +10,16 @@ from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, VEL, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.iron import follow_field, look_for_iron
 from gateway.estimation.eskf.measure import (
-    UNAIDED_CORRELATION_S,
-    lag_integrals,
-    take_back,
     update_by_baro,
     update_by_compass,
     update_by_rest,
     update_by_velocity,
 )
-from gateway.estimation.eskf.recovery import raise_bias_variance, watch_gravity
+from gateway.estimation.eskf.recovery import check_rest, raise_bias_variance, watch_gravity
 from gateway.estimation.eskf.start import (
     begin,
     bridge_gap,
@@ -32,7 +29,7 @@ from gateway.estimation.eskf.start import (
     start,
     start_heading_by_compass,
 )
-from gateway.estimation.filtering.fix_intake import look_back
+from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
 from gateway.estimation.filtering.sample_clock import step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -45,7 +42,7 @@ from gateway.estimation.kernel_record import (
     write_quat,
     write_vec,
 )
-from gateway.estimation.local_position import BARO_STALE_S, past_state
+from gateway.estimation.local_position import BARO_STALE_S
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_unlikeness, take_field
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
@@ -67,25 +64,10 @@ COMPASS_S: Final = 0.045
 """Between compass measurements; its slow error makes more of them useless."""
 ROUGH_LIMIT: Final = 1e4
 """A larger change is a fault, and NaN compares false."""
-HAND_MPS2: Final = 0.5
-TURN_S: Final = 4.0
-"""What pulls more than a hand does for long is flown; its velocity turns in about this time."""
-WAY_S: Final = 2.0
-HAND_M: Final = 2.0
-"""A hand does not go so far in this time; what does is flown."""
-FLOWN_S: Final = 30.0
-"""The speed that a flight has shown is to be expected for about this time."""
-LEG_S: Final = 10.0
-"""A flight that hardly turns is on the same leg for about this time."""
-ASSUMED_S: Final = 5.0
-"""Corrections that are older are not taken back."""
-PUSHED_SQ: Final = 9.0
 PUSH_MPS2: Final = 0.3
 """A steady level force beyond this, and beyond three standard deviations of tilt, is no rest."""
 PUSHED_MPS: Final = 40.0
 """No steady force pushes to more than this without a turn or a gust."""
-UNAIDED_PULL_MPS2: Final = 0.5
-"""A lasting acceleration of this much halves the belief in standing still."""
 ZERO: Final = (0.0, 0.0, 0.0)
 
 
@@ -116,6 +98,7 @@ def take_imu(
         return
     sound = move(s, gyro, accel, row[CLIPPED], dt)
     if sound:
+        check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
         rested = s.at_rest == 1
         watch_rest(s, p, gyro, accel, is_pushed(s, dt) or moving, dt)
@@ -273,51 +256,6 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def unaided_density(s: EskfState, p: EskfGains) -> float:
-    """Return how little is known of a velocity that no GPS tells.
-
-    Returns
-    -------
-    float
-        The variance of the speed of about zero that stands in for a sensor, times how long the
-        true velocity stays the same, m2/s. A hand's is small and short. What flies is as fast as
-        it has shown, by turns or by its way, and the harder it turns, the sooner it is another.
-    """
-    pull = s.pull_mps2 / UNAIDED_PULL_MPS2
-    hand = p.unaided_var * (1.0 + pull * pull) * UNAIDED_CORRELATION_S
-    turned = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
-    leg_s = min(0.5 * math.sqrt(s.unaided_sq) / max(s.turning_mps2, 0.1), LEG_S)
-    return max(hand, turned * turned * TURN_S, s.unaided_sq * leg_s)
-
-
-@compiled
-def watch_way(s: EskfState, dt: float) -> None:
-    """Detect flight: the way of the last seconds is longer than a hand carries anything.
-
-    A take-off run is as smooth as rest, and its pull looks like tilt; only its way tells. The
-    speed of about zero is refuted by it, so what that has corrected meanwhile is taken back.
-    """
-    lag = s.time_s - look_back(s, s.time_s - WAY_S)
-    _, vel = past_state(s, s.then, lag)
-    _, pushed = lag_integrals(s, s.then, lag)
-    north = (vel[0] - s.assumed[3]) * lag + pushed[0]
-    east = (vel[1] - s.assumed[4]) * lag + pushed[1]
-    unsure = s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
-    flew = s.flies
-    s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * unsure else 0
-    s.unaided_sq *= math.exp(-dt / FLOWN_S)
-    for k in range(6):
-        s.assumed[k] *= math.exp(-dt / ASSUMED_S)
-    if s.at_rest == 1:
-        s.unaided_sq, s.flies = 0.0, 0
-    elif s.flies == 1:
-        shown = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2 - unsure)
-        s.unaided_sq = max(s.unaided_sq, shown)
-        if flew == 0:
-            take_back(s)
-
-
-@compiled
 def recent_unlikeness(s: EskfState, p: EskfGains, norm: float, dip: float, dt: float) -> float:
     """Return by what to divide a field's weight: what disturbs the compass lasts for a while."""
     now = field_unlikeness(s, norm, dip)
@@ -355,10 +293,13 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     weight = take_field(s, p, norm, field[2]) / recent_unlikeness(s, p, norm, dip, dt)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
+    if weight == 0.0:
+        return
     if s.heading_known == 0:
-        start_heading_by_compass(s, p, declination - math.atan2(field[1], field[0]))
+        turn_rad = declination - math.atan2(field[1], field[0])
+        start_heading_by_compass(s, p, field, turn_rad, p.mag_var / weight)
         s.heading_true = 1 if known else 0
-    elif weight > 0.0 and s.time_s - s.mag_used_s >= COMPASS_S:
+    elif s.time_s - s.mag_used_s >= COMPASS_S:
         since = min(s.time_s - s.mag_used_s, STALE_MAG_S)
         s.mag_used_s = s.time_s
         write_vec(s.field_n, field)

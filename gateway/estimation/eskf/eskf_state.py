@@ -79,6 +79,8 @@ class EskfState(FilterState):
     """1 once that was more than noise."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
+    hand_sq: float
+    """Variance of a level velocity that began unknown in a hand, per axis, m2/s2; it fades."""
     unaided_sq: float
     """Mean square of the speed that has shown itself where no GPS tells it, per axis, m2/s2."""
     assumed: Annotated[FloatArray, (6,)]
@@ -87,6 +89,8 @@ class EskfState(FilterState):
     """Speed to which a steady force would have pushed by now, were it no tilt."""
     flies: int
     """1 while the way without GPS is that of a flight."""
+    rest_unsure: int
+    """1 after a silence that began at rest, until a sample shows whether it still holds."""
     hold_s: float
     """How long position is dead-reckoned."""
     baro_down_m: float

@@ -16,12 +16,17 @@ from gateway.estimation.eskf.covariance import propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
-from gateway.estimation.rest import BIAS_CHANGE_RADPS
+from gateway.estimation.rest import BIAS_CHANGE_RADPS, SHAKEN
 from gateway.geometry.quaternion import multiply, normalise
+from gateway.records import Vec3
 
 ENOUGH_HEADING_RAD: Final = 0.3
 """A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
+HAND_MPS: Final = 1.8
+"""By how much the speed of what moves in a hand differs from one moment to another."""
+HAND_VAR: Final = (0.5 * HAND_MPS) ** 2
+"""Of each axis of the velocity where an attitude begins in a hand's motion."""
 NO_HEADING_VAR: Final = 3.0
 """Of a heading that may be any."""
 OWN_FRAME_VAR: Final = 0.0
@@ -45,8 +50,9 @@ def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: fl
     renew(s, TILT + 1, level_var)
     renew(s, TILT + 2, heading_var)
     for k in range(3):
-        renew(s, VEL + k, p.unaided_var)
+        renew(s, VEL + k, HAND_VAR)
         s.vel_n[k] = 0.0
+    s.hand_sq = HAND_VAR
     s.aided = 0
     # The integrals in NED stand in the old attitude.
     s.ring_count = 0
@@ -71,9 +77,23 @@ def lose_attitude(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
+def check_rest(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3) -> None:
+    """Give the attitude up where a rest has ended during a silence: it may be any by now."""
+    if s.rest_unsure == 0:
+        return
+    s.rest_unsure = 0
+    turned, pulled = 0.0, 0.0
+    for k in range(3):
+        turned += (gyro[k] - s.gyro_lp[k]) ** 2
+        pulled += (accel[k] - s.accel_lp[k]) ** 2
+    if turned > (SHAKEN * p.rest_gyro_radps) ** 2 or pulled > p.rest_accel_mps2**2:
+        lose_attitude(s, p)
+
+
+@compiled
 def watch_gravity(s: EskfState, p: EskfGains) -> None:
     """Look at gravity where GPS tells no velocity."""
-    dt = align_by_gravity(s, s.time_s, as_vec(s.integrals), GRAVITY_PAIR_S)
+    dt = align_by_gravity(s, s.time_s, as_vec(s.integrals), GRAVITY_PAIR_S, True)
     if dt > 0.0:
         review_attitude(s, p, dt)
 
@@ -84,7 +104,7 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     level_told = math.sqrt(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
     heading_told = math.sqrt(s.P[TILT + 2, TILT + 2])
     bias = math.sqrt(0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1]))
-    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt):
+    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt, HAND_MPS):
         if tells_heading(s, ENOUGH_HEADING_RAD):
             turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
             renew(s, TILT + 2, s.heading_std * s.heading_std)

@@ -7,7 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
-from gateway.estimation.eskf.covariance import propagate, renew
+from gateway.estimation.eskf.covariance import propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -23,17 +23,20 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row
-from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
+from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import begin_clock, silent_rate
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
 from gateway.records import NAN, Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 FIRST_VELOCITY_VAR: Final = 0.5**2
 NO_VELOCITY_VAR: Final = 5.0**2
 GAP_REST_RATE: Final = 0.02
+GAP_HAND_RATE: Final = 0.3
+"""What flies goes straight on, but a hand turns as it likes."""
 GAP_ACCEL_MPS2: Final = 3.0
 RELOCK_HEADING_VAR: Final = 0.3**2
 
@@ -75,15 +78,24 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
     pitch = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
     write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
     write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
-    # One sample may be anything: the alignment finds the level within the first second.
+    # One sample may be anything: taken to be of gravity's strength, it pulls nowhere, and the
+    # alignment finds the level within the first seconds.
+    share = STANDARD_GRAVITY_MPS2 / math.hypot(accel[0], math.hypot(accel[1], accel[2]))
+    for k in range(3):
+        s.force_first_i[k] = s.force_mean_i[k] = share * accel[k]
     lose_attitude(s, p)
 
 
 @compiled
-def start_heading_by_compass(s: EskfState, p: EskfGains, turn_rad: float) -> None:
-    """Take the heading from the compass."""
+def start_heading_by_compass(
+    s: EskfState, p: EskfGains, field_n: Vec3, turn_rad: float, variance: float
+) -> None:
+    """Take the heading from the compass: it has the tilt's error, through the field's dip."""
+    propagate(s, p)
     turn_heading(s, turn_rad)
-    renew(s, TILT + 2, p.mag_var)
+    renew(s, TILT + 2, NO_HEADING_VAR)
+    compass_row(s, field_n)
+    update_scalar(s, 0.0, variance, p.gate_sq)
     s.heading_known = 1
 
 
@@ -201,7 +213,8 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     still = s.at_rest == 1
     rate = silent_rate(s, as_vec(s.gyro_bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-    turned = (GAP_REST_RATE if still else GAP_TILT_RATE + turning) * dt
+    flown = GAP_TILT_RATE if s.aided == 1 else GAP_HAND_RATE
+    turned = (GAP_REST_RATE if still else flown + turning) * dt
     turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt)
     for k in range(3):
         if s.aided == 1:
@@ -215,6 +228,7 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     s.pair_s = NEVER_S
     s.rest_s = 0.0
     s.at_rest = 0
+    s.rest_unsure = 1 if still else 0
     if turned > GAP_LOST_RAD and not still:
         lose_attitude(s, p)
 

@@ -31,9 +31,9 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.covariance import MOVED
-from gateway.estimation.eskf.eskf_kernels import FLOWN_S, WAY_S
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
+from gateway.estimation.eskf.unaided_velocity import FLOWN_S, WAY_S
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward

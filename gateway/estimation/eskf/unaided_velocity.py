@@ -1,0 +1,83 @@
+"""The velocity where no GPS tells it: a hand's is about zero, a flight's is as it has shown."""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import TILT, VEL, EskfState
+from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, lag_integrals, take_back
+from gateway.estimation.filtering.fix_intake import look_back
+from gateway.estimation.local_position import past_state
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+HAND_MPS2: Final = 0.5
+TURN_S: Final = 4.0
+"""What pulls more than a hand does for long is flown; its velocity turns in about this time."""
+WAY_S: Final = 2.0
+HAND_M: Final = 2.0
+"""A hand does not go so far in this time; what does is flown."""
+SWING_S: Final = 0.1
+"""A hand's motion, to and fro, keeps its velocity for about this time."""
+SETTLE_S: Final = 20.0
+"""The velocity that an attitude began with is forgotten in about this time."""
+FLOWN_S: Final = 30.0
+"""The speed that a flight has shown is to be expected for about this time."""
+LEG_S: Final = 10.0
+"""A flight that hardly turns is on the same leg for about this time."""
+ASSUMED_S: Final = 5.0
+"""Corrections that are older are not taken back."""
+UNAIDED_PULL_MPS2: Final = 0.5
+"""A lasting acceleration of this much halves the belief in standing still."""
+PUSHED_SQ: Final = 9.0
+"""Beyond three standard deviations nothing is explained by them."""
+
+
+@compiled
+def unaided_density(s: EskfState, p: EskfGains) -> float:
+    """Return how little is known of a velocity that no GPS tells.
+
+    Returns
+    -------
+    float
+        The variance of the speed of about zero that stands in for a sensor, times how long the
+        true velocity stays the same, m2/s. A hand's is small and short, but not at once known to
+        be. What flies is as fast as it has shown, by turns or by its way, and the harder it
+        turns, the sooner it is another.
+    """
+    pull = s.pull_mps2 / UNAIDED_PULL_MPS2
+    hand = p.unaided_var * (1.0 + pull * pull) * UNAIDED_CORRELATION_S
+    turned = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
+    leg_s = min(0.5 * math.sqrt(s.unaided_sq) / max(s.turning_mps2, 0.1), LEG_S)
+    return max(hand, s.hand_sq * SWING_S, turned * turned * TURN_S, s.unaided_sq * leg_s)
+
+
+@compiled
+def watch_way(s: EskfState, dt: float) -> None:
+    """Detect flight: the way of the last seconds is longer than a hand carries anything.
+
+    A take-off run is as smooth as rest, and its pull looks like tilt; only its way tells. The
+    speed of about zero is refuted by it, so what that has corrected meanwhile is taken back.
+    """
+    lag = s.time_s - look_back(s, s.time_s - WAY_S)
+    _, vel = past_state(s, s.then, lag)
+    _, pushed = lag_integrals(s, s.then, lag)
+    north = (vel[0] - s.assumed[3]) * lag + pushed[0]
+    east = (vel[1] - s.assumed[4]) * lag + pushed[1]
+    unsure = s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
+    tilt_var = s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1]
+    pulled_sq = (0.5 * STANDARD_GRAVITY_MPS2 * lag) ** 2 * tilt_var
+    drift = unsure + PUSHED_SQ * (2.0 * s.hand_sq + pulled_sq)
+    flew = s.flies
+    s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * drift else 0
+    s.unaided_sq *= math.exp(-dt / FLOWN_S)
+    s.hand_sq *= math.exp(-dt / SETTLE_S)
+    for k in range(6):
+        s.assumed[k] *= math.exp(-dt / ASSUMED_S)
+    if s.at_rest == 1:
+        s.unaided_sq, s.hand_sq, s.flies = 0.0, 0.0, 0
+    elif s.flies == 1:
+        shown = 0.5 * (s.vel_n[0] ** 2 + s.vel_n[1] ** 2 - unsure)
+        s.unaided_sq = max(s.unaided_sq, shown)
+        if flew == 0:
+            take_back(s)
