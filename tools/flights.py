@@ -9,7 +9,11 @@ import numpy as np
 import pandas as pd
 
 from gateway.estimation.columns import (
+    GPS_ALT,
     GPS_COLUMNS,
+    GPS_DECLINATION,
+    GPS_DIP,
+    GPS_LAT,
     IMU_COLUMNS,
     NAV_COLUMNS,
     NAV_LAT,
@@ -101,7 +105,12 @@ def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
     gps = np.full((len(fixes), GPS_COLUMNS), np.nan)
     gps[:, 0] = 1.0
     gps[:, 1:7] = fixes[GPS_NAMES].to_numpy()
-    gps[:, 10] = EarthField(settings).declination_rad
+    earth = EarthField(settings)
+    gps[:, GPS_DECLINATION] = earth.declination_rad
+    if len(gps):
+        lat_deg, lon_deg, alt_m = gps[0, GPS_LAT : GPS_ALT + 1].tolist()
+        earth.update(lat_deg, lon_deg, alt_m, None)
+        gps[:, GPS_DIP] = math.nan if earth.field is None else earth.field.inclination_rad
     imu = np.zeros((len(table), IMU_COLUMNS))
     imu[:, : len(IMU_NAMES)] = table[IMU_NAMES].to_numpy()
     return SampleLog(

@@ -50,7 +50,9 @@ GPS_SPEED_ACC: Final = 9
 """The receiver's own standard deviations; NaN where it tells none."""
 GPS_DECLINATION: Final = 10
 """Declination in rad; NaN while not known."""
-GPS_COLUMNS: Final = 11
+GPS_DIP: Final = 11
+"""Dip of the Earth's field at the place, positive down, rad; NaN while not known."""
+GPS_COLUMNS: Final = 12
 
 NAV_QUAT: Final = 0
 NAV_RATE: Final = 4
@@ -109,7 +111,7 @@ def imu_vectors(row: FloatArray) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:
-    """Lay out a fix together with the declination at its place.
+    """Lay out a fix together with the Earth's magnetic field at its place.
 
     Parameters
     ----------
@@ -143,6 +145,7 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
         fix.v_acc_m,
         fix.speed_acc_mps,
         earth.declination_rad,
+        NAN if earth.field is None else earth.field.inclination_rad,
     )
 
 

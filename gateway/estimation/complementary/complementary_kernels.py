@@ -73,6 +73,7 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     begin_drift(s, p)
     s.gravity_tau_s = p.tau_accel_s
     s.declination_rad = p.declination_rad
+    s.earth_dip_rad = NAN
     begin_latency(s, p.gps_latency_s)
     forget_times(s)
 

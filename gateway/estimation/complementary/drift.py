@@ -51,6 +51,8 @@ FORCE_WALK_M2PS5: Final = 0.002**2
 """Bias of the accelerometer at the start, at most, and its random walk."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
+DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
+"""How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
 UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
 UNCLIPPED: Final = 1e9
@@ -182,14 +184,32 @@ def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
 
     Without GPS there is nothing to weigh that of iron against, and it averages out over turns.
     """
-    iron = iron_variance(s) if s.level_by_gps == 1 else 0.0
+    iron = steady_iron_variance(s)
+    if s.level_by_gps == 1:
+        iron += iron_variance(s)
     variance = p.heading_noise_rad**2 + iron
     widen_compass(s, variance)
-    faded = s.carried_s / p.tau_heading_s + s.carried_rad * iron / variance
+    still = variance - iron
+    faded = (s.carried_s / p.tau_heading_s * still + s.carried_rad * iron) / variance
     kept = math.exp(-faded)
     scale_state(s, COMPASS, kept)
     s.drift_cov[COMPASS, COMPASS] += (1.0 - kept * kept) * variance
     s.compass_rad *= kept
+
+
+@compiled
+def steady_iron_variance(s: ComplementaryState) -> float:
+    """Return the variance of the compass's heading by iron that bends the dip of the field, rad2.
+
+    A hover or a stand shows no iron by the field's strength. But iron that makes the field steeper
+    or less steep than it is at the place bends it sideways as much.
+    """
+    dip = s.level_dip_rad
+    bent = math.sin(dip - s.earth_dip_rad)
+    excess = bent * bent - DIP_ERROR_RAD**2
+    if s.level_dip_s == 0.0 or not excess > 0.0:
+        return 0.0
+    return excess / max(math.cos(dip) ** 2, excess)
 
 
 @compiled

@@ -24,13 +24,15 @@ from gateway.estimation.complementary.drift import (
     heading_variance,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import STALE_MAG_S, take_field
+from gateway.estimation.magfield import IRON_TAU_S, STALE_MAG_S, take_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 
 MAG_NOISE_DEG: Final = 3.2
 """Error of the compass that is another within a second or so."""
+LEVEL_RAD: Final = 2.0 * RAD_PER_DEG
+"""A level that is less sure says nothing of the field's dip."""
 GOOD_VAR: Final = 0.3
 """Up to 30 deg of standard deviation, the GPS acceleration may be turned by the heading."""
 
@@ -62,6 +64,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     weight = take_field(s, p, norm, down)
     if weight <= 0.0:
         return
+    note_dip(s, math.asin(down / norm), dt)
     declination = s.declination_rad
     if s.heading_known == 0 or math.isfinite(declination):
         s.heading_true = 1 if math.isfinite(declination) else s.heading_true
@@ -80,3 +83,13 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
     correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED)
+
+
+@compiled
+def note_dip(s: ComplementaryState, dip_rad: float, dt: float) -> None:
+    """Average the dip of the usual field while the level is known."""
+    usual = s.mag_norm_ref > 0.0 and s.mag_disturbed == 0
+    if not usual or max(s.told_std[0], s.told_std[1]) > LEVEL_RAD:
+        return
+    s.level_dip_s = min(s.level_dip_s + dt, IRON_TAU_S)
+    s.level_dip_rad += dt / s.level_dip_s * (dip_rad - s.level_dip_rad)
