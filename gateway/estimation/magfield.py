@@ -10,6 +10,7 @@ from typing import Annotated, Final
 from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray
 from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
 
 SETTLE_S: Final = 0.5
 """An undisturbed field must last this long to be believed."""
@@ -26,6 +27,8 @@ IRON_TAU_S: Final = 60.0
 """The mean of the field is taken over this time: it holds turns in all directions."""
 STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
+DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
+"""How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
 LIKE_NORM_SHARE: Final = 0.04
 LIKE_DIP_RAD: Final = 0.035
 """A field this much stronger or steeper than usual counts half."""
@@ -180,6 +183,18 @@ def iron_variance(s: FieldState) -> float:
     """Return the variance of the compass's heading that iron makes, rad2."""
     level_ut = s.mag_mean_norm * math.cos(s.mag_mean_dip)
     return s.mag_iron_ut2 / max(level_ut * level_ut, MIN_FIELD_UT)
+
+
+@compiled
+def bent_share_sq(dip_rad: float, earth_dip_rad: float) -> float:
+    """Return the square of iron's share of a field, along one axis, by how it bends the dip.
+
+    A hover or a stand shows no iron by the field's strength. But iron that makes the field steeper
+    or less steep than it is at the place bends it sideways as much. 0 where that is not known.
+    """
+    bent = math.sin(dip_rad - earth_dip_rad)
+    excess = bent * bent - DIP_ERROR_RAD**2
+    return excess if excess > 0.0 else 0.0
 
 
 @compiled

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
+    GPS_DIP,
     NAV_FLAGS,
     NAV_LAT,
     NAV_VEL,
@@ -84,14 +85,17 @@ def test_each_axis_stays_within_three_standard_deviations(flight: Flight) -> Non
 def test_iron_that_the_calibration_left_is_learned_in_flight(flight: Flight) -> None:
     imu = flight.log.imu.copy()
     imu[:, 6:9] += [3.0, -2.0, 4.0]
-    bent = replace(flight, log=replace(flight.log, imu=imu))
+    no_dip = flight.log.gps.copy()
+    no_dip[:, GPS_DIP] = np.nan
 
-    def yaw(settings: EskfSettings) -> float:
+    def yaw(gps: np.ndarray, settings: EskfSettings) -> float:
         choice = EstimationSettings(estimator="eskf", reference=flight.reference, eskf=settings)
-        out = make_estimator(choice).run(bent.log)
-        return attitude_scores(bent, out[:, :4])["yaw"]
+        out = make_estimator(choice).run(replace(flight.log, imu=imu, gps=gps))
+        return attitude_scores(flight, out[:, :4])["yaw"]
 
-    assert yaw(EskfSettings()) < 0.9 * yaw(EskfSettings(mag_bias_ut=0.01))
+    unlearned = yaw(no_dip, EskfSettings(mag_bias_ut=0.01))
+    assert yaw(no_dip, EskfSettings()) < 0.9 * unlearned
+    assert yaw(flight.log.gps, EskfSettings(mag_bias_ut=0.01)) < 0.9 * unlearned
 
 
 @pytest.mark.slow

@@ -175,8 +175,6 @@ class ComplementaryState(FilterState):
     """Slow error of the compass."""
     compass_var: float
     """Within which that error is expected, rad2."""
-    earth_dip_rad: float
-    """Dip of the Earth's field at the place; NaN before the first fix."""
     level_dip_rad: float
     """Mean dip that the compass shows while the level is known."""
     level_dip_s: float

@@ -20,7 +20,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
-from gateway.estimation.magfield import iron_variance
+from gateway.estimation.magfield import bent_share_sq, iron_variance
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import (
     from_rotation_vector,
@@ -51,8 +51,6 @@ FORCE_WALK_M2PS5: Final = 0.002**2
 """Bias of the accelerometer at the start, at most, and its random walk."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
-DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
-"""How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
 UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
 UNCLIPPED: Final = 1e9
@@ -199,17 +197,11 @@ def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 @compiled
 def steady_iron_variance(s: ComplementaryState) -> float:
-    """Return the variance of the compass's heading by iron that bends the dip of the field, rad2.
-
-    A hover or a stand shows no iron by the field's strength. But iron that makes the field steeper
-    or less steep than it is at the place bends it sideways as much.
-    """
-    dip = s.level_dip_rad
-    bent = math.sin(dip - s.earth_dip_rad)
-    excess = bent * bent - DIP_ERROR_RAD**2
-    if s.level_dip_s == 0.0 or not excess > 0.0:
+    """Return the variance of the heading by iron that bends the dip of the field, rad2."""
+    share_sq = bent_share_sq(s.level_dip_rad, s.earth_dip_rad)
+    if s.level_dip_s == 0.0 or share_sq == 0.0:
         return 0.0
-    return excess / max(math.cos(dip) ** 2, excess)
+    return share_sq / max(math.cos(s.level_dip_rad) ** 2, share_sq)
 
 
 @compiled

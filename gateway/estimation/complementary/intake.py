@@ -11,7 +11,6 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_of_fix,
 )
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
-from gateway.estimation.columns import GPS_DECLINATION, GPS_DIP
 from gateway.estimation.complementary.accuracy import settle_place
 from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
@@ -38,7 +37,7 @@ from gateway.estimation.filtering.fix_intake import (
     accept_fix,
     is_fix_told,
     is_flown_unaided,
-    learn_declination,
+    learn_earth_field,
     look_back,
     pair_with,
     place_fix,
@@ -98,8 +97,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     """
     if not is_fix_told(s, row):
         return
-    s.heading_rad += learn_declination(s, row[GPS_DECLINATION])
-    s.earth_dip_rad = row[GPS_DIP]
+    s.heading_rad += learn_earth_field(s, row)
     wanted_s = wanted_time_s(s, p, time_us, row)
     silent_s = silence_before(s, wanted_s)
     if silent_s > 0.0:

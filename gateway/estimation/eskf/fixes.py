@@ -8,7 +8,6 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_noise,
     velocity_of_fix,
 )
-from gateway.estimation.columns import GPS_DECLINATION
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import EskfState
@@ -29,7 +28,7 @@ from gateway.estimation.filtering.fix_intake import (
     accept_fix,
     is_fix_told,
     is_flown_unaided,
-    learn_declination,
+    learn_earth_field,
     look_back,
     pair_with,
     place_fix,
@@ -59,7 +58,7 @@ def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
     """
     if not is_fix_told(s, row):
         return
-    turn_rad = learn_declination(s, row[GPS_DECLINATION])
+    turn_rad = learn_earth_field(s, row)
     if turn_rad != 0.0:
         turn_heading(s, turn_rad)
     set_wander_variance(s, p, row)

@@ -27,6 +27,7 @@ from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn
 from gateway.estimation.filtering.sample_clock import begin_clock, silent_rate
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.magfield import bent_share_sq
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
 from gateway.records import NAN, Vec3
@@ -53,6 +54,7 @@ def start(s: EskfState, p: EskfGains) -> None:
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
         s.rate_b[k] = NAN
     s.declination_rad = p.declination_rad
+    s.earth_dip_rad = NAN
     s.left_iron_ut = math.sqrt(p.mag_bias_var)
     begin_latency(s, p.gps_latency_s)
     forget_times(s)
@@ -109,14 +111,19 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
         return
     s.iron_search_started = 1
     by_compass = s.field_n[0] != 0.0 or s.field_n[1] != 0.0
+    variance = p.mag_bias_var
     if by_compass:
+        north, east, down = as_vec(s.field_n)
+        level_sq = north * north + east * east
+        share_sq = bent_share_sq(math.atan2(down, math.sqrt(level_sq)), s.earth_dip_rad)
+        variance = max(variance, share_sq * (level_sq + down * down))
         compass_row(s, as_vec(s.field_n))
     for k in range(3):
-        renew(s, MAG_BIAS + k, p.mag_bias_var)
+        renew(s, MAG_BIAS + k, variance)
         if by_compass:
             share = s.h[MAG_BIAS + k]
-            set_covariance(s, TILT + 2, MAG_BIAS + k, -share * p.mag_bias_var)
-            s.P[TILT + 2, TILT + 2] += share * share * p.mag_bias_var
+            set_covariance(s, TILT + 2, MAG_BIAS + k, -share * variance)
+            s.P[TILT + 2, TILT + 2] += share * share * variance
 
 
 @compiled

@@ -57,6 +57,8 @@ class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState,
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
     declination_rad: float
+    earth_dip_rad: float
+    """Dip of the Earth's field at the place; NaN before the first fix."""
     baro_known: int
     baro_s: float
     has_height: int

@@ -7,7 +7,7 @@ from gateway.estimation.alignment.gps_latency import watch_latency
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import MOVING_MPS
 from gateway.estimation.alignment.wahba import align_by_velocity
-from gateway.estimation.columns import GPS_LAT, GPS_LON, GPS_USABLE
+from gateway.estimation.columns import GPS_DECLINATION, GPS_DIP, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState
 from gateway.estimation.history import recall
 from gateway.estimation.kernel_record import FloatArray, as_vec
@@ -46,8 +46,10 @@ def place_fix(s: FilterState, row: FloatArray) -> tuple[Vec3, Vec3]:
 
 
 @compiled
-def learn_declination(s: FilterState, declination_rad: float) -> float:
-    """Note the declination, and return by how much it turns a heading that was magnetic, rad."""
+def learn_earth_field(s: FilterState, row: FloatArray) -> float:
+    """Note the field at the place; return the turn of a heading that was magnetic so far, rad."""
+    s.earth_dip_rad = row[GPS_DIP]
+    declination_rad: float = row[GPS_DECLINATION]
     if not math.isfinite(declination_rad):
         return 0.0
     s.declination_rad = declination_rad
