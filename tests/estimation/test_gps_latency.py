@@ -61,6 +61,21 @@ def test_without_velocities_it_is_unknown(flight: Flight) -> None:
     assert estimate_latency(between(flight.log, 0.0, 0.0)) is None
 
 
+def first_seconds(log: SampleLog, seconds: float) -> SampleLog:
+    imu, baro, gps = (
+        times_us <= seconds * 1e6
+        for times_us in (log.imu_time_us, log.baro_time_us, log.gps_time_us)
+    )
+    return SampleLog(
+        imu_time_us=log.imu_time_us[imu],
+        imu=log.imu[imu],
+        baro_time_us=log.baro_time_us[baro],
+        baro_alt_m=log.baro_alt_m[baro],
+        gps_time_us=log.gps_time_us[gps],
+        gps=log.gps[gps],
+    )
+
+
 def fused(name: str, flight: Flight, set_s: float) -> tuple[np.ndarray, float]:
     """Run a filter with a latency that is set; return its states and the latency in use at last."""
     reference = msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
@@ -87,6 +102,24 @@ def test_a_filter_corrects_what_is_set_wrong(flight: Flight, name: str) -> None:
 def test_a_filter_keeps_what_is_set_until_a_manoeuvre(flight: Flight, name: str) -> None:
     straight = replace(flight, log=between(flight.log, 0.0, 13.0))
     assert fused(name, straight, 0.3)[1] == 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+def test_python_finds_what_machine_code_does(name: str) -> None:
+    """Before everything is compiled, a filter flies as Python, turns and all."""
+    flight = simulated_flight(21, calibrated=True)
+    estimator = make_estimator(EstimationSettings(estimator=name, reference=flight.reference))
+    assert isinstance(estimator, KernelEstimator)
+    log = first_seconds(flight.log, 45.0)
+    machine, found = estimator.run(log), estimator.state
+    assert found.found_information > 0.0
+    kernels = estimator._kernels
+    python = {k: getattr(kernels, k).__wrapped__ for k in ("begin", "run")}
+    estimator._kernels = replace(kernels, **python)
+    estimator.reset()
+    np.testing.assert_allclose(estimator.run(log), machine, rtol=1e-6, atol=1e-6)
+    assert estimator.state.found_latency_s == pytest.approx(found.found_latency_s, abs=1e-6)
 
 
 @pytest.mark.slow

@@ -187,9 +187,10 @@ def best_fit(s: LatencyState, k: int) -> float:
     That is the largest eigenvalue of Davenport's matrix, as a root of its characteristic
     polynomial [1]_; it cannot be more than half of the squares, from where Newton's steps descend.
     """
-    B = s.lag_outer[k]
+    # Number by number: run as Python, a record has no row of a matrix.
+    B = s.lag_outer
     b00, b01, b02, b10, b11, b12, b20, b21, b22 = (
-        B[0], B[1], B[2], B[3], B[4], B[5], B[6], B[7], B[8],
+        B[k, 0], B[k, 1], B[k, 2], B[k, 3], B[k, 4], B[k, 5], B[k, 6], B[k, 7], B[k, 8],
     )  # fmt: skip
     norm_sq = b00 * b00 + b01 * b01 + b02 * b02 + b10 * b10 + b11 * b11 + b12 * b12
     norm_sq += b20 * b20 + b21 * b21 + b22 * b22
