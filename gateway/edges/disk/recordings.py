@@ -71,14 +71,17 @@ def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
 
 
 def list_recordings(folder: Path) -> list[Recording]:
-    """List the recordings of a folder, the newest last; none if there is no such folder."""
+    """List the recordings of a folder, the newest last; none if there is no such folder.
+
+    Two that ended in the same tick of the file system's clock stand by name.
+    """
     files: dict[str, list[Path]] = {}
     with contextlib.suppress(FileNotFoundError):
         for path in sorted(folder.iterdir()):
             if (match := _FILE_NAME.fullmatch(path.name)) and path.is_file():
                 files.setdefault(match["name"], []).append(path)
     found = [_describe(name, paths) for name, paths in files.items()]
-    return sorted(found, key=lambda recording: recording.modified_s)
+    return sorted(found, key=lambda recording: (recording.modified_s, recording.name))
 
 
 def find_recording(folder: Path, name: str) -> Recording:

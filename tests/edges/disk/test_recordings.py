@@ -35,6 +35,14 @@ def test_files_belong_to_recordings_oldest_first(folder: Path) -> None:
     assert list_recordings(folder / "none") == []
 
 
+def test_recordings_that_ended_in_one_tick_stand_by_name(tmp_path: Path) -> None:
+    for name in ("day-2_01.tlog", "day_01.tlog", "day-3_01.tlog"):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (1, 1))
+    assert [recording.name for recording in list_recordings(tmp_path)] == ["day", "day-2", "day-3"]
+    assert find_recording(tmp_path, "last").name == "day-3"
+
+
 def test_rename_takes_all_files(folder: Path) -> None:
     renamed = rename_recording(folder, "b", "new one")
     assert [path.name for path in renamed.files] == [
