@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.processes import CONFIG, Client, Gateway, MavProxy
+from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway, MavProxy
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def start_gateway(tmp_path: Path) -> Iterator[Callable[..., Gateway]]:
     for gateway in started:
         if gateway.process.poll() is None:
             gateway.process.kill()
-            gateway.process.wait(10)
+            gateway.process.wait(START_LIMIT_S)
 
 
 @pytest.fixture

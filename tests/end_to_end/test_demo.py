@@ -13,8 +13,11 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 
 HOME = SimulatorSettings()
-NEAR_DEG = 0.001
-"""Standing on the runway: about 100 m."""
+NEAR_DEG = 0.004
+"""The whole simulated flight; how much of it has been flown by then depends on the machine."""
+HIGH_M = 100.0
+STEEPEST_DEG, FASTEST_CLIMB_MPS = 50.0, 8.0
+"""Of the simulated flight."""
 
 EXPECTED = {
     "HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "ATTITUDE_QUATERNION", "ATTITUDE",
@@ -61,7 +64,7 @@ async def test_mavsdk_sees_vehicle_attitude_and_position(
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
         telemetry = TelemetryAsync(system)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(START_LIMIT_S):
             async for place in telemetry.subscribe_position():
                 if math.isfinite(place.latitude_deg):
                     break
@@ -69,9 +72,9 @@ async def test_mavsdk_sees_vehicle_attitude_and_position(
             speeds = await anext(telemetry.subscribe_fixedwing_metrics())
     assert place.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     assert place.longitude_deg == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
-    assert place.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=20.0)
-    assert abs(attitude.roll_deg) < 10.0
-    assert abs(speeds.climb_rate_m_s) < 3.0
+    assert place.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=HIGH_M)
+    assert abs(attitude.roll_deg) < STEEPEST_DEG
+    assert abs(speeds.climb_rate_m_s) < FASTEST_CLIMB_MPS
 
 
 def test_mavproxy_sees_vehicle_attitude_and_position(
@@ -85,5 +88,5 @@ def test_mavproxy_sees_vehicle_attitude_and_position(
     assert int(place[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     assert int(place[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
     attitude = proxy.until(r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),")
-    assert abs(float(attitude[1])) < 0.2
-    assert abs(float(attitude[2])) < 0.2
+    assert abs(float(attitude[1])) < math.radians(STEEPEST_DEG)
+    assert abs(float(attitude[2])) < math.radians(STEEPEST_DEG)

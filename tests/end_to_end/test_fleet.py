@@ -6,7 +6,6 @@ The civil clocks of two of them are wrong by years; nothing of it may matter.
 import asyncio
 import json
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -21,8 +20,9 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 
 from gateway.cli.support.warm_up import make_ready
 from gateway.estimation.select import EstimationSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, free_udp_ports
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.test_ground_stations import WAYPOINTS
+from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -78,15 +78,13 @@ def wrong_clock(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) -> Iterator[Fleet]:
     folder = tmp_path_factory.mktemp("fleet")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    place = f"tcp/127.0.0.1:{free_port()}"
     # Once for all: three sites that compile at the same time would take minutes.
     compiling = make_ready(EstimationSettings().estimator)
     while compiling is not None and compiling.take_one():
         pass
     running: dict[str, Gateway] = {}
-    ports = free_udp_ports(3)
+    ports = free_ports(3)
     words = [sys.executable, "-m", "gateway.cli", "fleet", "--listen", place, "--site", "field-*"]
     for port in ports:
         words += ["--endpoint", f"udp:127.0.0.1:{port}"]
@@ -99,7 +97,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) ->
     finally:
         for each in (process, *(gateway.process for gateway in running.values())):
             each.kill()
-            each.wait(10)
+            each.wait(START_LIMIT_S)
 
 
 def start_site(folder: Path, place: str, site: str, wrong_clock: Path | None) -> Gateway:
@@ -137,7 +135,7 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
             for system_id in systems:
                 await asyncio.to_thread(mavproxy.until, rf"Detected vehicle {system_id}:1")
             first, second, third = (systems[ids[site]] for site in SITES)
-            async with asyncio.timeout(60):
+            async with asyncio.timeout(START_LIMIT_S):
                 params = [ParamAsync(system) for system in (first, second, third)]
                 name = "SENS_ACC_CUTOFF"
                 before = [await param.get_param_float(name) for param in params]
@@ -148,13 +146,13 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
             mavproxy.type("wp load way.txt")
             found = r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED"
             await asyncio.to_thread(mavproxy.until, found)
-            async with asyncio.timeout(60):
+            async with asyncio.timeout(START_LIMIT_S):
                 missions = [MissionRawAsync(system) for system in (first, second, third)]
                 items = [await mission.download_mission() for mission in missions]
             assert [len(found) for found in items] == [0, 0, 2]
     finally:
         mavproxy.process.kill()
-        mavproxy.process.communicate(timeout=10)
+        mavproxy.process.communicate(timeout=START_LIMIT_S)
 
 
 def test_clocks_that_are_wrong_by_years(

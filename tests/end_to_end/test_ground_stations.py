@@ -94,7 +94,7 @@ async def with_mavsdk(gateway: Gateway, use: Callable) -> None:
     async with Mavsdk(configuration) as mavsdk:
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(START_LIMIT_S):
             await use(system)
 
 
@@ -240,4 +240,4 @@ def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
         assert "breach" not in mavproxy.output
     finally:
         mavproxy.process.kill()
-        mavproxy.process.communicate(timeout=10)
+        mavproxy.process.communicate(timeout=START_LIMIT_S)

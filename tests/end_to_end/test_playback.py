@@ -17,8 +17,10 @@ from gateway.cli.app import app
 from gateway.edges.operator.control_socket import request
 from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, free_udp_ports
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.test_demo import NEAR_DEG
 from tests.flightlog.frames import START_US, make_tlog
+from tests.ports import free_port
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -65,7 +67,7 @@ class Playing:
     """A running `mavgate play`."""
 
     def __init__(self, folder: Path, *arguments: str, port: int = 0) -> None:
-        self.port = port or free_udp_ports(1)[0]
+        self.port = port or free_port()
         self.socket = folder / "mavgate" / "play.sock"
         environment = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
         self.process = subprocess.Popen(
@@ -96,7 +98,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Playing]]:
 def test_a_client_gets_every_frame_byte_for_byte(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     client = connect(port)
     playing = play(str(tlog), "--speed", "50", port=port)
     frames = [client.sock.recv(2048) for _ in RECORDS]
@@ -107,7 +109,7 @@ def test_a_client_gets_every_frame_byte_for_byte(
 def test_an_attached_player_ends_when_its_parent_is_gone(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     client = connect(port)
     playing = play(str(tlog), "--loop", "--attached", port=port)
     assert client.sock.recv(2048)
@@ -120,7 +122,7 @@ def test_an_attached_player_ends_when_its_parent_is_gone(
 def test_a_paused_player_is_steered_by_its_socket(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     client = connect(port)
     playing = play(str(tlog), "--loop", "--from", "0:10", port=port)
     client.until(lambda seen: "HOME_POSITION" in seen)
@@ -135,7 +137,7 @@ def test_a_paused_player_is_steered_by_its_socket(
 def test_two_recordings_fly_as_two_vehicles(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     client = connect(port)
     play(str(tlog), str(tlog), "--as", "3", "--as", "7", "--speed", "10", port=port)
     systems: set[int] = set()
@@ -146,7 +148,7 @@ def test_two_recordings_fly_as_two_vehicles(
 def test_a_recorded_vehicle_answers_a_ground_station(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     client = connect(port)
     play(str(tlog), port=port)
     _, address = client.sock.recvfrom(2048)
@@ -210,7 +212,7 @@ async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., 
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
         telemetry = TelemetryAsync(system)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(START_LIMIT_S):
             place = await anext(telemetry.subscribe_position())
             home = await anext(telemetry.subscribe_home())
     assert place.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
@@ -235,12 +237,12 @@ async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
     async with Mavsdk(configuration) as mavsdk:
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(START_LIMIT_S):
             place = await anext(TelemetryAsync(system).subscribe_position())
     home = SimulatorSettings()
-    assert place.latitude_deg == pytest.approx(home.home_lat_deg, abs=0.001)
+    assert place.latitude_deg == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
     playing.process.terminate()
-    playing.process.wait(10)
+    playing.process.wait(START_LIMIT_S)
     viewing = play(str(tmp_path / "mav.tlog"), "--loop")
     folder = tmp_path / "viewer"
     folder.mkdir()
@@ -251,4 +253,4 @@ async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
     finally:
         viewer.process.kill()
         viewer.process.communicate()
-    assert int(found[1]) / 1e7 == pytest.approx(home.home_lat_deg, abs=0.001)
+    assert int(found[1]) / 1e7 == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)

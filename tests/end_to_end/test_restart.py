@@ -16,6 +16,7 @@ from gateway.daemon import Daemon
 from gateway.routing.hub_settings import HubSettings
 from gateway.simulator.receiver import simulate
 from tests.end_to_end.station import Station
+from tests.ports import free_port
 from tests.vehicle.services.missions.test_mission import RALLY, content, download, item, upload
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -61,8 +62,7 @@ def hear_of_trouble(port: int) -> list[str]:
 
 async def run(folder: Path, use: Callable[[int], Any]) -> Any:
     """Let the gateway run for as long as somebody uses its TCP port."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     settings = GatewaySettings(
         hub=HubSettings(endpoints=(f"tcp-listen:127.0.0.1:{port}",)),
         aircraft_folder=str(folder / "aircraft"),

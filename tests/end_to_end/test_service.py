@@ -12,7 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.operator.control_socket import ControlError, request, socket_path
-from tests.end_to_end.processes import CONFIG, Client, Gateway, free_udp_ports
+from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway
+from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -62,7 +63,7 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert told(systemd) == b"READY=1"
     steady = connect(gateway.port)
     steady.until(lambda seen: "ATTITUDE_QUATERNION" in seen)
-    extra, metrics = free_udp_ports(2)
+    extra, metrics = free_ports(2)
     numbers: list[int] = []
     settings = tmp_path / "gateway.toml"
 
@@ -81,7 +82,8 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     newcomer = connect(extra)
     seen = newcomer.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
     assert "ATTITUDE" not in seen
-    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=10) as page:
+    place = f"http://127.0.0.1:{metrics}/metrics"
+    with urllib.request.urlopen(place, timeout=START_LIMIT_S) as page:
         text = page.read().decode()
     assert f'remote="127.0.0.1:{extra}"' in text
     settings.write_text("[hub]\nendpoints = 7\n")
@@ -160,7 +162,7 @@ def test_orders_reach_the_hub(
     gateway = start_gateway("demo")
     connect(gateway.port).until(lambda seen: "HEARTBEAT" in seen)
     control = socket_path("run")
-    (extra,) = free_udp_ports(1)
+    extra = free_port()
     url = f"udp:127.0.0.1:{extra}?name=tablet&allow=HEARTBEAT"
     assert url in request(control, "clients.add", {"url": url})
     newcomer = connect(extra)

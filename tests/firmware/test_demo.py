@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.processes import Client, Gateway
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -16,7 +16,7 @@ def gateway(programs: Path, tmp_path: Path) -> Iterator[Gateway]:
     yield started
     if started.process.poll() is None:
         started.process.kill()
-        started.process.wait(10)
+        started.process.wait(START_LIMIT_S)
 
 
 def test_a_ground_station_sees_the_vehicle(gateway: Gateway) -> None:

@@ -1,7 +1,6 @@
 """A fleet that is a router, sites behind it with real sessions, and one ground station."""
 
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from gateway.cli.app import app
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
 from gateway.routing.hub_settings import HubSettings
-from tests.edges.hub.conftest import Rig, Sender, Station, rig
+from tests.edges.hub.conftest import LIMIT_S, Rig, Sender, Station, rig
+from tests.ports import free_port
 
 __all__ = ["rig"]
 
@@ -62,7 +62,7 @@ class World:
             self.got += reader.parse_buffer(data) or []
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(LIMIT_S):
             while not condition():
                 self.rig.clock.us += 100_000
                 self.say()
@@ -88,11 +88,8 @@ async def run(*words: str) -> str:
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    with socket.socket() as place:
-        place.bind(("127.0.0.1", 0))
-        port = place.getsockname()[1]
     return FleetSettings(
-        listen=f"tcp/127.0.0.1:{port}",
+        listen=f"tcp/127.0.0.1:{free_port()}",
         sites=("field-*",),
         ids_file=str(tmp_path / "fleet.json"),
         site=(SiteSettings(name="field-s", passphrase="secret"),),
@@ -105,7 +102,7 @@ async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
     await fleet.start()
     station = rig.station(fleet._hub.listening_ports()[0])
     world = World(rig, fleet, settings.listen, station)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(LIMIT_S):
         while not fleet._session.is_open:
             await asyncio.sleep(0.01)
     yield world

@@ -1,7 +1,6 @@
 """The router of docs/fleet.md as it stands there: a site writes its own keys only."""
 
 import re
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 
 from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+from tests.ports import free_port
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -57,9 +57,7 @@ def written(folder: Path, number: int, **names: str) -> Path:
 @pytest.fixture
 def join(keys: Path) -> Iterator[Callable[[str], Any]]:
     """Open the router, then a session for whoever has a certificate."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        place = f"tls/localhost:{free.getsockname()[1]}"
+    place = f"tls/localhost:{free_port()}"
     opened = [open_session(session_config(place, str(written(keys, 1)), "router"))]
 
     def make(name: str) -> Any:

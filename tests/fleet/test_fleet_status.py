@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import socket
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 
 from gateway.edges.operator.control_socket import request
 from tests.fleet.conftest import World, run
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
@@ -41,8 +41,7 @@ async def test_round_trip_rate_and_table(world: World) -> None:
 async def test_metrics(world: World) -> None:
     world.open_site("field-a")
     await world.until(lambda: bool(world.systems()))
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     world.fleet._metrics.listen(port)
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")

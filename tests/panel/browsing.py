@@ -86,7 +86,7 @@ class Process:
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:
-            self.process.wait(15)
+            self.process.wait(WAIT_MS / 1000)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait(5)

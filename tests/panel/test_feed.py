@@ -11,7 +11,7 @@ from gateway.panel.serving.feed import GRANTS, TelemetryFeed
 from gateway.panel.state.fleet_picture import FleetPicture
 from tests.panel.messages import position
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 
 
 class Browser:

@@ -234,11 +234,11 @@ def test_silent_node_is_a_banner_over_every_view_and_an_event(desk: Desk) -> Non
     desk.receiver.has_gps = False
     expect(banner).to_be_visible()
     view = desk.view("events")
-    row = view.locator("tr", has_text="GPS node 1 silent")
+    row = view.locator("tr", has_text="GPS node 1 silent").first
     expect(row).to_contain_text("Critical")
     expect(row.locator("td").first).to_have_text(re.compile(r"\d\d:\d\d:\d\d"))
     desk.receiver.has_gps = True
-    expect(view.locator("tr", has_text="GPS node 1 is back")).to_be_visible()
+    expect(view.locator("tr", has_text="GPS node 1 is back").first).to_be_visible()
     expect(banner).to_have_count(0)
 
 

@@ -14,7 +14,7 @@ from gateway.panel.state.fleet_picture import FleetPicture, Origin
 from gateway.panel.uplink import SYSTEM_ID, Uplink
 
 pytestmark = pytest.mark.io
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 PLAYED = 249
 
 

@@ -7,6 +7,8 @@ import threading
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.ports import free_port
+
 RATE_HZ = 20
 
 
@@ -15,9 +17,7 @@ class ToldVehicle(threading.Thread):
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port: int = probe.getsockname()[1]
+        self.port = free_port()
         self.kind = mavlink.MAV_TYPE_FIXED_WING
         self.roll_deg = self.pitch_deg = self.heading_deg = 0.0
         self.alt_home_m, self.home_alt_m = 60.0, 431.0

@@ -51,7 +51,7 @@ class Played:
 async def test_it_plays_to_the_end_by_itself(tlog: Path) -> None:
     played = Played(tlog, GatewayClock(), speed=math.inf)
     played.edge.start()
-    await asyncio.wait_for(played.ended.wait(), 10)
+    await asyncio.wait_for(played.ended.wait(), 60)
     assert played.frames == FRAMES
     status = played.edge.status()
     assert (status.state, status.sent, status.speed) == ("ended", COUNT, None)

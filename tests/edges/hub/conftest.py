@@ -13,8 +13,11 @@ from gateway.records import Incoming, Outgoing
 from gateway.routing.hub_settings import HubSettings
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import message_id_of, restamp
+from tests.ports import free_port
 
 STATION = 190
+LIMIT_S = 60.0
+"""Until a test is given up: what it waits for takes a moment, on a busy machine some seconds."""
 
 
 class Clock:
@@ -71,12 +74,13 @@ class Station:
         self.sender = Sender(255, STATION)
         self.socket = socket.socket(socket.AF_INET, kind)
         self.socket.setblocking(False)
-        self.socket.bind(("127.0.0.1", 0))
-        self.port: int = self.socket.getsockname()[1]
+        self.port = free_port()
+        self.socket.bind(("127.0.0.1", self.port))
         self.target = ("127.0.0.1", target) if target else None
 
     async def receive(self) -> bytes:
-        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(self.socket, 65535), 5)
+        async with asyncio.timeout(LIMIT_S):
+            return await asyncio.get_running_loop().sock_recv(self.socket, 65535)
 
     def is_silent(self) -> bool:
         try:
@@ -134,7 +138,7 @@ class Rig:
         hub._tick()
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(LIMIT_S):
             while not condition():
                 await asyncio.sleep(0)
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from tests.edges.hub.conftest import LIMIT_S
+
 pytestmark = pytest.mark.io
 
 GROUP = "239.255.145.50"
@@ -36,7 +38,7 @@ def source_address() -> str:
 
 
 async def receive(sock: socket.socket) -> tuple[bytes, tuple[str, int]]:
-    return await asyncio.wait_for(asyncio.get_running_loop().sock_recvfrom(sock, 4096), 5)
+    return await asyncio.wait_for(asyncio.get_running_loop().sock_recvfrom(sock, 4096), LIMIT_S)
 
 
 async def test_multicast_both_ways_and_nothing_comes_back(rig: Any) -> None:

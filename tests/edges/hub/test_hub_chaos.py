@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from gateway.records import ClientInterval
+from tests.ports import free_ports
 
 pytestmark = pytest.mark.io
 
@@ -21,6 +22,7 @@ class Chaos:
         self.rng = random.Random(seed)
         self.hub = rig.hub("udp-listen:127.0.0.1:0", "tcp-listen:127.0.0.1:0", max_clients=4)
         self.udp_port, self.tcp_port = self.hub.listening_ports()
+        self.nobody = free_ports(10)
         self.callers: list[Any] = []
         self.tcp: list[socket.socket] = []
         self.autopilot = rig.sender(42, 1)
@@ -77,7 +79,7 @@ class Chaos:
             client.close()
 
     async def add(self) -> None:
-        port = self.rng.randrange(40000, 40010)
+        port = self.rng.choice(self.nobody)
         kind = self.rng.choice(("udp", "tcp"))
         options = self.rng.choice(("", "?deny=ATTITUDE", "?rate=RAW_IMU:5", "?pack=200"))
         place = f"{kind}:127.0.0.1:{port}"

@@ -2,7 +2,6 @@
 
 import asyncio
 import itertools
-import socket
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of
+from tests.ports import free_ports
 from tests.vehicle.samples import sample_at, state_at
 
 pytestmark = pytest.mark.io
@@ -48,18 +48,12 @@ class Gateway:
         self.perform(self.vehicle.poll(now_us))
 
 
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 class Joined:
     """Two gateways, each calling the other, and a station at the second."""
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        ports = [_free_port(), _free_port()]
+        ports = free_ports(2)
         self.first, self.second = (
             Gateway(rig, system, f"udp-listen:127.0.0.1:{here}", f"udp:127.0.0.1:{there}")
             for system, here, there in ((1, *ports), (2, *reversed(ports)))

@@ -11,6 +11,7 @@ from gateway.records import ClientInterval
 from gateway.routing.probe import PROBE_COMPONENT
 from gateway.wire.mavlink_signing import Signer
 from gateway.wire.mavlink_splitter import MavlinkSplitter, is_signed, message_id_of, restamp
+from tests.edges.hub.conftest import LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -91,7 +92,7 @@ async def test_what_overtakes_in_a_queue_leaves_the_stamps_in_order(rig: Any) ->
         hub.send(rig.out(rig.vehicle.attitude()))
     splitter, receiver, kinds = MavlinkSplitter(), Strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
-        data = await asyncio.wait_for(loop.sock_recv(client, 65536), 5)
+        data = await asyncio.wait_for(loop.sock_recv(client, 65536), LIMIT_S)
         kinds += [receiver.read(frame)[0] for frame in splitter.feed(data)]
     assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
 

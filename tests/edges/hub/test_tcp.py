@@ -12,6 +12,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from gateway.routing.client_table import SILENT_AFTER_US
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
+from tests.edges.hub.conftest import LIMIT_S
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
@@ -24,10 +26,15 @@ async def connect(rig: Any, port: int) -> socket.socket:
     return client
 
 
+async def receive(client: socket.socket) -> bytes:
+    async with asyncio.timeout(LIMIT_S):
+        return await asyncio.get_running_loop().sock_recv(client, 65536)
+
+
 async def read_frames(client: socket.socket, count: int) -> list[bytes]:
     splitter, frames = MavlinkSplitter(), []
     while len(frames) < count:
-        data = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(client, 4096), 5)
+        data = await receive(client)
         assert data
         frames += splitter.feed(data)
     return frames
@@ -61,7 +68,7 @@ class TestTcpListen:
         for _ in range(2):
             await connect(rig, hub.listening_ports()[0])
         third = await connect(rig, hub.listening_ports()[0])
-        assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(third, 1), 5) == b""
+        assert await receive(third) == b""
         assert len(hub.clients()) == 2
 
     async def test_a_stalled_client_loses_its_own_oldest_telemetry(self, rig: Any) -> None:
@@ -80,8 +87,7 @@ class TestTcpListen:
             data = await asyncio.get_running_loop().sock_recv(lively, 65536)
             got += splitter.feed(data)
         while len(got) < sent + 1:
-            data = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(lively, 65536), 5)
-            got += splitter.feed(data)
+            got += splitter.feed(await receive(lively))
         slow, fast = hub.clients()
         assert (fast.sent, fast.dropped) == (sent + 1, 0)
         assert [frame[4] for frame in got] == [n & 0xFF for n in range(sent + 1)]
@@ -104,9 +110,7 @@ class TestTcpOut:
             sock.bind(address)
             await connect(sock, address)
 
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
+        port = free_port()
         monkeypatch.setattr(loop, "sock_connect", from_there)
         hub = rig.hub(f"tcp:127.0.0.1:{port}")
         await rig.until(lambda: hub.clients()[0].state in ("refused", "open"))
@@ -115,18 +119,15 @@ class TestTcpOut:
     async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
         self, rig: Any
     ) -> None:
-        with socket.socket() as place:
-            place.bind(("127.0.0.1", 0))
-            port = place.getsockname()[1]
+        port = free_port()
         hub = rig.hub(f"tcp:127.0.0.1:{port}")
         await rig.until(lambda: hub.clients()[0].state == "refused")
         for _ in range(2):
             with socket.create_server(("127.0.0.1", port)) as server:
                 server.setblocking(False)
                 rig.clock.us += 2_000_000
-                connection, _ = await asyncio.wait_for(
-                    asyncio.get_running_loop().sock_accept(server), 5
-                )
+                async with asyncio.timeout(LIMIT_S):
+                    connection, _ = await asyncio.get_running_loop().sock_accept(server)
             await rig.until_open(hub)
             frame = rig.vehicle.attitude()
             hub.send(rig.out(frame))

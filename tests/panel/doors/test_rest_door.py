@@ -33,6 +33,7 @@ from gateway.routing.hub_settings import HubSettings
 
 pytestmark = pytest.mark.io
 
+LIMIT_S = 60.0
 ATTITUDE = "/v1/mavlink/vehicles/1/components/1/messages/ATTITUDE"
 
 
@@ -55,7 +56,7 @@ class World:
         self.send(mavlink.MAVLink_attitude_message(5, roll, 0.25, 0, 0, 0, 0))
 
     async def until_json(self, path: str, value: Any) -> None:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while (answer := await self.client.get(path)).text != json.dumps(value):
                 assert answer.status_code in (200, 404)
                 await asyncio.sleep(0.01)
@@ -66,7 +67,7 @@ class World:
         return [message for message in found if message.get_type() == "COMMAND_LONG"]
 
     async def until_commanded(self) -> Any:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while not self.commands():
                 await asyncio.sleep(0.01)
         return self.commands()[-1]
@@ -94,10 +95,10 @@ async def open_world(folder: Path, settings: PanelSettings) -> AsyncIterator[Wor
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     uplink.start()
     url = f"127.0.0.1:{sock.getsockname()[1]}"
-    async with httpx.AsyncClient(base_url=f"http://{url}", timeout=20) as client:
+    async with httpx.AsyncClient(base_url=f"http://{url}", timeout=LIMIT_S) as client:
         world = World(hub, heard, url, client, mavlink.MAVLink(None, 1, 1))
         world.send(mavlink.MAVLink_heartbeat_message(1, 0, 81, 0, 4, 3))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while not hub.clients():
                 await asyncio.sleep(0.01)
         yield world
@@ -260,7 +261,7 @@ class TestFollowing:
 
     @staticmethod
     async def until_followed(world: World, stream: Any) -> None:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while True:
                 world.attitude(-1.0)
                 with suppress(TimeoutError):

@@ -13,7 +13,7 @@ from wsproto import ConnectionType, WSConnection
 from wsproto.events import AcceptConnection, BytesMessage, Event, Ping, Request
 
 from gateway.wire.mavlink_splitter import MavlinkSplitter
-from tests.edges.hub.conftest import Rig
+from tests.edges.hub.conftest import LIMIT_S, Rig
 
 
 @pytest.fixture(scope="session")
@@ -65,7 +65,7 @@ class Page:
     async def take(self) -> bool:
         """Take what comes next; tell whether anything came before the end."""
         try:
-            data = await asyncio.wait_for(self.reader.read(65536), 10)
+            data = await asyncio.wait_for(self.reader.read(65536), LIMIT_S)
         except ConnectionError:
             # The hub closed while something of ours was still unread.
             return False
@@ -81,7 +81,7 @@ class Page:
         return True
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(LIMIT_S):
             while not condition():
                 assert await self.take()
 
@@ -92,7 +92,7 @@ class Page:
 
     async def end(self) -> None:
         """Read until the server has closed."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(LIMIT_S):
             while await self.take():
                 pass
 
@@ -139,6 +139,6 @@ def plug(rig: Rig) -> Callable[..., Any]:
 async def hung_up(sock: socket.socket) -> bool:
     """Tell whether the hub closes a bare connection without a word."""
     try:
-        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), 10) == b""
+        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), LIMIT_S) == b""
     except ConnectionError:
         return True

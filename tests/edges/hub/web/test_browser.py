@@ -10,7 +10,7 @@ import pytest
 from playwright.async_api import Page, async_playwright
 from pymavlink.dialects.v20 import common as dialect
 
-from tests.edges.hub.conftest import Rig
+from tests.edges.hub.conftest import LIMIT_S, Rig
 
 CHROMIUM = shutil.which("chromium")
 PROGRAMS = Path(__file__).resolve().parents[4] / "docs" / "programs.md"
@@ -59,7 +59,7 @@ async def colour(page: Page, x: int, y: int) -> list[int]:
 
 
 async def until_colour(page: Page, place: tuple[int, int], wanted: list[int]) -> None:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(LIMIT_S):
         while await colour(page, *place) != wanted:
             await asyncio.sleep(0.01)
 
@@ -92,7 +92,7 @@ async def test_a_page_of_elsewhere_sees_nothing(rig: Rig, page: Page) -> None:
     """The browser itself tells whose page it is; an opened file and a sandbox are nobody's."""
     hub = rig.hub("ws-listen:127.0.0.1:0")
     await page.set_content(documented_page(hub.listening_ports()[0]))
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(LIMIT_S):
         while not await page.evaluate("socket.readyState === WebSocket.CLOSED"):
             await asyncio.sleep(0.01)
     assert not hub.clients()

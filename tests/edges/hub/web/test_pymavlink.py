@@ -1,7 +1,6 @@
 """pymavlink's own WebSockets as the other end, both ways."""
 
 import asyncio
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,14 +8,15 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from tests.edges.hub.conftest import Rig
+from tests.edges.hub.conftest import LIMIT_S, Rig
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
 
 async def receive(link: Any, kind: str) -> Any:
     """Wait in a thread of its own, since pymavlink blocks."""
-    return await asyncio.to_thread(link.recv_match, type=kind, blocking=True, timeout=10)
+    return await asyncio.to_thread(link.recv_match, type=kind, blocking=True, timeout=LIMIT_S)
 
 
 async def test_it_calls(rig: Rig) -> None:
@@ -60,9 +60,7 @@ async def test_it_calls_within_tls(
 
 
 async def test_it_serves(rig: Rig) -> None:
-    with socket.socket() as place:
-        place.bind(("127.0.0.1", 0))
-        port = place.getsockname()[1]
+    port = free_port()
     server = mavutil.mavlink_connection(f"wsserver:127.0.0.1:{port}", source_system=9)
     try:
         hub = rig.hub(f"ws:127.0.0.1:{port}")

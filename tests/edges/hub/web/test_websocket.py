@@ -15,7 +15,7 @@ from wsproto.events import CloseConnection, RejectConnection, TextMessage
 
 from gateway.routing.hub_settings import HubSettings
 from gateway.wire.mavlink_splitter import message_id_of
-from tests.edges.hub.conftest import Rig
+from tests.edges.hub.conftest import LIMIT_S, Rig
 from tests.edges.hub.web.conftest import hung_up
 
 pytestmark = pytest.mark.io
@@ -151,7 +151,7 @@ class TestTrouble:
         sock = await plug(hub.listening_ports()[0], room_bytes=4096)
         await self.shake_hands(rig, hub, sock)
         ping = b"\x89\xfd" + bytes(4 + 125)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while hub.clients():
                 try:
                     await asyncio.get_running_loop().sock_sendall(sock, ping * 30)
@@ -329,7 +329,7 @@ class TestTls:
         page.reader._transport.resume_reading()
         (slow,) = hub.clients()
         got = 0
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(LIMIT_S):
             while got < slow.sent:
                 await page.take()
                 got = sum(len(data) for data in page.messages) // len(rig.vehicle.raw_imu())
