@@ -5,7 +5,8 @@ import multiprocessing
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool
 from typing import Any, Final
 
@@ -41,11 +42,43 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
         yield pool
 
 
-def begin_copy(work: Callable[[Any], None], argument: Any) -> None:
-    """Call a function in a background process, which ends with this one at the latest."""
-    process = multiprocessing.Process(target=_begin, args=(work, argument), daemon=True)
+def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connection:
+    """Call a function in a background process, which sends what it makes.
+
+    Parameters
+    ----------
+    work : callable
+        Called there with the argument and with what it sends by. It ends where it sends and nobody
+        can receive any more, also if this process is killed.
+    argument : object
+        In a forked process it need not be picklable.
+
+    Returns
+    -------
+    Connection
+        What the other process sends; its end is that of the process.
+    """
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.Process(
+        target=_begin, args=(_send, work, argument, sender, receiver), daemon=True
+    )
     with no_warning_of_threads():
         process.start()
+    # So that the pipe ends with that process.
+    sender.close()
+    return receiver
+
+
+def _send(
+    work: Callable[[Any, Connection], None],
+    argument: Any,
+    sender: Connection,
+    receiver: Connection,
+) -> None:
+    # So that sending fails, and does not wait for ever, once nobody receives.
+    receiver.close()
+    with suppress(BrokenPipeError):
+        work(argument, sender)
 
 
 def _begin(work: Callable[..., None], *arguments: Any) -> None:

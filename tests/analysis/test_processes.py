@@ -1,7 +1,13 @@
 """Forked processes: what they leave alone."""
 
 import gc
+import os
+import select
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
@@ -49,3 +55,36 @@ def test_a_worker_collects_nothing_that_its_parent_left() -> None:
 def test_a_copy_collects_nothing_that_its_parent_left() -> None:
     with copies(1, lambda: None) as pool:
         assert pool.map(collect, [0]) == [[]]
+
+
+PARENT = """
+import multiprocessing, time
+from gateway.analysis.processes import begin_copy
+
+def send_without_end(_, sender):
+    while True:
+        sender.send(bytes(100_000))
+
+receivers = [begin_copy(send_without_end, None) for _ in range(2)]
+print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+time.sleep(3600.0)
+"""
+
+
+@pytest.mark.io
+def test_copies_end_with_a_parent_that_is_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        children = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
+        try:
+            parent.send_signal(signal.SIGKILL)
+            assert len(children) == 2
+            for child in children:
+                assert select.select([child], [], [], 60.0)[0]
+        finally:
+            for child in children:
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(child, signal.SIGKILL)
+                os.close(child)

@@ -86,7 +86,7 @@ def test_without_a_compiler_it_goes_on_as_python(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(warm_up, "_compile", lambda _: os.kill(os.getpid(), signal.SIGKILL))
+    monkeypatch.setattr(warm_up, "_compile", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     compiling = make_ready("paper")
     assert compiling is not None
     assert not compiling.take_one()

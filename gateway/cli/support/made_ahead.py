@@ -3,9 +3,7 @@
 import logging
 import signal
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import islice
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -31,11 +29,7 @@ def made_ahead(frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
     iterator of TimedFrame
         The same frames.
     """
-    receiver, sender = Pipe(duplex=False)
-    begin_copy(_make, (frames, sender, receiver))
-    # So that the pipe ends with that process.
-    sender.close()
-    return _take(receiver)
+    return _take(begin_copy(_make, frames))
 
 
 def _take(receiver: Connection) -> Iterator[TimedFrame]:
@@ -50,12 +44,8 @@ def _take(receiver: Connection) -> Iterator[TimedFrame]:
                 yield TimedFrame(time_s, data, damaged)
 
 
-def _make(task: tuple[Iterator[TimedFrame], Connection, Connection]) -> None:
-    frames, sender, receiver = task
-    # So that sending fails once nobody takes the frames.
-    receiver.close()
+def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
     # A terminal's Ctrl+C is for the gateway, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(BrokenPipeError):
-        while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
-            sender.send(made)
+    while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
+        sender.send(made)

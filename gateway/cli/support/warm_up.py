@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -85,11 +84,8 @@ class Compilation:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._receiver, sender = Pipe(duplex=False)
         self._missing = {(name, k) for name in names for k in range(len(ENTRY_POINTS[name]))}
-        begin_copy(_compile, (names, sender))
-        # So that the pipe ends with that process.
-        sender.close()
+        self._receiver = begin_copy(_compile, names)
 
     def watch(self) -> None:
         """Take the machine code as it comes; needs a running event loop."""
@@ -117,8 +113,7 @@ class Compilation:
         return True
 
 
-def _compile(task: tuple[Sequence[str], Connection]) -> None:
-    names, sender = task
+def _compile(names: Sequence[str], sender: Connection) -> None:
     # The parent reports an interrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     os.nice(BEHIND)
