@@ -10,7 +10,6 @@ whole time, is a loop that only wakes up.
 
 import argparse
 import asyncio
-import gc
 import os
 import socket
 import subprocess
@@ -76,9 +75,7 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
     line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
     daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
     watch.install()
-    with loop_comes_first():
-        daemon.start()
-        gc.freeze()
+    with loop_comes_first(daemon.start):
         watch.restart()
         try:
             await asyncio.sleep(seconds)

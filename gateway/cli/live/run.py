@@ -120,10 +120,7 @@ async def serve(
     _reload_on_hangup(daemon)
     if compiling is not None:
         compiling.watch()
-    with loop_comes_first():
-        daemon.start()
-        # What the start has loaded, the library of the metrics for one, is there to stay as well.
-        gc.freeze()
+    with loop_comes_first(daemon.start):
         if panel is not None:
             panel.start(daemon.control_socket)
         try:
@@ -138,17 +135,19 @@ async def serve(
 
 
 @contextmanager
-def loop_comes_first() -> Iterator[None]:
-    """Prevent what would stop the event loop, once all that it needs is there."""
-    # Freeze what exists by now: a full garbage collection of it stops telemetry for 0.1 s.
-    gc.collect()
-    gc.freeze()
+def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
+    """Start something on the event loop, and prevent what would stop the loop afterwards."""
     # The threads of the files may keep the interpreter for so long whenever the loop has let it go,
     # as it does with every frame that it sends; the default is 5 ms.
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
         with nothing_compiled():
+            start()
+            # All that exists by now is there to stay, as the library of the metrics that the start
+            # has loaded: a full garbage collection of it would stop telemetry for 0.1 s.
+            gc.collect()
+            gc.freeze()
             yield
     finally:
         sys.setswitchinterval(before)
