@@ -81,7 +81,7 @@ def run_eskf(flight: Flight) -> np.ndarray:
 
 def run_smoothed(flight: Flight) -> np.ndarray:
     """Run the Kalman filter from both ends."""
-    return smooth(estimator_of("eskf", flight), flight.log)
+    return smooth(estimator_of("eskf", flight), flight.log)[0]
 
 
 OWN: dict[str, Run] = {"paper": run_paper, "complementary": run_complementary, "eskf": run_eskf}

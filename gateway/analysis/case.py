@@ -36,6 +36,8 @@ class Case:
     """By estimator, and `SMOOTHED` if requested."""
     frame: LocalFrame | None
     """Metres about the first fix; None in a flight without GPS."""
+    smoothed_latency_s: float | None = None
+    """The GPS latency of the smoothed track; another than is set where the motion contradicts."""
 
     @property
     def chosen(self) -> str:
@@ -80,6 +82,7 @@ def make_case(
     fusion = fusion or flight.fusion
     sensed = sense(flight, fusion.sensing)
     tracks = {name: fuse(flight, with_estimator(fusion, name), sensed) for name in ESTIMATORS}
+    latency_s = None
     if smooth and not np.any(np.diff(flight.time_us) < 0):
-        tracks[SMOOTHED] = fuse_smoothed(flight, fusion)
-    return Case(flight, fusion, sensed, tracks, local_frame(flight))
+        tracks[SMOOTHED], latency_s = fuse_smoothed(flight, fusion)
+    return Case(flight, fusion, sensed, tracks, local_frame(flight), latency_s)

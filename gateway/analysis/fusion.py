@@ -108,7 +108,7 @@ def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> Flo
     return np.array([nav_row(state) for state in states], np.float64).reshape(-1, NAV_COLUMNS)
 
 
-def fuse_smoothed(flight: Flight, settings: FusionSettings) -> FlightTrack:
+def fuse_smoothed(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
     """Smooth a flight from both ends, over the Kalman filter.
 
     Parameters
@@ -120,15 +120,17 @@ def fuse_smoothed(flight: Flight, settings: FusionSettings) -> FlightTrack:
 
     Returns
     -------
-    FlightTrack
+    track : FlightTrack
         One row per IMU sample.
+    latency_s : float
+        The GPS latency that was used; see `smooth`.
     """
     estimation = msgspec.structs.replace(settings.estimation, estimator="eskf")
     estimator = make_estimator(estimation)
     if not isinstance(estimator, KernelEstimator):
         raise TypeError(f"{type(estimator)} cannot be smoothed")
-    out = smooth(estimator, sample_log(flight, estimator.fix_row))
-    return _track_of_rows(flight, out)
+    out, latency_s = smooth(estimator, sample_log(flight, estimator.fix_row))
+    return _track_of_rows(flight, out), latency_s
 
 
 def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog:

@@ -61,7 +61,7 @@ def withheld_error_m(case: Case, estimator: str) -> float:
     """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
     judge = make_judge(case.flight, withhold(case.flight, HOLD_OUT))
     if estimator == SMOOTHED:
-        track = fuse_smoothed(judge.fused, case.fusion)
+        track, _ = fuse_smoothed(judge.fused, case.fusion)
     else:
         track = fuse(judge.fused, with_estimator(case.fusion, estimator), case.sensed)
     return score(track, judge)["held_m"]

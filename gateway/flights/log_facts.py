@@ -18,7 +18,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, aircraft_of, is_table
-from gateway.flights.smoothed import gather_samples
+from gateway.flights.smoothed import gather_samples, smoothed_latency_in_words
 
 HEAD_LINES: Final = 20
 DOUBTFUL_S: Final = 0.03
@@ -99,6 +99,29 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
             f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
             f"but gps_latency_s is {set_s:.2f} s"
         )
+
+
+def note_smoothed_latency(
+    file: Path, table: RecordedTable, aircraft: AircraftSettings, used_s: float
+) -> AircraftSettings:
+    """Return the settings that a flight was smoothed with; a remark tells a latency not set.
+
+    Parameters
+    ----------
+    file : Path
+        For the remark.
+    table : RecordedTable
+        Its remarks are added to.
+    aircraft : AircraftSettings
+        What the flight was to be smoothed with.
+    used_s : float
+        The GPS latency that it was smoothed with; see `smooth_blocks`.
+    """
+    set_s = aircraft.estimation.reference.gps_latency_s
+    if used_s == set_s:
+        return aircraft
+    table.remarks.append(f"{file}: {smoothed_latency_in_words(used_s, set_s)}")
+    return with_reference(aircraft, gps_latency_s=used_s)
 
 
 def _samples_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:

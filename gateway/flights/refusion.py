@@ -16,7 +16,7 @@ from gateway.flightlog.table.table import TableBlock, TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.joined import joined_tables
-from gateway.flights.log_facts import aircraft_for
+from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
 from gateway.flights.reading import ReadOptions, RecordedTable, foreign_rows, is_table, open_rows
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
@@ -59,7 +59,10 @@ class Refusion:
         correct: Callable[[NavState], NavState] | None = None
         if smooth:
             self._aircraft = with_smoothed_estimator(self._aircraft)
-            correct = SmoothedStates(*smooth_blocks(_blocks_of(files, options), self._aircraft))
+            blocks = _blocks_of(files, options)
+            time_us, states, latency_s = smooth_blocks(blocks, self._aircraft)
+            self._aircraft = note_smoothed_latency(files[0], table, self._aircraft, latency_s)
+            correct = SmoothedStates(time_us, states)
         elif options.position == "interpolated":
             latency_s = self._aircraft.estimation.reference.gps_latency_s
             correct = InterpolatedPosition(_fixes_of(files, options), latency_s)

@@ -32,7 +32,7 @@ def with_smoothed_estimator(aircraft: AircraftSettings) -> AircraftSettings:
 
 def smooth_blocks(
     blocks: Iterable[TableBlock], aircraft: AircraftSettings
-) -> tuple[IntArray, FloatArray]:
+) -> tuple[IntArray, FloatArray, float]:
     """Smooth the rows of one aircraft.
 
     Parameters
@@ -48,6 +48,8 @@ def smooth_blocks(
         Of the IMU samples.
     states : ndarray, shape (n, NAV_COLUMNS)
         See `gateway.estimation.columns`.
+    latency_s : float
+        The GPS latency that was used; see `smooth`.
 
     Raises
     ------
@@ -57,7 +59,15 @@ def smooth_blocks(
     log, estimator = gather_samples(blocks, aircraft)
     if np.any(np.diff(log.imu_time_us) < 0):
         raise FlightError("its clock goes back, so it cannot be smoothed; cut it there")
-    return log.imu_time_us, smooth(estimator, log)
+    return log.imu_time_us, *smooth(estimator, log)
+
+
+def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
+    """Tell a GPS latency that a flight was smoothed with, and that was not set."""
+    return (
+        f"smoothed with a GPS latency of {used_s:.2f} s, which its manoeuvres show; "
+        f"gps_latency_s is {set_s:.2f} s"
+    )
 
 
 class SmoothedStates:

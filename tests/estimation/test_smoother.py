@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
     Run,
     attitude_scores,
+    estimator_of,
     outage_score,
     outage_scores,
     position_errors_m,
@@ -86,6 +88,27 @@ def test_it_beats_the_filter_most_of_all_in_outages(flight: Flight) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("set_s", "used_s"), [(0.2, 0.2), (0.4, 0.16)])
+def test_one_latency_holds_for_the_whole_flight(
+    flight: Flight, set_s: float, used_s: float
+) -> None:
+    """The filter finds it on the way; the smoother knows it from the beginning."""
+    set_so = replace(
+        flight, reference=msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
+    )
+    found, latency_s = smooth(estimator_of("eskf", set_so), flight.log)
+    assert latency_s == pytest.approx(used_s, abs=0.0 if set_s == used_s else 0.015)
+    right = run_smoothed(flight)
+    early = replace(flight, counts=flight.counts & (flight.log.imu_time_us < 80e6))
+    off_m, right_off_m = (
+        rms(position_errors_m(early, out)[early.counts]) for out in (found, right)
+    )
+    assert off_m < right_off_m + 0.3
+    off_deg, right_deg = (attitude_scores(early, out[:, :4])["total"] for out in (found, right))
+    assert off_deg < right_deg + 0.2
+
+
+@pytest.mark.slow
 def test_it_beats_the_filter_without_gps_too(flight: Flight) -> None:
     """The filter then takes corrections back as soon as a flight shows, which ends nothing."""
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
@@ -129,9 +152,9 @@ def test_a_place_that_begins_anew_leaves_the_attitude_smoothed(flight: Flight) -
 def test_the_estimator_is_left_as_it_was(flight: Flight) -> None:
     estimator = make_estimator(EstimationSettings(estimator="eskf", reference=flight.reference))
     before = estimator.snapshot()
-    first = smooth(estimator, flight.log)
+    first = smooth(estimator, flight.log)[0]
     assert estimator.snapshot() == before
-    np.testing.assert_array_equal(smooth(estimator, flight.log), first)
+    np.testing.assert_array_equal(smooth(estimator, flight.log)[0], first)
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from gateway.analysis.case import make_case
+from gateway.analysis.reporting.sections.estimators import estimators
 from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
@@ -80,3 +82,26 @@ def test_what_the_log_the_user_or_the_settings_tell_is_taken(untold: Path) -> No
     estimation = msgspec.structs.replace(SETTINGS.estimation, reference=reference)
     set_s = PipelineSettings(msgspec.structs.replace(SETTINGS, estimation=estimation))
     assert latency_s(untold, ReadOptions(set_s)) == 0.2
+
+
+def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
+    tmp_path: Path,
+) -> None:
+    path, out = tmp_path / "log.csv", tmp_path / "smoothed.csv"
+    text = gzip.decompress(GOLDEN.read_bytes()).decode()
+    path.write_text(text.replace("gps_latency_s=0.16", "gps_latency_s=0.4"))
+    told = "smoothed with a GPS latency of 0.1"
+    fused = CliRunner().invoke(app, ["fuse", str(path), "-o", str(out), "--smooth"])
+    assert told in " ".join(fused.output.split())
+    table = open_rows(out, OPTIONS)
+    latency_s = settings_of(table.header).estimation.reference.gps_latency_s
+    assert latency_s == pytest.approx(0.16, abs=0.02)
+    refusion = Refusion([path], OPTIONS, smooth=True)
+    assert told in refusion.remarks[0]
+    settings = settings_of(refusion.table().header)
+    assert settings.estimation.reference.gps_latency_s == latency_s
+    case = make_case(load_flight(path, Loading(GatewaySettings())), smooth=True)
+    assert case.smoothed_latency_s == latency_s
+    section = estimators(case)
+    assert section is not None
+    assert f"0.40 s: `smoothed` uses the {latency_s:.2f} s" in section.lead

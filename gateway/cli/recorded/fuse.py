@@ -34,7 +34,7 @@ from gateway.flightlog.table.table import TableBlock
 from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
-from gateway.flights.log_facts import aircraft_for
+from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
 from gateway.flights.reading import ReadOptions, RecordedTable, open_rows
 from gateway.flights.refusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
@@ -105,7 +105,8 @@ def fuse_log(
         try:
             if smooth:
                 aircraft = with_smoothed_estimator(aircraft)
-                time_us, states = smooth_blocks(table.blocks, aircraft)
+                time_us, states, latency_s = smooth_blocks(table.blocks, aircraft)
+                aircraft = note_smoothed_latency(file, table, aircraft, latency_s)
             else:
                 time_us, states = _fused(table, aircraft)
         except ValueError as error:

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from gateway.analysis.flight_arrays import Flight
 from gateway.analysis.sources import with_latency
 from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.loading import (
@@ -23,6 +24,7 @@ from gateway.cli.support.recording_options import (
     ForceOption,
     SettingsOption,
     SmoothOption,
+    print_remarks,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -31,6 +33,7 @@ from gateway.cli.support.settings_options import (
     or_refuse,
 )
 from gateway.cli.support.terminal import console_of
+from gateway.flights.smoothed import smoothed_latency_in_words
 from gateway.output import check_folder
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
@@ -106,7 +109,15 @@ def report(
 
         with refusing():
             page = write_report(made, output, advance)
+    _print_latency(loaded, case.smoothed_latency_s)
     print(page)
+
+
+def _print_latency(flight: Flight, used_s: float | None) -> None:
+    """Print the GPS latency that a flight was smoothed with, if it is not the one that is set."""
+    if used_s is not None and used_s != flight.latency_s:
+        words = smoothed_latency_in_words(used_s, flight.latency_s)
+        print_remarks([f"{flight.name}: {words}"])
 
 
 def _refuse_without_packages() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from gateway.compiled.entry_point import dispatched
 from gateway.estimation.alignment.gps_latency import (
+    CONTRADICTED_S,
     KNOWN_STD_S,
     LatencyState,
     begin_latency,
@@ -55,6 +56,27 @@ def estimate_latency(log: SampleLog) -> GpsLatency | None:
     watch_log(s, log.imu_time_us, log.imu, log.gps_time_us[told], vel[told])
     std_s = found_latency_std(s)
     return GpsLatency(max(float(s.found_latency_s), 0.0), std_s) if std_s < KNOWN_STD_S else None
+
+
+def latency_of_flight(log: SampleLog, set_s: float) -> float:
+    """Choose one latency for a whole flight, as `settle_latency` does in flight.
+
+    Parameters
+    ----------
+    log : SampleLog
+        A whole flight.
+    set_s : float
+        The latency that is set, s.
+
+    Returns
+    -------
+    float
+        What is set, or what the manoeuvres show where they contradict it, s.
+    """
+    found = estimate_latency(log)
+    if found is None or abs(found.latency_s - set_s) <= CONTRADICTED_S:
+        return set_s
+    return found.latency_s
 
 
 @dispatched

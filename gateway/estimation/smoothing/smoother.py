@@ -5,6 +5,9 @@ measurements from there on have moved it, as far as the two hang together [1]_. 
 from its end as well as from its begin. Of a state that the filter began anew, as an attitude that
 was lost, what came later says nothing of what was before; of the other states it still does.
 
+Where the flight's manoeuvres contradict the GPS latency that is set, the whole flight is smoothed
+with the one that they show.
+
 A flight without GPS surprises the filter, which took it for rest or for a hand's motion up to then.
 So it is run over once more, knowing of the flight beforehand.
 
@@ -19,6 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from gateway.estimation.alignment.latency_of_log import latency_of_flight
 from gateway.estimation.columns import (
     NAV_ALT,
     NAV_ATTITUDE_STD,
@@ -50,13 +54,15 @@ LASTING_RAD: Final = 0.005
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Share of its own variance that each state foreseen is blurred by, so that all can be divided."""
+CERTAIN: Final = 1e30
+"""Information in 1/s2 that nothing found on the way adds to."""
 BLOCK: Final = 256
 """Nodes whose gains are computed at once."""
 BYTES_PER_SECOND: Final = round(3 * 8 * STATES * STATES / NODE_S)
 """Memory that a second of flight takes."""
 
 
-def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
+def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatArray, float]:
     """Smooth a whole log.
 
     Parameters
@@ -69,10 +75,15 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
 
     Returns
     -------
-    ndarray, shape (n, NAV_COLUMNS)
+    states : ndarray, shape (n, NAV_COLUMNS)
         One row per IMU sample; flags and rates are the filter's.
+    latency_s : float
+        The GPS latency that the whole flight was smoothed with; see `latency_of_flight`.
     """
-    state = estimator.state
+    state, gains = estimator.state, _gains_of(estimator)
+    latency_s = latency_of_flight(log, gains.gps_latency_s)
+    gains.gps_latency_s = state.gps_latency_s = state.found_latency_s = latency_s
+    state.found_information = CERTAIN
     states = np.zeros(2, np.asarray(state).dtype)
     states[0] = state
     nodes = _nodes(log.imu_time_us)
@@ -82,7 +93,7 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
     shown = np.zeros((count, SHOWN))
     arguments = (
-        states, _gains_of(estimator), nodes,
+        states, gains, nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
         out, P, F, foreseen, d, anew, shown,
     )  # fmt: skip
@@ -94,7 +105,7 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> FloatArray:
     found = _backward(P, F, foreseen, d, states[0]["P"])
     begins, ends, variances = (numbers[:, :MOVED] for numbers in found)
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
-    return out
+    return out, latency_s
 
 
 def _gains_of(estimator: KernelEstimator[Any, Any]) -> EskfGains:

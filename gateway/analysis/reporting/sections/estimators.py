@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from gateway.analysis.case import SMOOTHED, Case
+from gateway.analysis.case import Case
 from gateway.analysis.flight_arrays import BoolArray, FlightTrack, Reference, fixes_of
 from gateway.analysis.interpolation import interpolate
 from gateway.analysis.key_figures import HOLD_OUT, withheld_error_m
@@ -24,6 +24,10 @@ STORY: Final = (
 SMOOTHED_STORY: Final = (
     " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
     "recording can be."
+)
+LATENCY_STORY: Final = (
+    " The manoeuvres contradict the GPS latency set, {:.2f} s: `smoothed` uses the {:.2f} s "
+    "they show, from the beginning."
 )
 OWN_GPS: Final = (
     "its own interpolated GPS, which is not independent: what follows the fixes' own errors agrees "
@@ -48,7 +52,7 @@ def estimators(case: Case) -> Section | None:
         table["withheld fixes, m"] = table["estimator"].map(withheld)
     return Section(
         "Estimators compared",
-        STORY.format(reference.story) + (SMOOTHED_STORY if SMOOTHED in case.tracks else ""),
+        STORY.format(reference.story) + _smoothed_story(case),
         [
             Picture(
                 "estimator_errors",
@@ -117,6 +121,14 @@ def _reference(case: Case) -> Reference | None:
         return None
     track = interpolate(fixes_of(case.flight), case.flight.time_us)
     return Reference(track, is_exact=False, story=OWN_GPS)
+
+
+def _smoothed_story(case: Case) -> str:
+    """Tell how the smoothed track came about, if there is one."""
+    set_s, used_s = case.fusion.estimation.reference.gps_latency_s, case.smoothed_latency_s
+    if used_s is None:
+        return ""
+    return SMOOTHED_STORY + (LATENCY_STORY.format(set_s, used_s) if used_s != set_s else "")
 
 
 def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
