@@ -12,7 +12,7 @@ from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
 from gateway.estimation.eskf.fixes import take_gps
-from gateway.estimation.eskf.iron import follow_field, look_for_iron
+from gateway.estimation.eskf.iron import doubt_standing_field, follow_field, look_for_iron
 from gateway.estimation.eskf.measure import (
     update_by_baro,
     update_by_compass,
@@ -291,6 +291,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     dt = min(s.time_s - s.mag_s, STALE_MAG_S)
     follow_field(s, dip, dt)
     weight = take_field(s, p, norm, field[2]) / recent_unlikeness(s, p, norm, dip, dt)
+    doubt_standing_field(s, p, dt)
     known = math.isfinite(s.declination_rad)
     declination = s.declination_rad if known else 0.0
     if weight == 0.0:

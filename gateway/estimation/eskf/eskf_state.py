@@ -63,8 +63,11 @@ class EskfState(FilterState):
     """Mean of `field_unlikeness` over the last `field_memory_s`."""
     field_n: Annotated[FloatArray, (3,)]
     """The field that the compass was last used with, NED, uT; all zero before."""
+    field_held_s: float
+    """Time in motion for which the usual field has held; what was learned at rest is a place's."""
     left_iron_ut: float
-    """Standard deviation per axis of the iron that the calibration left."""
+    """Standard deviation per axis of what bends the field: iron that the calibration left, and more
+    where the field in motion is not that of the place where the heading was read."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
     iron_norm: float

@@ -15,7 +15,7 @@ from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import MAG_BIAS, TILT, EskfState
 from gateway.estimation.eskf.measure import COMPASS_CORRELATION_S, compass_row
 from gateway.estimation.kernel_record import as_vec
-from gateway.estimation.magfield import FIELD_TAU_S, STALE_MAG_S
+from gateway.estimation.magfield import FIELD_TAU_S, FIRST_FIELD_S, STALE_MAG_S
 from gateway.records import Vec3
 
 MEAN_S: Final = 60.0
@@ -91,3 +91,24 @@ def doubt_iron(s: EskfState, variance: float) -> None:
         s.P[TILT + 2, k] -= turned
         s.P[k, TILT + 2] -= turned
         s.P[TILT + 2, TILT + 2] += s.h[k] * turned
+
+
+@compiled
+def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
+    """Doubt a heading that was read where the aircraft stood, where the field in motion is another.
+
+    The floor's iron has turned the one, or motors and currents turn the other: which of both is the
+    Earth's, nothing tells before a fix. What they differ by in strength and dip, they may differ by
+    sideways. The doubt fades while the compass is believed in motion.
+    """
+    confirmed = s.field_held_s >= FIRST_FIELD_S or s.iron_search_started == 1
+    if s.mag_disturbed == 0 and s.at_rest == 0:
+        s.field_held_s += dt
+        variance = s.left_iron_ut * s.left_iron_ut
+        variance += dt / FIELD_TAU_S * (p.mag_bias_var - variance)
+        s.left_iron_ut = math.sqrt(variance)
+    elif s.mag_disturbed == 1 and not confirmed:
+        s.field_held_s = 0.0
+        norm, usual, turned = s.mag_new_norm, s.mag_norm_ref, s.mag_new_dip - s.mag_dip_ref
+        apart_sq = norm * norm + usual * usual - 2.0 * norm * usual * math.cos(turned)
+        s.left_iron_ut = math.sqrt(max(0.5 * apart_sq, p.mag_bias_var))

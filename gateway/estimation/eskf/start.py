@@ -102,7 +102,7 @@ def start_heading_by_compass(
 
 
 @compiled
-def start_iron_search(s: EskfState, p: EskfGains) -> None:
+def start_iron_search(s: EskfState) -> None:
     """Look for iron that the calibration left, once the GPS can tell it from the heading.
 
     A heading that came from the compass has the iron's error, reversed.
@@ -111,7 +111,7 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
         return
     s.iron_search_started = 1
     by_compass = s.field_n[0] != 0.0 or s.field_n[1] != 0.0
-    variance = p.mag_bias_var
+    variance = s.left_iron_ut * s.left_iron_ut
     if by_compass:
         north, east, down = as_vec(s.field_n)
         level_sq = north * north + east * east
@@ -151,7 +151,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
-    start_iron_search(s, p)
+    start_iron_search(s)
     s.off_last_m = s.contradiction_m = 0.0
 
 

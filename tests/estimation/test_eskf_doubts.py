@@ -1,0 +1,86 @@
+"""What the eskf doubts: the heading it began with, the field it was read in, a rest that ended."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
+from gateway.estimation.eskf.eskf_state import TILT, EskfState
+from gateway.estimation.eskf.start import start_heading_by_compass
+from gateway.estimation.kernel_record import new_record
+from gateway.estimation.magfield import CompassSettings
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
+from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.records import ImuSample, NavFlags, NavState
+from tests.estimation.samples import G, imu, times
+
+REFERENCE = ReferenceSettings(declination="fixed", declination_deg=0.0)
+GAINS = make_gains(EskfSettings(), REFERENCE, RestSettings(), CompassSettings())
+
+
+def last_state(samples: Iterable[ImuSample]) -> NavState:
+    estimator = make_estimator(EstimationSettings(estimator="eskf", reference=REFERENCE))
+    return [estimator.update_imu(sample) for sample in samples][-1]
+
+
+def field(dip_deg: float) -> tuple[float, float, float]:
+    dip = math.radians(dip_deg)
+    return (45.0 * math.cos(dip), 0.0, 45.0 * math.sin(dip))
+
+
+@pytest.mark.parametrize("tilt_rad", [(0.03, 0.0), (0.0, -0.03)])
+def test_a_first_heading_knows_of_the_tilt_it_was_read_with(tilt_rad: tuple[float, float]) -> None:
+    """A level that is found later turns the heading back by what the field's dip has turned it."""
+    s, field_n = new_record(EskfState), np.array([20.0, 6.0, 40.0])
+    for k in range(2):
+        s.P[TILT + k, TILT + k] = 0.05**2
+    s.P[TILT + 2, TILT + 2] = 3.0
+    # Upright in the estimate, tilted in truth: the field is seen in the tilted body.
+    true = Rotation.from_rotvec([*tilt_rad, 0.0])
+    seen = tuple(true.inv().apply(field_n).tolist())
+    s.q_nb[0] = 1.0
+    declination = math.atan2(field_n[1], field_n[0])
+    noise_var = 0.01**2
+    start_heading_by_compass(s, GAINS, seen, declination - math.atan2(seen[1], seen[0]), noise_var)
+    found = Rotation.from_quat(s.q_nb, scalar_first=True)
+    error = (true * found.inv()).as_rotvec()
+    explained = sum(s.P[TILT + 2, k] / s.P[k, k] * error[k] for k in range(2))
+    assert error[2] == pytest.approx(explained, abs=0.006)
+    assert abs(error[2]) > 0.01
+    level = (s.P[TILT + 2, 0] ** 2 + s.P[TILT + 2, 1] ** 2) / 0.05**2
+    assert s.P[TILT + 2, TILT + 2] == pytest.approx(noise_var + level, rel=0.05)
+
+
+@pytest.mark.parametrize(("bent_deg", "low_deg", "high_deg"), [(0.0, 0.5, 3.0), (14.0, 7.0, 20.0)])
+def test_a_heading_read_over_iron_is_as_unsure_as_the_field_has_proved_bent(
+    bent_deg: float, low_deg: float, high_deg: float
+) -> None:
+    """It stands for 8 s and is then carried about; only over iron is its field another then."""
+
+    def samples() -> Iterable[ImuSample]:
+        for t in times(14.0):
+            moves = t >= 8_000_000
+            swing = 2.0 * math.sin(6.0e-6 * t) if moves else 0.0
+            mag = field(30.0 if moves else 30.0 - bent_deg) if t % 50_000 == 0 else None
+            yield imu(t, (swing, 0.0, -G), mag=mag)
+
+    state = last_state(samples())
+    assert low_deg < math.degrees(state.attitude_std_rad[2]) < high_deg
+
+
+@pytest.mark.parametrize(
+    ("accel", "known"),
+    [((0.0, 0.0, -G), True), ((0.0, -G, 0.0), False)],
+    ids=["rests", "picked up"],
+)
+def test_a_rest_that_ended_in_a_silence_is_noticed_at_the_first_sample(
+    accel: tuple[float, float, float], known: bool
+) -> None:
+    before = [imu(t) for t in times(10.0)]
+    after = imu(before[-1].time_us + 4_000_000 + 10_000, accel)
+    state = last_state([*before, imu(after.time_us - 10_000, accel), after])
+    assert (NavFlags.ATTITUDE_VALID in state.flags) is known
