@@ -227,7 +227,7 @@ def replay(
         Its `frames(flight.duration_s)` end with the recording.
     """
     imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
-    inertial = chain.from_iterable(_imu_payloads(f, imu_clock) for f in _rounds(flight, endless))
+    inertial = _imu_payloads(flight, imu_clock, endless=endless)
     pressures: Iterator[Sent] = iter(())
     if np.isfinite(flight.baro_alt_m).any():
         rounds = _rounds(flight, endless)
@@ -286,7 +286,7 @@ def _imu_sensors(flight: RecordedFlight) -> int:
     return IMU_SENSORS & ~absent
 
 
-def _imu_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]:
+def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) -> Iterator[Sent]:
     accel_range, gyro_range, mag_gain = ranges = _ranges(flight)
     mag_new = _complete(flight.mag_b_ut)
     absent = 0 if mag_new.any() else int(ImuFlags.MAG_ABSENT)
@@ -296,16 +296,17 @@ def _imu_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]:
     accel_lsb = (INT16_MAX + 1) / (ACCEL_RANGES_G[accel_range] * STANDARD_GRAVITY_MPS2)
     gyro_lsb = math.degrees(GYRO_LSB_PER_DPS[gyro_range])
     temperature = temperature_counts(np.full(ROWS, TEMPERATURE_DEGC))
-    for start in range(0, len(flight.time_s), ROWS):
-        rows = slice(start, start + ROWS)
-        time_s = flight.time_s[rows]
-        accel, accel_clipped = to_int16(flight.accel_b_mps2[rows] * FACE_UP * accel_lsb)
-        gyro, gyro_clipped = to_int16(flight.gyro_b_radps[rows] * FACE_UP * gyro_lsb)
-        flags = absent | mag_new[rows] * int(ImuFlags.MAG_NEW)
-        flags |= accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
-        flags |= gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
-        columns = (time_s, _on_clock(clock, time_s), accel, gyro, mag_raw[rows])
-        yield from pack_imu((*columns, temperature[: len(time_s)], flags), ranges)
+    for flown in _rounds(flight, endless):
+        for start in range(0, len(flown.time_s), ROWS):
+            rows = slice(start, start + ROWS)
+            time_s = flown.time_s[rows]
+            accel, accel_clipped = to_int16(flown.accel_b_mps2[rows] * FACE_UP * accel_lsb)
+            gyro, gyro_clipped = to_int16(flown.gyro_b_radps[rows] * FACE_UP * gyro_lsb)
+            flags = absent | mag_new[rows] * int(ImuFlags.MAG_NEW)
+            flags |= accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
+            flags |= gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
+            columns = (time_s, _on_clock(clock, time_s), accel, gyro, mag_raw[rows])
+            yield from pack_imu((*columns, temperature[: len(time_s)], flags), ranges)
 
 
 def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
