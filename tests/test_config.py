@@ -98,7 +98,7 @@ def test_refusals_name_file_key_value_and_what_is_allowed(
     assert message in str(caught.value)
 
 
-def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
+def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     file.write_text("[serial]\nbaud = 1\nport = 2\n[vehicle]\nnope = 3\n")
     with pytest.raises(ConfigError) as caught:
@@ -106,7 +106,7 @@ def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
     assert len(str(caught.value).splitlines()) == 3
 
 
-def test_every_endpoint_is_told_also_beside_other_errors(tmp_path: Path) -> None:
+def test_every_endpoint_is_reported_also_beside_other_errors(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     urls = ["udp:", "tcp:host:99999", "udp:127.0.0.1:14550", "udp:127.0.0.1:14550?name=b"]
     file.write_text(f"[hub]\nmax_clients = 0\nendpoints = {urls}\n[serial]\nbaud = 1\n")

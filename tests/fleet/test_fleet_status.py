@@ -53,7 +53,7 @@ async def test_metrics(world: World) -> None:
     assert "mavgate_hub_forwarded_total" in text
 
 
-async def test_two_sites_of_one_name_are_told_here_too(
+async def test_two_sites_of_one_name_are_shown_here_too(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = world.open_site("field-a")

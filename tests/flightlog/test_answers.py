@@ -78,7 +78,7 @@ def test_parameters_are_whole_and_numbered_anew(day: Day) -> None:
     assert {m.get_srcSystem() for m in found} == {8}
 
 
-def test_a_parameter_holds_from_when_it_was_told_and_the_first_before(day: Day) -> None:
+def test_a_parameter_holds_from_when_it_was_sent_and_the_first_before(day: Day) -> None:
     day.say(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
     moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
     told = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
@@ -147,7 +147,7 @@ def test_home_is_that_of_the_moment(day: Day) -> None:
     assert told == [470_000_000, 470_000_000, 480_000_000]
 
 
-def test_what_was_not_told_is_not_known(day: Day) -> None:
+def test_what_was_not_sent_is_not_known(day: Day) -> None:
     day.say(day.station, value("ALPHA", 1.0))
     answers = day.answers()
     assert answers.parameters() == {}

@@ -104,7 +104,7 @@ async def test_named_host_is_let_in() -> None:
     assert answer.status_code == http.HTTPStatus.OK
 
 
-async def test_too_much_is_refused_told_or_not() -> None:
+async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
     async def chunks() -> AsyncIterator[bytes]:
         for _ in range(20):
             yield bytes(MAX_BODY // 10)

@@ -18,7 +18,7 @@ def vehicle() -> VehiclePicture:
     return VehiclePicture(1)
 
 
-def test_what_nobody_told_is_not_known(vehicle: VehiclePicture) -> None:
+def test_what_nobody_sent_is_not_known(vehicle: VehiclePicture) -> None:
     now = vehicle.instant(0)
     assert math.isinf(now.silent_s)
     assert all(math.isnan(value) for value in (*now.q_nb, now.lat_deg, now.groundspeed_mps))

@@ -49,7 +49,7 @@ def test_a_client_that_left_is_no_way(table: RoutingTable) -> None:
     assert table.origins(1) == ()
 
 
-def test_stations_are_told_from_vehicles(table: RoutingTable) -> None:
+def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
     table.hear(4, (255, 190), 0)
     table.note_kind(4, (255, 190), is_station=True)
     assert table.is_station((255, 190))

@@ -44,7 +44,7 @@ def test_a_short_absence_is_not_reported() -> None:
     assert look(watch, client(state="unreachable"), PATIENCE_US + 1) == []
 
 
-def test_a_long_absence_is_told_once_and_so_is_the_return() -> None:
+def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
     watch = TroubleWatch()
     texts = [text for n in range(20) for text in look(watch, client(state="unreachable"), n * S)]
     assert texts == ["tablet: unreachable"]
@@ -52,7 +52,7 @@ def test_a_long_absence_is_told_once_and_so_is_the_return() -> None:
     assert look(watch, client(), 22 * S) == []
 
 
-def test_the_reason_is_told_if_it_is_known() -> None:
+def test_the_reason_is_reported_if_it_is_known() -> None:
     watch = TroubleWatch()
     away = client(state="unreachable", reason="Permission denied")
     texts = [text for n in range(20) for text in look(watch, away, n * S)]
@@ -76,7 +76,7 @@ def test_a_station_that_is_not_running_is_no_trouble() -> None:
     assert all(not look(watch, client(state="refused"), n * S) for n in range(20))
 
 
-def test_drops_are_told_once_until_they_have_ceased() -> None:
+def test_drops_are_reported_once_until_they_have_ceased() -> None:
     watch = TroubleWatch()
     texts = [text for n in range(10) for text in look(watch, client(dropped=n * 10), n * S)]
     assert texts == ["tablet is too slow: telemetry dropped"]

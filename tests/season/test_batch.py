@@ -309,7 +309,7 @@ def test_what_is_elsewhere_is_fetched_once_and_only_if_it_changed(
     assert fetched() == [FLIGHTS[1]]
 
 
-def test_a_broken_file_elsewhere_is_told_by_its_url(memory: str, tmp_path: Path) -> None:
+def test_a_broken_file_elsewhere_is_reported_by_its_url(memory: str, tmp_path: Path) -> None:
     fsspec.filesystem("memory").pipe_file("/flights/broken.csv", b"x,y\n1,2\n")
     code, text = run("info", f"{memory}/broken.csv", "-o", tmp_path)
     assert code == 1

@@ -39,7 +39,7 @@ def test_no_flight_judges_what_it_chose() -> None:
     assert np.mean(judged) > -0.05
 
 
-def test_a_true_lead_is_told_from_chance(rng: np.random.Generator) -> None:
+def test_a_true_lead_is_distinguished_from_chance(rng: np.random.Generator) -> None:
     errors = np.exp(rng.normal(0.0, 0.1, (40, 5)))
     errors[:, 3] *= 0.8
     found = choose(errors, np.exp(rng.normal(0.0, 0.1, 40)), GROUPS)

@@ -228,7 +228,7 @@ class TestDamage:
             assert after.time_s == before.time_s
 
     @pytest.mark.parametrize("share", [0.002, 0.02, 0.1])
-    def test_what_comes_through_can_be_told(self, share: float) -> None:
+    def test_which_frames_are_damaged_is_known(self, share: float) -> None:
         """A frame survives if it and the delimiter before it are whole."""
         clean = frames(10.0)
         hit = frames(10.0, corrupt_bytes=share)

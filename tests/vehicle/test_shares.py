@@ -110,7 +110,7 @@ def test_only_the_trusted_may_have_an_answer_sent_to_all(
     assert to_all == [trusted]
 
 
-def test_what_strangers_are_refused_is_told_now_and_then(station: GroundStation) -> None:
+def test_what_strangers_are_refused_is_reported_now_and_then(station: GroundStation) -> None:
     stranger = GroundStation(station.vehicle, station.clock, client_id=8, trusted=False)
     for _ in range(60 * 20):
         stranger.command(mavlink.MAV_CMD_LOGGING_START)

@@ -281,7 +281,7 @@ class TestTrouble:
         assert local.dropped == 0
         router.signal(signal.SIGCONT)
 
-    async def test_two_sites_of_one_name_are_told_on_both(self, rig: Rig, router: Router) -> None:
+    async def test_two_sites_of_one_name_are_shown_on_both(self, rig: Rig, router: Router) -> None:
         first, second = [await open_site(rig, router) for _ in range(2)]
         for hub in (first, second):
             await until(rig, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023

@@ -81,7 +81,7 @@ async def test_without_systemd_nothing_happens(monkeypatch: pytest.MonkeyPatch) 
     ServiceNotifier().ready()
 
 
-def test_realtime_is_asked_for_or_told(
+def test_realtime_is_asked_for_or_a_refusal_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     asked: list[tuple[int, int]] = []

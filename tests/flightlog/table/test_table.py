@@ -60,7 +60,7 @@ def test_marks_stand_between_rows() -> None:
     assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
 
 
-def test_what_a_node_told_of_itself_stands_between_rows() -> None:
+def test_what_a_node_reports_of_itself_stands_between_rows() -> None:
     rows = make_rows(2, 4)
     status = NodeStatus(5, NodeId(3, 1), 4, (1, 2), 1, 8, 0, 3, 2, 1, 900, 5, 3290)
     data = "".join(map(encode_line, [rows[0], status, rows[1]]))

@@ -71,7 +71,7 @@ def sleepless(monkeypatch: pytest.MonkeyPatch) -> dict[int, int]:
 
 
 @pytest.mark.parametrize("set_by_us", [0, 3_600_000_000])
-def test_a_machine_that_slept_is_told_from_one_whose_clock_was_set(
+def test_a_machine_that_slept_is_distinguished_from_one_whose_clock_was_set(
     monkeypatch: pytest.MonkeyPatch, set_by_us: int
 ) -> None:
     clocks = sleepless(monkeypatch)

@@ -42,7 +42,7 @@ def test_node_of_another_aircraft_or_with_a_short_gap_is_none() -> None:
     assert titles(status(silent_s=1.0)) == []
 
 
-def test_status_takes_the_place_of_what_the_texts_told() -> None:
+def test_status_takes_the_place_of_what_the_texts_said() -> None:
     told = Alert("node GPS node 2", AlertLevel.CRITICAL, "GPS node 2 silent")
     assert titles(status(), told, GPS_LOST) == ["GPS lost"]
     assert titles(status(silent_s=9.0), told) == ["GPS node 2 silent"]

@@ -17,7 +17,7 @@ def results(messages: list) -> list[int]:
     return [m.result for m in messages if m.get_type() == "COMMAND_ACK"]
 
 
-def test_home_is_set_to_a_place_and_told_to_all(station: GroundStation) -> None:
+def test_home_is_set_to_a_place_and_sent_to_all(station: GroundStation) -> None:
     found = station.command(SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
     assert kinds(found)[:3] == ["COMMAND_ACK", "HOME_POSITION", "STATUSTEXT"]
     assert {m.param_id for m in found[3:]} == {"HOME_SOURCE", "HOME_LAT", "HOME_LON", "HOME_ALT"}
@@ -82,7 +82,7 @@ def test_an_untrusted_client_commands_nothing(station: GroundStation, number: in
     assert station.vehicle.refusals == 1
 
 
-def test_refusals_are_told_but_cannot_flood(station: GroundStation) -> None:
+def test_refusals_are_reported_but_cannot_flood(station: GroundStation) -> None:
     station.trusted = False
     found = [m for _ in range(200) for m in station.command(mavlink.MAV_CMD_LOGGING_START)]
     assert len(results(found)) == 200

@@ -90,7 +90,7 @@ def test_no_limit_and_no_measurement_tell_nothing() -> None:
     assert unlimited.told == blind.told == []
 
 
-def test_bus_errors_are_told_once_also_where_the_counter_begins_anew(flying: Flying) -> None:
+def test_bus_errors_are_reported_once_also_where_the_counter_begins_anew(flying: Flying) -> None:
     for errors in (65_535, 0, 1, 2):
         flying.report(bus_errors=errors)
     assert flying.told == [(WARNING, "IMU node 0: bus errors, 65535 so far")]

@@ -93,7 +93,7 @@ def test_a_value_that_follows_one_without_an_answer_is_sent_in_its_place() -> No
     assert message.param_value == 3.0
 
 
-def test_a_client_that_may_not_change_is_told_so() -> None:
+def test_a_client_that_may_not_change_is_refused_with_the_reason() -> None:
     client = ParameterClient(1)
     bench = Bench(client, may_change=False)
     bench.run(client.load(bench.now_us), 2.0)

@@ -102,7 +102,7 @@ def test_unknown_names_are_refused(station: GroundStation, name: bytes, index: i
         ("TUNING_BIAS_Y", -3.5, "bias_mps2", (0.0, -3.5, 2.0)),
     ],
 )
-def test_a_change_takes_effect_and_is_told_to_all(
+def test_a_change_takes_effect_and_is_sent_to_all(
     station: GroundStation, name: str, sent: float, path: str, stored: object
 ) -> None:
     other = GroundStation(station.vehicle, station.clock, client_id=8)
