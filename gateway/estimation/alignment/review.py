@@ -113,7 +113,6 @@ def is_to_be_taken(
     heading_told: float,
     bias_radps: float,
     dt: float,
-    hand_mps: float = 0.0,
 ) -> bool:
     """Solve the alignment after a new pair and compare it with the attitude.
 
@@ -129,8 +128,6 @@ def is_to_be_taken(
         Standard deviation of the gyroscope's bias.
     dt : float
         Length of the pair, s.
-    hand_mps : float
-        See `alignment_std`.
 
     Returns
     -------
@@ -138,7 +135,7 @@ def is_to_be_taken(
         Whether the alignment's attitude is to take its place: see `find`.
     """
     q_ni = solve_alignment(s)
-    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni), bias_radps, hand_mps)
+    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni), bias_radps)
     write_quat(s.found_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
     if s.lost == 1:
         s.lost_s += dt

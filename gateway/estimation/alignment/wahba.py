@@ -41,6 +41,10 @@ PULL_TAU_S: Final = 3.0
 SWING_TAU_S: Final = 1.8
 """Of either of two low-passes, where a hand's swings are to average out."""
 TURNING_TAU_S: Final = 20.0
+TURN_S: Final = 4.0
+"""What flies pulls one way for about this time."""
+HAND_MPS: Final = 1.8
+"""By how much the speed of what moves in a hand differs from one moment to another."""
 PULL_KEPT: Final = 0.7
 """Of an acceleration that is over, from one pair to the next."""
 USUAL_PULL: Final = 1.03
@@ -288,9 +292,7 @@ def misfit(s: AlignmentState, q_ni: Quat) -> float:
 
 
 @compiled
-def alignment_std(
-    s: AlignmentState, excess: float, bias_radps: float, hand_mps: float = 0.0
-) -> tuple[float, float]:
+def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[float, float]:
     """Return how well the pairs say the level and the heading.
 
     Parameters
@@ -301,9 +303,6 @@ def alignment_std(
         See `misfit`.
     bias_radps : float
         Standard deviation of the gyroscope's bias.
-    hand_mps : float
-        By how much the velocity may have changed meanwhile, where gravity is the reference;
-        0 where nothing is known of it.
 
     Returns
     -------
@@ -327,9 +326,9 @@ def alignment_std(
         pulled = math.sqrt(level) * off_level * off_level
         heading_var = (excess + pulled) * level / determinant + drift
     level_var *= excess
-    if s.by_gps == 0 and hand_mps > 0.0:
-        # However it is shaken: over the time, the mean force is gravity but for that change.
-        level_var = min(level_var, (hand_mps / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
+    if s.by_gps == 0:
+        # However it is shaken: over the time, the mean force is gravity but for the speed gained.
+        level_var = min(level_var, (HAND_MPS / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
     return (
         math.sqrt(min(level_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
         math.sqrt(min(heading_var, UNKNOWN_RAD * UNKNOWN_RAD)),

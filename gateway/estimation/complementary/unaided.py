@@ -10,6 +10,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.wahba import TURN_S
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
@@ -25,8 +26,6 @@ from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.geometry.quaternion import rotate
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-TURN_S: Final = 4.0
-"""The pull of a flight turns about in this time."""
 FLOWN_S: Final = 20.0
 """What has pulled in this time is to be expected."""
 PULL_TAU_S: Final = 1.5

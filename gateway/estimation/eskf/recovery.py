@@ -11,7 +11,7 @@ from gateway.estimation.alignment.review import (
     lose,
     tells_heading,
 )
-from gateway.estimation.alignment.wahba import align_by_gravity, heading_difference
+from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, heading_difference
 from gateway.estimation.eskf.covariance import propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
@@ -23,8 +23,6 @@ from gateway.records import Vec3
 ENOUGH_HEADING_RAD: Final = 0.3
 """A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
-HAND_MPS: Final = 1.8
-"""By how much the speed of what moves in a hand differs from one moment to another."""
 HAND_VAR: Final = (0.5 * HAND_MPS) ** 2
 """Of each axis of the velocity where an attitude begins in a hand's motion."""
 NO_HEADING_VAR: Final = 3.0
@@ -104,7 +102,7 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     level_told = math.sqrt(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
     heading_told = math.sqrt(s.P[TILT + 2, TILT + 2])
     bias = math.sqrt(0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1]))
-    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt, HAND_MPS):
+    if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt):
         if tells_heading(s, ENOUGH_HEADING_RAD):
             turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
             renew(s, TILT + 2, s.heading_std * s.heading_std)

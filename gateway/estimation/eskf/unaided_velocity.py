@@ -4,6 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.wahba import TURN_S
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import TILT, VEL, EskfState
 from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, lag_integrals, take_back
@@ -12,8 +13,7 @@ from gateway.estimation.local_position import past_state
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 HAND_MPS2: Final = 0.5
-TURN_S: Final = 4.0
-"""What pulls more than a hand does for long is flown; its velocity turns in about this time."""
+"""What pulls more for long is flown."""
 WAY_S: Final = 2.0
 HAND_M: Final = 2.0
 """A hand does not go so far in this time; what does is flown."""
