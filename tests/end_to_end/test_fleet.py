@@ -178,8 +178,8 @@ def test_clocks_that_are_wrong_by_years(
         fleet.ask("recordings", "get", site, "last", "--to", str(tmp_path / site))
     assert [gateway.stop() for gateway in fleet.sites.values()] == [0, 0, 0]
     for site, off_s in OFF_S.items():
-        (log,) = (tmp_path / site).glob("*.tlog")
-        data = log.read_bytes()
-        first_s = int.from_bytes(data[:8], "big") / 1e6
+        # A second part begins where GPS tells another time than the clock, as in a late start.
+        logs = [log.read_bytes() for log in sorted((tmp_path / site).glob("*.tlog"))]
+        first_s = int.from_bytes(logs[0][:8], "big") / 1e6
         assert abs(first_s - now_s - off_s) < YEAR_S / 365
-        assert len(data) > 10_000
+        assert sum(map(len, logs)) > 10_000

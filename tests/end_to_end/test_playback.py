@@ -175,7 +175,7 @@ folder = "FOLDER"
     gateway = start_gateway("demo", "--record", config=config.replace("FOLDER", str(tmp_path)))
     connect(gateway.port).until(lambda seen: "HIGHRES_IMU" in seen)
     assert gateway.stop() == 0
-    (path,) = tmp_path.glob("*.tlog")
+    path, *_ = sorted(tmp_path.glob("*.tlog"))
     batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
     assert batch.damage == ()
     dumped = subprocess.run(
@@ -188,7 +188,7 @@ folder = "FOLDER"
     lines = [line for line in dumped.stdout.splitlines() if " {" in line]
     assert len(lines) == len(batch)
     assert "BAD_DATA" not in dumped.stdout
-    (table,) = tmp_path.glob("*_v1.csv")
+    table, *_ = sorted(tmp_path.glob("*_v1.csv"))
     again = tmp_path / "again.csv"
     done = CliRunner().invoke(app, ["convert", str(table), "--fuse", "-o", str(again)])
     assert done.exit_code == 0, done.output
