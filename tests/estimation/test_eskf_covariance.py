@@ -27,7 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
-from gateway.estimation.kernel_record import new_record
+from gateway.estimation.kernel_record import copy_record, new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
@@ -81,6 +81,21 @@ def test_propagation_is_the_matrix_product(state: EskfState, rng: np.random.Gene
     assert diagonal[VEL] == pytest.approx(GAINS.accel_density * dt, rel=1e-6)
     np.testing.assert_allclose(state.P, state.P.T, atol=1e-9)
     assert state.pending_s == 0.0
+
+
+def test_a_turn_leaks_into_the_axes_beside_its_own(rng: np.random.Generator) -> None:
+    turn_b, R = np.array([0.1, -0.2, 0.3]), Rotation.random(random_state=rng).as_matrix()
+    gains = copy_record(GAINS)
+    gains.gyro_axes_var = 1e-3
+    variances = []
+    for p in (GAINS, gains):
+        s = new_record(EskfState)
+        s.pending_s, s.pending_scaled[:] = 0.02, R * turn_b
+        propagate(s, p)
+        variances.append(np.diag(s.P)[TILT : TILT + 3])
+    angle = np.linalg.norm(turn_b)
+    expected = 1e-3 * angle * (1.0 - (R @ turn_b / angle) ** 2)
+    np.testing.assert_allclose(variances[1] - variances[0], expected, rtol=1e-9)
 
 
 def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator) -> None:

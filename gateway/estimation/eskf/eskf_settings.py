@@ -143,6 +143,8 @@ class EskfGains(FilterGains):
     gyro_roughness_sq: float
     accel_roughness_sq: float
     gyro_scale_var: float
+    gyro_axes_var: float
+    """Squared angle that a turn by one radian leaks into each axis beside its own, rad2/rad."""
     accel_density: float
     """m2/s3."""
     accel_scale_sq: float
@@ -203,6 +205,7 @@ def make_gains(
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_var": s.gyro_scale**2,
+        "gyro_axes_var": 0.0,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,
         "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,
