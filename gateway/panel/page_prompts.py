@@ -30,6 +30,21 @@ def notify_failure(context: ViewContext) -> Iterator[None]:
             ui.notify(f"only a gateway on this machine can: {text}", type="negative")
 
 
+def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
+    """Return what closes a dialog and then acts, for a button in it.
+
+    What it shows is shown on the page: the dialog is deleted before a slow link has answered.
+    """
+    page = ui.context.client
+
+    async def run() -> None:
+        dialog.close()
+        with page:
+            await act()
+
+    return run
+
+
 def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
     """Ask for confirmation, and act on a yes.
 
@@ -45,11 +60,7 @@ def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None
     with ui.dialog() as dialog, ui.card().classes("asks"):
         ui.label(question).classes("title")
 
-        async def run() -> None:
-            dialog.close()
-            await act()
-
-        ui.button(word, on_click=run).props("color=negative")
+        ui.button(word, on_click=closing(dialog, act)).props("color=negative")
         ui.button("Cancel", on_click=dialog.close).props("flat")
     dialog.on("hide", dialog.delete)
     dialog.open()

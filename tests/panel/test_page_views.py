@@ -2,6 +2,7 @@
 
 import csv
 import re
+import signal
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ class Desk:
     """A gateway on a receiver of the test's, and the one page that all tests look at."""
 
     folder: Path
+    gateway: Process
     receiver: BenchReceiver
     page: Page
 
@@ -80,7 +82,7 @@ def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     page = open_page(browser, gateway.link())
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
-    yield Desk(folder, receiver, page)
+    yield Desk(folder, gateway, receiver, page)
     page.close()
     gateway.end()
     receiver.end()
@@ -131,7 +133,8 @@ def test_parameter_is_found_changed_live_and_shown_against_its_default(desk: Des
     view = desk.view("tuning")
     view.get_by_label("Search", exact=True).fill("gyroscope bias sensor")
     rows = view.locator(".parameter")
-    expect(rows).to_have_count(3)
+    # Words are searched for in the descriptions, which come after the parameters.
+    expect(rows).to_have_count(3, timeout=START_LIMIT_MS)
     row = view.locator(".parameter[data-name='CAL_GYRO_BIAS_Z']")
     expect(row).to_contain_text("-10 to 10 rad/s · default 0")
     field = row.get_by_label("CAL_GYRO_BIAS_Z")
@@ -204,7 +207,12 @@ def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
     asks = desk.page.locator(".asks")
     place = asks.locator(".title").inner_text()
     assert desk.home == before
+    # As over a link that answers only after the question has left the page.
+    desk.gateway.process.send_signal(signal.SIGSTOP)
     asks.get_by_role("button", name="Set home here").click()
+    expect(asks).to_have_count(0)
+    desk.gateway.process.send_signal(signal.SIGCONT)
+    expect(desk.page.get_by_text("Home set")).to_be_visible()
     lat_deg, lon_deg = (float(part) for part in place.split(","))
     desk.page.wait_for_function(f"Math.abs(mavgate.state.home.lat_deg - {lat_deg}) < 1e-6")
     assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)

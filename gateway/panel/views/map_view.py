@@ -11,7 +11,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.page_prompts import notify_failure
+from gateway.panel.page_prompts import closing, notify_failure
 from gateway.panel.state.instant import Spot
 from gateway.panel.view_context import WEB, ViewContext
 
@@ -57,11 +57,10 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
 
         def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
             async def run() -> None:
-                dialog.close()
                 with notify_failure(context):
                     await act()
 
-            return run
+            return closing(dialog, run)
 
         ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
         ui.button("Set home here", on_click=then(partial(_set_home, context, spot))).props(
