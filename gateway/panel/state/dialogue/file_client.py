@@ -15,7 +15,9 @@ from gateway.units import US_PER_S
 from gateway.vehicle.services.ftp import ACK, MAX_DATA, NAK, FtpError, Opcode, Packet, decode_packet
 
 RETRY_US: Final = US_PER_S // 2
+"""After the first attempt, and twice as long after each further one."""
 MAX_ATTEMPTS: Final = 6
+"""Half a minute: a radio link may be silent for so long."""
 MAX_FILE: Final = 4_000_000
 """Metadata of the largest autopilots has two; more is refused."""
 AUTOPILOT: Final = 1
@@ -80,8 +82,8 @@ class FileClient:
             return []
         if self._attempts >= MAX_ATTEMPTS:
             return self._end(now_us, read=False)
+        self._due_us = now_us + (RETRY_US << self._attempts)
         self._attempts += 1
-        self._due_us = now_us + RETRY_US
         return [self._message(self._asked)]
 
     def _on_ack(self, reading: _Reading, packet: Packet, now_us: int) -> list[Any]:

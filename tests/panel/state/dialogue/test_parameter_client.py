@@ -159,7 +159,7 @@ def test_a_file_that_is_not_there_is_refused() -> None:
 def test_a_vehicle_without_files_does_not_hold_up() -> None:
     files = FileClient(1)
     files.read("/general.json", 0)
-    for step in range(20):
+    for step in range(40):
         files.poll(step * US_PER_S)
     assert files.refused == {"/general.json"}
 
