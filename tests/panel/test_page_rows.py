@@ -13,7 +13,15 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.operator.control_socket import request
-from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.browsing import (
+    START_LIMIT_MS,
+    WAIT_MS,
+    Process,
+    needs_chromium,
+    open_page,
+    show,
+    wait_for,
+)
 from tests.panel.told_vehicle import ToldVehicle
 
 pytestmark = [
@@ -109,7 +117,10 @@ class TestFlightDisplay:
             vehicle.roll_deg, vehicle.pitch_deg = roll, pitch
             spoken = re.compile(f"^Roll {roll}.0°, pitch {pitch}.0°,")
             expect(display_of(page)).to_have_attribute("aria-label", spoken)
-            assert tuple(colour_at(page, *place) for place in (left, right, low)) == expected
+            wait_for(
+                lambda: tuple(colour_at(page, *place) for place in (left, right, low)) == expected,  # noqa: B023
+                lambda: f"{expected} at {roll}, {pitch}",  # noqa: B023
+            )
         vehicle.roll_deg = vehicle.pitch_deg = 0.0
 
     def test_row_compass(self, told: tuple[ToldVehicle, Page]) -> None:
@@ -178,10 +189,15 @@ def test_row_3d_from_two_viewpoints(page: Page) -> None:
     box = scene.bounding_box()
     assert box is not None
     clip = {"x": box["x"], "y": box["y"], "width": box["width"], "height": box["height"]}
-    picture = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
-    upper = picture.crop((0, 60, picture.width, picture.height // 2))
-    lower = picture.crop((0, picture.height // 2 + 60, picture.width, picture.height))
-    assert all(len(half.getcolors(1 << 24)) > 20 for half in (upper, lower))
+
+    def halves() -> list[Image.Image]:
+        """The two halves as soon as the browser has put what was drawn on the page."""
+        picture = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
+        middle = picture.height // 2
+        found = [picture.crop((0, y + 60, picture.width, y + middle)) for y in (0, middle)]
+        return found if all(len(half.getcolors(1 << 24)) > 20 for half in found) else []
+
+    upper, lower = wait_for(halves, lambda: "one colour")
     assert upper.tobytes() != lower.resize(upper.size).tobytes()
     choices.nth(0).select_option("above")
     before = scene.get_attribute("data-frames")
