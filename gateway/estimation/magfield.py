@@ -23,8 +23,6 @@ NEW_FIELD_S: Final = 20.0
 """Time in turning motion after which a steady other field becomes the usual one."""
 FIRST_FIELD_S: Final = 5.0
 TURNING_RADPS: Final = 0.35
-IRON_TAU_S: Final = 60.0
-"""The mean of the field is taken over this time: it holds turns in all directions."""
 STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
@@ -77,13 +75,6 @@ class FieldState:
     mag_new_dip: float
     mag_new_s: float
     mag_disturbed: int
-    mag_seen_s: float
-    """Time behind the means that follow."""
-    mag_norm_lp: float
-    mag_mean_norm: float
-    mag_mean_dip: float
-    mag_iron_ut2: float
-    """Mean square by which the field is off its own mean, along an axis."""
 
 
 @compiled
@@ -109,7 +100,6 @@ def take_field(s: FieldState, p: FieldGains, norm: float, down: float) -> float:
         return 0.0
     s.mag_s = s.time_s
     dip, dt = math.asin(down / norm), min(dt, STALE_MAG_S)
-    note_iron(s, norm, dip, dt)
     return compare_field(s, p, norm, dip, dt)
 
 
@@ -159,30 +149,6 @@ def compare_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: flo
         s.mag_reject_s += dt
         return 0.0
     return REJECT_SHARE
-
-
-@compiled
-def note_iron(s: FieldState, norm: float, dip: float, dt: float) -> None:
-    """Average how far the field's strength, which knows of no attitude, is off its mean.
-
-    Iron and current bend the field along all three axes alike: what they do to its strength tells
-    what they do to the heading.
-    """
-    s.mag_seen_s = min(s.mag_seen_s + dt, IRON_TAU_S)
-    share = dt / s.mag_seen_s
-    # The magnetometer's own noise is no iron.
-    s.mag_norm_lp += dt / min(s.mag_seen_s, SETTLE_S + dt) * (norm - s.mag_norm_lp)
-    stronger = s.mag_norm_lp - s.mag_mean_norm
-    s.mag_mean_norm += share * stronger
-    s.mag_mean_dip += share * (dip - s.mag_mean_dip)
-    s.mag_iron_ut2 += share * ((1.0 - share) * stronger * stronger - s.mag_iron_ut2)
-
-
-@compiled
-def iron_variance(s: FieldState) -> float:
-    """Return the variance of the compass's heading that iron makes, rad2."""
-    level_ut = s.mag_mean_norm * math.cos(s.mag_mean_dip)
-    return s.mag_iron_ut2 / max(level_ut * level_ut, MIN_FIELD_UT)
 
 
 @compiled

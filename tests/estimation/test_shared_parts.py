@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 import pytest
 
+from gateway.estimation.complementary.compass_error import compass_variance, note_strength
 from gateway.estimation.complementary.complementary_state import (
     ComplementarySettings,
     ComplementaryState,
@@ -19,8 +20,6 @@ from gateway.estimation.magfield import (
     CompassSettings,
     compare_field,
     field_unlikeness,
-    iron_variance,
-    note_iron,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
@@ -117,18 +116,29 @@ class TestField:
         self, iron_ut: float
     ) -> None:
         """A flat field of 30 uT with iron to the front, turned about down; white noise is none."""
-        state, rng, headings = new_record(ComplementaryState), np.random.default_rng(3), []
+        state, headings = new_record(ComplementaryState), []
+        rng = np.random.default_rng(3)
         for k in range(1200):
             angle = 0.3 * 0.05 * k
-            north = 30.0 * math.cos(angle) + iron_ut
-            east = -30.0 * math.sin(angle)
-            headings.append(math.remainder(math.atan2(-east, north) - angle, math.tau))
-            note_iron(state, math.hypot(north, east, 5.0) + rng.normal(0.0, 0.3), 0.17, 0.05)
-        seen = math.sqrt(iron_variance(state))
+            field = (30.0 * math.cos(angle) + iron_ut, -30.0 * math.sin(angle), 5.0)
+            headings.append(math.remainder(math.atan2(-field[1], field[0]) - angle, math.tau))
+            note_strength(state, field, math.hypot(*field) + rng.normal(0.0, 0.3), 0.05)
+        assert math.sqrt(compass_variance(state, GAINS)[0]) < 0.7 * GAINS.heading_noise_rad
+        state.level_by_gps = 1
+        variance, iron = compass_variance(state, GAINS)
+        assert variance == pytest.approx(GAINS.heading_noise_rad**2 + iron)
         if iron_ut:
-            assert np.std(headings) == pytest.approx(seen, rel=0.25)
+            assert np.std(headings) == pytest.approx(math.sqrt(iron), rel=0.25)
         else:
-            assert seen < 0.01
+            assert math.sqrt(iron) < 0.01
+
+    def test_a_compass_that_has_not_turned_is_as_good_as_expected(self) -> None:
+        state = new_record(ComplementaryState)
+        for _ in range(1200):
+            note_strength(state, (20.0, 0.0, 40.0), math.hypot(20.0, 40.0), 0.05)
+        variance, iron = compass_variance(state, GAINS)
+        assert math.sqrt(variance) == pytest.approx(GAINS.heading_noise_rad, rel=1e-6)
+        assert iron == 0.0
 
     def test_a_field_counts_by_its_unlikeness_to_the_usual_one(self) -> None:
         state = new_record(ComplementaryState)

@@ -53,7 +53,13 @@ class ComplementarySettings(Settings, frozen=True):
         setting("Slow error of the compass: iron, and the place.", "deg", ge=0.1, le=45.0),
     ] = 3.0
     gps_velocity_noise_mps: Annotated[
-        float, setting("Noise of the GPS velocity.", "m/s", ge=0.01, le=5.0)
+        float,
+        setting(
+            "Noise of the GPS velocity along an axis, where the receiver tells none.",
+            "m/s",
+            ge=0.01,
+            le=5.0,
+        ),
     ] = 0.3
     bias_initial_degps: Annotated[
         float, setting("Gyroscope bias to be expected at the start.", "deg/s", ge=0.01, le=20.0)
@@ -175,6 +181,13 @@ class ComplementaryState(FilterState):
     """Slow error of the compass."""
     compass_var: float
     """Within which that error is expected, rad2."""
+    field_seen_s: float
+    """Time behind the means that follow, see `compass_error`."""
+    field_direction_b: Annotated[FloatArray, (3,)]
+    strength_ut: float
+    strength_lp_ut: float
+    strength_var_ut2: float
+    """Mean square by which the strength is off its mean."""
     level_dip_rad: float
     """Mean dip that the compass shows while the level is known."""
     level_dip_s: float

@@ -14,13 +14,13 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.complementary.compass_error import compass_variance
 from gateway.estimation.complementary.complementary_state import (
     STATES,
     ComplementaryGains,
     ComplementaryState,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
-from gateway.estimation.magfield import bent_share_sq, iron_variance
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import (
     from_rotation_vector,
@@ -178,14 +178,8 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 @compiled
 def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
-    """Carry the compass's error on: it fades with time, and that of iron as the aircraft turns.
-
-    Without GPS there is nothing to weigh that of iron against, and it averages out over turns.
-    """
-    iron = steady_iron_variance(s)
-    if s.level_by_gps == 1:
-        iron += iron_variance(s)
-    variance = p.heading_noise_rad**2 + iron
+    """Carry the compass's error on: it fades with time, and that of iron as the aircraft turns."""
+    variance, iron = compass_variance(s, p)
     widen_compass(s, variance)
     still = variance - iron
     faded = (s.carried_s / p.tau_heading_s * still + s.carried_rad * iron) / variance
@@ -193,15 +187,6 @@ def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
     scale_state(s, COMPASS, kept)
     s.drift_cov[COMPASS, COMPASS] += (1.0 - kept * kept) * variance
     s.compass_rad *= kept
-
-
-@compiled
-def steady_iron_variance(s: ComplementaryState) -> float:
-    """Return the variance of the heading by iron that bends the dip of the field, rad2."""
-    share_sq = bent_share_sq(s.level_dip_rad, s.earth_dip_rad)
-    if s.level_dip_s == 0.0 or share_sq == 0.0:
-        return 0.0
-    return share_sq / max(math.cos(s.level_dip_rad) ** 2, share_sq)
 
 
 @compiled

@@ -10,6 +10,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.complementary.compass_error import note_dip, note_strength
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
@@ -24,7 +25,7 @@ from gateway.estimation.complementary.drift import (
     heading_variance,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import IRON_TAU_S, STALE_MAG_S, take_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, take_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -61,10 +62,14 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     dt = min(s.time_s - s.mag_s, STALE_MAG_S)
     north, east, down = rotate(as_quat(s.q_eb), mag_b)
     norm = math.sqrt(north * north + east * east + down * down)
+    if norm > MIN_FIELD_UT and dt > 0.0:
+        note_strength(s, mag_b, norm, dt)
     weight = take_field(s, p, norm, down)
     if weight <= 0.0:
         return
-    note_dip(s, math.asin(down / norm), dt)
+    usual = s.mag_norm_ref > 0.0 and s.mag_disturbed == 0
+    if usual and max(s.told_std[0], s.told_std[1]) < LEVEL_RAD:
+        note_dip(s, math.asin(down / norm), dt)
     declination = s.declination_rad
     if s.heading_known == 0 or math.isfinite(declination):
         s.heading_true = 1 if math.isfinite(declination) else s.heading_true
@@ -83,13 +88,3 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
     correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED)
-
-
-@compiled
-def note_dip(s: ComplementaryState, dip_rad: float, dt: float) -> None:
-    """Average the dip of the usual field while the level is known."""
-    usual = s.mag_norm_ref > 0.0 and s.mag_disturbed == 0
-    if not usual or max(s.told_std[0], s.told_std[1]) > LEVEL_RAD:
-        return
-    s.level_dip_s = min(s.level_dip_s + dt, IRON_TAU_S)
-    s.level_dip_rad += dt / s.level_dip_s * (dip_rad - s.level_dip_rad)

@@ -1,6 +1,7 @@
 """GPS fixes as they arrive: when they are blended, believed anew, or left out; and silences."""
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_velocity import (
@@ -11,6 +12,7 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_of_fix,
 )
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.columns import GPS_SPEED_ACC
 from gateway.estimation.complementary.accuracy import settle_place
 from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
@@ -54,6 +56,9 @@ from gateway.estimation.local_position import NEVER_S, is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
+
+SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)
+"""Of the accuracy of a velocity in space, along one axis."""
 
 
 @compiled
@@ -109,7 +114,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     align(s, p, at_s, vel, velocity_noise(told))
     look_back(s, wanted_s)
     past = past_state(s, s.then, lag)
-    noise_mps = p.gps_velocity_noise_mps if is_velocity_told(told) else WAY_NOISE_MPS
+    noise_mps = reported_noise(p, row) if is_velocity_told(told) else WAY_NOISE_MPS
     if not is_sound(told, FASTEST_MPS):
         told = velocity_from_position(s, pos, past)
     if not blend_or_restart(s, p, row, pos, told, past, lag):
@@ -122,6 +127,13 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
         if interval > 0.0 and s.at_rest == 1:
             update_bias_at_rest(s, p, interval)
     refresh(s)
+
+
+@compiled
+def reported_noise(p: ComplementaryGains, row: FloatArray) -> float:
+    """Return the noise of a fix's velocity along an axis: what the receiver tells, if anything."""
+    told = row[GPS_SPEED_ACC]
+    return float(told * SPATIAL_SHARE if told > 0.0 else p.gps_velocity_noise_mps)
 
 
 @compiled
