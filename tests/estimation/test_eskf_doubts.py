@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import TILT, EskfState
+from gateway.estimation.eskf.measure import update_by_compass
 from gateway.estimation.eskf.start import start_heading_by_compass
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
@@ -84,3 +85,19 @@ def test_a_rest_that_ended_in_a_silence_is_noticed_at_the_first_sample(
     after = imu(before[-1].time_us + 4_000_000 + 10_000, accel)
     state = last_state([*before, imu(after.time_us - 10_000, accel), after])
     assert (NavFlags.ATTITUDE_VALID in state.flags) is known
+
+
+def test_a_compass_is_weighed_by_the_iron_that_its_strength_shows_and_nothing_explains() -> None:
+    def gained(misfit_ut2: float) -> float:
+        """Return how much surer of the heading a second of compass makes the filter."""
+        s, told = new_record(EskfState), 0.1**2
+        s.q_nb[0], s.P[TILT + 2, TILT + 2] = 1.0, told
+        s.iron_norm, s.iron_misfit = 45.0, misfit_ut2
+        for _ in range(20):
+            update_by_compass(s, GAINS, field(60.0), 0.0, 1.0, 0.05)
+        return 1.0 / s.P[TILT + 2, TILT + 2] - 1.0 / told
+
+    assert gained(1.0) == gained(0.0)
+    # 9 uT of iron against 22 level: 22 degrees, for some 20 s.
+    assert gained(81.0) < 0.05 * gained(0.0)
+    assert gained(81.0) == pytest.approx((1.0 / 20.0) / (81.0 / 22.5**2), rel=0.1)

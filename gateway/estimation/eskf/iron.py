@@ -13,17 +13,18 @@ from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import clear, inject, propagate, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import MAG_BIAS, TILT, EskfState
-from gateway.estimation.eskf.measure import COMPASS_CORRELATION_S, compass_row
+from gateway.estimation.eskf.measure import (
+    COMPASS_CORRELATION_S,
+    MISFIT_S,
+    STRENGTH_NOISE,
+    compass_row,
+)
 from gateway.estimation.kernel_record import as_vec
 from gateway.estimation.magfield import FIELD_TAU_S, FIRST_FIELD_S, STALE_MAG_S
 from gateway.records import Vec3
 
 MEAN_S: Final = 60.0
 """The strength of the field itself stays the same over this time."""
-STRENGTH_NOISE: Final = 0.03
-"""Share by which the strength varies with no iron to find: soft iron, scale, currents."""
-MISFIT_S: Final = 20.0
-"""A strength that has varied for so long beyond its noise is that of unknown iron."""
 
 
 @compiled

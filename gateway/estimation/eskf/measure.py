@@ -48,6 +48,11 @@ UNAIDED_CORRELATION_S: Final = 1.0
 """The true speed that is taken for noise changes in about this time."""
 COMPASS_CORRELATION_S: Final = 0.6
 """The errors of soft iron and current change with the attitude, so in about this time."""
+STRENGTH_NOISE: Final = 0.03
+"""Share by which the field's strength varies with no iron to find: soft iron, scale, currents."""
+MISFIT_S: Final = 20.0
+"""A strength that has varied for so long beyond its noise is that of unknown iron; the heading's
+error by it lasts as long, for it changes with the attitude alone."""
 VELOCITY_GATE_SQ: Final = 9.0
 """A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
 FAR_SQ: Final = 1e12
@@ -234,6 +239,12 @@ def compass_row(s: EskfState, field_n: Vec3) -> None:
 
 
 @compiled
+def unexplained_iron_sq(s: EskfState) -> float:
+    """Return the variance, per axis, of what bends the field beyond the iron that is known, uT2."""
+    return max(s.iron_misfit - (STRENGTH_NOISE * s.iron_norm) ** 2, 0.0)
+
+
+@compiled
 def update_by_compass(
     s: EskfState, p: EskfGains, field_n: Vec3, declination: float, weight: float, dt: float
 ) -> None:
@@ -246,7 +257,9 @@ def update_by_compass(
         # The horizon rests on the accelerometer alone then: keep the field's dip out of it.
         consider(s, TILT, 2)
         consider(s, ACCEL_BIAS, 3)
-    update_scalar(s, wrap_pi(measured), repeated * p.mag_var / weight, p.gate_sq)
+    level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
+    lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
+    update_scalar(s, wrap_pi(measured), repeated * p.mag_var / weight + lasting, p.gate_sq)
     inject(s)
 
 
