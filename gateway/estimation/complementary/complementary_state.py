@@ -55,7 +55,7 @@ class ComplementarySettings(Settings, frozen=True):
     gps_velocity_noise_mps: Annotated[
         float,
         setting(
-            "Noise of the GPS velocity along an axis, where the receiver tells none.",
+            "Noise of the GPS velocity along an axis, unless the receiver tells more.",
             "m/s",
             ge=0.01,
             le=5.0,

@@ -131,9 +131,12 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
 
 @compiled
 def reported_noise(p: ComplementaryGains, row: FloatArray) -> float:
-    """Return the noise of a fix's velocity along an axis: what the receiver tells, if anything."""
+    """Return the noise of a fix's velocity along an axis: as set, or what the receiver tells.
+
+    What is set is the least: a receiver knows its noise, and not by how much it lags in manoeuvres.
+    """
     told = row[GPS_SPEED_ACC]
-    return float(told * SPATIAL_SHARE if told > 0.0 else p.gps_velocity_noise_mps)
+    return float(max(told * SPATIAL_SHARE if told > 0.0 else 0.0, p.gps_velocity_noise_mps))
 
 
 @compiled

@@ -110,7 +110,7 @@ def test_report_takes_the_name(
 
     def note(flight: Flight, **_: object) -> SimpleNamespace:
         reported.append(flight)
-        return SimpleNamespace(sections=[])
+        return SimpleNamespace(sections=[], smoothed_latency_s=None)
 
     monkeypatch.setattr("gateway.analysis.case.make_case", note)
     monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda case, _: case)
