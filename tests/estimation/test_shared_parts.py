@@ -6,12 +6,14 @@ from typing import Annotated
 import numpy as np
 import pytest
 
+from gateway.estimation.columns import GPS_COLUMNS, GPS_SPEED_ACC
 from gateway.estimation.complementary.compass_error import compass_variance, note_strength
 from gateway.estimation.complementary.complementary_state import (
     ComplementarySettings,
     ComplementaryState,
     make_gains,
 )
+from gateway.estimation.complementary.intake import reported_noise
 from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.local_position import PlaceState, is_relocked, move_origin
 from gateway.estimation.magfield import (
@@ -84,6 +86,17 @@ class TestRest:
 
     def test_never_in_flight(self) -> None:
         assert self.watch(lambda t: (0.0, 0.0, 0.0), moving=True) == 0
+
+
+@pytest.mark.parametrize(
+    ("told_mps", "noise_mps"), [(math.nan, 0.3), (0.1, 0.3), (3.0, math.sqrt(3.0))]
+)
+def test_a_receiver_that_calls_its_velocity_bad_is_believed(
+    told_mps: float, noise_mps: float
+) -> None:
+    row = np.full(GPS_COLUMNS, math.nan)
+    row[GPS_SPEED_ACC] = told_mps
+    assert reported_noise(GAINS, row) == pytest.approx(noise_mps)
 
 
 class TestField:

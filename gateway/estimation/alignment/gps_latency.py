@@ -232,6 +232,12 @@ def found_latency_std(s: LatencyState) -> float:
 
 
 @compiled
+def latency_to_use(found_s: float, set_s: float) -> float:
+    """Return the latency that is set, or the one that is found where it contradicts that, s."""
+    return max(found_s, 0.0) if abs(found_s - set_s) > CONTRADICTED_S else set_s
+
+
+@compiled
 def settle_latency(s: LatencyState, set_s: float, dt: float) -> None:
     """Move the latency in use to the one that is set, or that is found where they contradict.
 
@@ -244,8 +250,8 @@ def settle_latency(s: LatencyState, set_s: float, dt: float) -> None:
     dt : float
         Time since it was moved last, s.
     """
-    wanted, is_known = set_s, found_latency_std(s) < KNOWN_STD_S
-    if is_known and abs(s.found_latency_s - set_s) > CONTRADICTED_S:
-        wanted = max(s.found_latency_s, 0.0)
+    wanted = set_s
+    if found_latency_std(s) < KNOWN_STD_S:
+        wanted = latency_to_use(s.found_latency_s, set_s)
     most = SLEW * dt
     s.gps_latency_s += min(max(wanted - s.gps_latency_s, -most), most)

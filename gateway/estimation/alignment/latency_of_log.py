@@ -8,12 +8,12 @@ import numpy as np
 
 from gateway.compiled.entry_point import dispatched
 from gateway.estimation.alignment.gps_latency import (
-    CONTRADICTED_S,
     KNOWN_STD_S,
     LatencyState,
     begin_latency,
     close_window,
     found_latency_std,
+    latency_to_use,
     watch_latency,
 )
 from gateway.estimation.columns import ACCEL, GPS_USABLE, GPS_VEL, GYRO
@@ -74,9 +74,7 @@ def latency_of_flight(log: SampleLog, set_s: float) -> float:
         What is set, or what the manoeuvres show where they contradict it, s.
     """
     found = estimate_latency(log)
-    if found is None or abs(found.latency_s - set_s) <= CONTRADICTED_S:
-        return set_s
-    return found.latency_s
+    return set_s if found is None else latency_to_use(found.latency_s, set_s)
 
 
 @dispatched

@@ -135,8 +135,8 @@ def reported_noise(p: ComplementaryGains, row: FloatArray) -> float:
 
     What is set is the least: a receiver knows its noise, and not by how much it lags in manoeuvres.
     """
-    told = row[GPS_SPEED_ACC]
-    return float(max(told * SPATIAL_SHARE if told > 0.0 else 0.0, p.gps_velocity_noise_mps))
+    told = SPATIAL_SHARE * row[GPS_SPEED_ACC]
+    return float(told if told > p.gps_velocity_noise_mps else p.gps_velocity_noise_mps)
 
 
 @compiled

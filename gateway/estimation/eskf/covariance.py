@@ -58,7 +58,8 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     turned = p.gyro_roughness_sq * s.rough_gyro
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
     s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
-    add_axes_error(s, p)
+    if p.gyro_axes_var > 0.0:
+        add_axes_error(s, p)
     kept = math.exp(-dt / p.gps_wander_s)
     for k in range(3):
         s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
