@@ -29,6 +29,7 @@ from gateway.edges.operator.control_socket import ControlError, ControlServer, s
 from gateway.edges.operator.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
 from gateway.edges.operator.prometheus import MetricsServer
 from gateway.edges.operator.service import ServiceNotifier, set_realtime_priority
+from gateway.edges.reasons import reason_of
 from gateway.edges.receiver.pty_port import PtyPort
 from gateway.edges.receiver.serial_port import SerialPort
 from gateway.flightlog.recording_budget import RecordingBudget
@@ -48,7 +49,7 @@ from gateway.replay import header_for
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import AircraftStatus, Snapshot, Way
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import RecordingRequest, SavePlaces, SaveSettings
+from gateway.vehicle.actions import RecordingRequest, Request, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
 from gateway.vehicle.mark import distance_and_bearing
 from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
@@ -336,7 +337,7 @@ class Daemon:
                 case ClientInterval():
                     self._hub.set_interval(action)
                 case SaveSettings():
-                    self._save(action.vehicle_id)
+                    self._save(action)
                 case SavePlaces():
                     self._places.save(action.vehicle_id, action.places)
                 case RecordingRequest():
@@ -344,24 +345,24 @@ class Daemon:
                 case SettingsChanged():
                     self._recorder.settings_changed(action.vehicle_id)
 
-    def _save(self, vehicle_id: int) -> None:
-        """Write an aircraft's settings to its file, and announce the result."""
-        aircraft, loop = self._pipeline.find(vehicle_id), asyncio.get_running_loop()
-        what = (self._settings, vehicle_id, aircraft.settings)
+    def _save(self, save: SaveSettings) -> None:
+        """Write an aircraft's settings to its file, and report the outcome."""
+        aircraft, loop = self._pipeline.find(save.vehicle_id), asyncio.get_running_loop()
+        what = (self._settings, save.vehicle_id, aircraft.settings)
         saving = loop.run_in_executor(self._files, save_aircraft, *what)
-        saving.add_done_callback(partial(self._announce_saved, aircraft))
+        saving.add_done_callback(partial(self._on_saved, aircraft, save.request))
 
-    def _announce_saved(self, aircraft: Aircraft, saving: asyncio.Future[Path]) -> None:
-        vehicle_id = aircraft.vehicle_id
+    def _on_saved(self, aircraft: Aircraft, request: Request, saving: asyncio.Future[Path]) -> None:
+        vehicle_id, now_us = aircraft.vehicle_id, self.now_us()
         try:
-            file = saving.result()
+            text, stored = saving.result().name, True
         except OSError as error:
             log.warning("settings of aircraft %d cannot be saved: %s", vehicle_id, error)
-            status = StatusText(WARNING, f"Settings not saved: {error.strerror}")
+            text, stored = reason_of(error), False
         else:
-            log.info("settings of aircraft %d saved to %s", vehicle_id, file)
-            status = StatusText(INFO, f"Settings saved: {file.name}")
-        self._announce_for(aircraft, status)
+            log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
+        told = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
+        self._perform(aircraft.perform(told, now_us))
 
     def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
         status = StatusText(INFO, "Mission, mark and home are kept again")

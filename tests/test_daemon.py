@@ -1,6 +1,8 @@
 """The composition root: what is recorded of whom."""
 
 import asyncio
+import errno
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +18,15 @@ from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
-from gateway.vehicle.actions import SaveSettings
+from gateway.vehicle.actions import Request, SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
+STORE = mavlink.MAVLink_command_long_message(
+    1, 1, mavlink.MAV_CMD_PREFLIGHT_STORAGE, 0, 1, 0, 0, 0, 0, 0, 0
+)
 
 
 @pytest.fixture
@@ -44,12 +49,13 @@ def signing_daemon(folder: Path) -> Daemon:
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_a_signed_frame_is_taken_once_whatever_restarts(tmp_path: Path, orderly: bool) -> None:
+    # First, since it may compile for more than the minute in which a stamp is new.
+    first = signing_daemon(tmp_path)
     mav = mavlink.MAVLink(None, 255, 190)
     mav.signing.secret_key = key_from_passphrase("correct horse")
     mav.signing.sign_outgoing = True
     mav.signing.timestamp = (unix_time_us() - EPOCH_2015_US) // 10
     signed = Incoming(5, bytes(PING.pack(mav)), True)
-    first = signing_daemon(tmp_path)
     first._on_frame(signed)
     first._stamps.close(first._pipeline.newest_stamps() if orderly else {})
     assert first._pipeline.forged == 0
@@ -133,6 +139,42 @@ async def test_a_reload_tells_of_what_needs_a_new_start(
     daemon._hub.close()
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_full: bool
+) -> None:
+    file, seen = tmp_path / "1.toml", []
+    over = asyncio.get_running_loop().create_future()
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def note(sent: Outgoing) -> None:
+        message = mavlink.MAVLink(None).decode(bytearray(sent.frame))
+        if message.get_type() == "COMMAND_ACK":
+            seen.append((message.result, file.read_text() if file.exists() else ""))
+        elif message.get_type() == "STATUSTEXT" and message.text.startswith("Settings"):
+            over.set_result(message.text)
+
+    if is_full:
+        monkeypatch.setattr("gateway.config.write_new", fail)
+    monkeypatch.setattr(daemon._hub, "send", note)
+    bias = mavlink.MAVLink_param_set_message(1, 1, b"CAL_GYRO_BIAS_X", 0.01, 9)
+    for message in (bias, STORE):
+        daemon._on_frame(Incoming(5, frame(message), True))
+    assert seen == [(mavlink.MAV_RESULT_IN_PROGRESS, "")]
+    text = await over
+    [(result, stored)] = seen[1:]
+    if is_full:
+        assert (result, stored) == (mavlink.MAV_RESULT_FAILED, "")
+        assert text == "Settings not saved: No space left on device"
+    else:
+        assert (result, text) == (mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml")
+        assert "gyro_bias" in stored
+    daemon._metrics.close()
+    daemon._hub.close()
+
+
 async def test_files_of_settings_are_read_and_written_beside_the_loop(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -148,12 +190,11 @@ async def test_files_of_settings_are_read_and_written_beside_the_loop(
     for name in ("load_aircraft", "save_aircraft"):
         monkeypatch.setattr(f"gateway.daemon.{name}", noting(getattr(gateway.daemon, name)))
     monkeypatch.setattr(daemon, "_read", noting(daemon._read))
-    announced = asyncio.get_running_loop().create_future()
-    monkeypatch.setattr(daemon, "_announce_for", lambda _, status: announced.set_result(status))
-    daemon._perform([SaveSettings(1, ())])
+    outcome = asyncio.get_running_loop().create_future()
+    monkeypatch.setattr(daemon, "_on_saved", lambda *_: outcome.set_result(_[-1]))
+    daemon._perform([SaveSettings(1, Request(5, 255, 190, STORE, True))])
     await daemon.reload()
-    assert (await announced).text == "Settings saved: 1.toml"
-    assert (tmp_path / "1.toml").exists()
+    assert (await outcome).result() == tmp_path / "1.toml"
     assert len(threads) == 3
     assert threading.get_ident() not in threads
     daemon._metrics.close()

@@ -38,6 +38,8 @@ KNOCK_S: Final = 0.2
 open."""
 SILENT_US: Final = 3 * US_PER_S
 ACK_TIMEOUT_S: Final = 1.5
+PROGRESS_TIMEOUT_S: Final = 20.0
+"""After an acknowledgement that it is being carried out: a busy disk may take that long."""
 ATTEMPTS: Final = 3
 MAX_SENDERS: Final = 64
 """Programs that send through the panel under their own ids."""
@@ -85,7 +87,7 @@ class Uplink:
         self._heard: bytes | None = None
         self._heard_us = -SILENT_US
         self._local = self._told = ""
-        self._acks: dict[tuple[int, int], asyncio.Future[int]] = {}
+        self._acks: dict[tuple[int, int], asyncio.Queue[int]] = {}
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -177,14 +179,13 @@ class Uplink:
 
     async def _until_acknowledged(self, system_id: int, number: int, message: Any) -> None:
         name = mavlink.enums["MAV_CMD"][number].name if number in mavlink.enums["MAV_CMD"] else ""
-        answer = asyncio.get_running_loop().create_future()
-        self._acks[system_id, number] = answer
+        results: asyncio.Queue[int] = asyncio.Queue()
+        self._acks[system_id, number] = results
         try:
             for _ in range(ATTEMPTS):
                 self.send(message)
                 try:
-                    async with asyncio.timeout(ACK_TIMEOUT_S):
-                        result = await asyncio.shield(answer)
+                    result = await _outcome(results)
                 except TimeoutError:
                     continue
                 if result != mavlink.MAV_RESULT_ACCEPTED:
@@ -246,9 +247,8 @@ class Uplink:
 
     def _note_ack(self, message: Any) -> None:
         waiting = self._acks.get((message.get_srcSystem(), message.command))
-        in_progress = message.result == mavlink.MAV_RESULT_IN_PROGRESS
-        if waiting is not None and not waiting.done() and not in_progress:
-            waiting.set_result(message.result)
+        if waiting is not None:
+            waiting.put_nowait(message.result)
 
     async def _keep_alive(self) -> None:
         beat = mavlink.MAVLink_heartbeat_message(
@@ -285,6 +285,16 @@ class Uplink:
                     return int(listener["port"])
             await self._control.ask("clients.add", url=LOCAL_URL)
         return 0
+
+
+async def _outcome(results: asyncio.Queue[int]) -> int:
+    """Wait for the result of a command, longer once it is being carried out."""
+    async with asyncio.timeout(ACK_TIMEOUT_S):
+        result = await results.get()
+    while result == mavlink.MAV_RESULT_IN_PROGRESS:
+        async with asyncio.timeout(PROGRESS_TIMEOUT_S):
+            result = await results.get()
+    return result
 
 
 def _trusting(url: str) -> str:

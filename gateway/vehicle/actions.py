@@ -11,6 +11,29 @@ from gateway.settings import Settings
 from gateway.vehicle.stored import StoredPlaces
 
 
+class Reply(msgspec.Struct, frozen=True, gc=False):
+    """A message before it is encoded: to the client that asked, or to all."""
+
+    message: Any
+    client_id: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One checked message of a client to this vehicle."""
+
+    client_id: int
+    system_id: int
+    component_id: int
+    message: Any
+    may_change: bool
+    """Whether the client may change state: trusted, and signed where a key is set."""
+
+    def reply(self, message: Any) -> Reply:
+        """Answer the client that asked."""
+        return Reply(message, self.client_id)
+
+
 @dataclass(frozen=True, slots=True)
 class SettingsChange:
     """A section of this vehicle's settings has a new, already checked value: apply it live."""
@@ -26,10 +49,11 @@ class SettingsChange:
 
 @dataclass(frozen=True, slots=True)
 class SaveSettings:
-    """Store what differs from the settings file."""
+    """Store what differs from the settings file, and report the outcome to the vehicle."""
 
     vehicle_id: int
-    sections: tuple[tuple[str, Settings], ...]
+    request: Request
+    """Who waits for the outcome."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,28 +102,4 @@ Action = (
     | CalibrationMeasured
 )
 
-
-class Reply(msgspec.Struct, frozen=True, gc=False):
-    """A message before it is encoded: to the client that asked, or to all."""
-
-    message: Any
-    client_id: int | None = None
-
-
 Answer = Reply | Action
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """One checked message of a client to this vehicle."""
-
-    client_id: int
-    system_id: int
-    component_id: int
-    message: Any
-    may_change: bool
-    """Whether the client may change state: trusted, and signed where a key is set."""
-
-    def reply(self, message: Any) -> Reply:
-        """Answer the client that asked."""
-        return Reply(message, self.client_id)

@@ -27,7 +27,7 @@ from gateway.vehicle.encoder import Encoder
 from gateway.vehicle.home import Place
 from gateway.vehicle.reader import RequestReader
 from gateway.vehicle.services.calibrator import Calibrator
-from gateway.vehicle.services.commands import CommandService
+from gateway.vehicle.services.commands import ACCEPTED, FAILED, CommandService, read_command
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import IntervalService
 from gateway.vehicle.services.missions.places import PlaceService
@@ -40,7 +40,7 @@ from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.stamp_book import StampBook
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.announcements import Announcements
-from gateway.vehicle.telemetry.events import INFO, NOTICE, Announcer, StatusText
+from gateway.vehicle.telemetry.events import INFO, NOTICE, WARNING, Announcer, StatusText
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.motion import IN_AIR
 from gateway.vehicle.telemetry.telemetry import Telemetry
@@ -300,6 +300,29 @@ class Vehicle:
         self.health.recording = recording
         answers = self._recording.update(trouble, now_us, recording=recording)
         return self._finish(answers) if answers else []
+
+    def on_saved(self, request: Request, text: str, now_us: int, *, stored: bool) -> list[Action]:
+        """Acknowledge a request to store, and announce the outcome.
+
+        Parameters
+        ----------
+        request : Request
+            The one of `SaveSettings`.
+        text : str
+            Name of the file, or why it could not be written.
+        now_us : int
+            Gateway clock.
+        stored : bool
+            Whether the disk has the settings.
+
+        Returns
+        -------
+        list of Action
+        """
+        ack = read_command(request).ack(ACCEPTED if stored else FAILED)
+        saved = StatusText(INFO, f"Settings saved: {text}")
+        status = saved if stored else StatusText(WARNING, f"Settings not saved: {text}")
+        return self._finish([ack, *self._replies(self._announcements.say(status, now_us))])
 
     def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
         """Mark a place (its height may be NaN), or clear the mark.

@@ -9,9 +9,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.clock import GatewayClock
+from gateway.panel import uplink as panel_uplink
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture, Origin
-from gateway.panel.uplink import SYSTEM_ID, Uplink
+from gateway.panel.uplink import ACK_TIMEOUT_S, PROGRESS_TIMEOUT_S, SYSTEM_ID, Uplink
 
 pytestmark = pytest.mark.io
 LIMIT_S = 60.0
@@ -98,3 +99,22 @@ async def test_what_is_played_stays_in_the_panel(
         assert answered == [PLAYED]
     finally:
         uplink.close()
+
+
+@pytest.mark.parametrize("result", [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED])
+async def test_command_that_is_being_carried_out_is_waited_for_longer(
+    monkeypatch: pytest.MonkeyPatch, result: int
+) -> None:
+    results: asyncio.Queue[int] = asyncio.Queue()
+    progress = mavlink.MAV_RESULT_IN_PROGRESS
+    for answer in (progress, progress, result):
+        results.put_nowait(answer)
+    limits_s: list[float] = []
+
+    def timeout(limit_s: float) -> asyncio.Timeout:
+        limits_s.append(limit_s)
+        return asyncio.Timeout(None)
+
+    monkeypatch.setattr(asyncio, "timeout", timeout)
+    assert await panel_uplink._outcome(results) == result
+    assert limits_s == [ACK_TIMEOUT_S, PROGRESS_TIMEOUT_S, PROGRESS_TIMEOUT_S]

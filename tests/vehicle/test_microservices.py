@@ -61,7 +61,7 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "command/set-mode": (
         lambda: mavlink.MAVLink_set_mode_message(1, 1, 4), ACK, DENIED | {"command": 176},
     ),
-    "command/store": (command(245, 1), ACK, ACCEPTED),
+    "command/store": (command(245, 1), ACK, IN_PROGRESS),
     "command/start-recording": (command(2510), ACK, IN_PROGRESS),
     "command/stop-recording": (command(2511), ACK, ACCEPTED),
     # The messages that MAV_CMD_REQUEST_MESSAGE asks for follow its acknowledgement.

@@ -12,7 +12,14 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.settings import Settings
 from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange
-from gateway.vehicle.services.commands import ACCEPTED, UNSUPPORTED, Command, Outcome, whole
+from gateway.vehicle.services.commands import (
+    ACCEPTED,
+    IN_PROGRESS,
+    UNSUPPORTED,
+    Command,
+    Outcome,
+    whole,
+)
 from gateway.vehicle.services.parameters.parameters import Parameter, ParameterTable, decode_value
 
 BATCH: Final = 10
@@ -118,18 +125,18 @@ class ParameterService:
     def store(self, command: Command, _now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_STORAGE: store, or restore the defaults.
 
-        The defaults leave the sensors' calibration alone: it has its own reset.
+        What is stored is acknowledged by `Vehicle.on_saved`, when the disk has it. The defaults
+        leave the sensors' calibration alone: it has its own reset.
         """
         asked = whole(command.params[0])
-        sections = {k: v for k, v in self.table.sections.items() if k not in self._own}
         if asked == WRITE:
             own = [answer for section in self._own.values() for answer in section.store()]
-            return ACCEPTED, [SaveSettings(self._vehicle_id, tuple(sections.items())), *own]
+            return IN_PROGRESS, [SaveSettings(self._vehicle_id, command.request), *own]
         if asked not in (RESET, RESET_CALIBRATION):
             return UNSUPPORTED, []
         before = self._numbers()
         answers: list[Answer] = []
-        for key in sections:
+        for key in [key for key in self.table.sections if key not in self._own]:
             if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
                 fresh = self.table.reset(key)
                 answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))

@@ -186,12 +186,26 @@ def test_an_untrusted_client_changes_nothing_and_is_reported(station: GroundStat
     assert values(station)["TUNING_ORDER"] == 2.0, "reading is free"
 
 
-def test_storage_writes_only_when_asked(station: GroundStation) -> None:
+@pytest.mark.parametrize(
+    ("stored", "text", "result", "told"),
+    [
+        (True, "1.toml", mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml"),
+        (False, "disk full", mavlink.MAV_RESULT_FAILED, "Settings not saved: disk full"),
+    ],
+)
+def test_storage_is_acknowledged_when_the_disk_has_answered(
+    station: GroundStation, stored: bool, text: str, result: int, told: str
+) -> None:
     station.send(set_message("TUNING_ORDER", 5.0))
     assert station.of(SaveSettings) == []
-    assert station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)[0].result == 0
+    [ack] = station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)
+    assert ack.result == mavlink.MAV_RESULT_IN_PROGRESS
     [save] = station.of(SaveSettings)
-    assert dict(save.sections)["tuning"].order == 5
+    found = station.receive(station.vehicle.on_saved(save.request, text, 0, stored=stored))
+    assert kinds(found) == ["COMMAND_ACK", "STATUSTEXT"]
+    assert (found[0].command, found[0].result) == (mavlink.MAV_CMD_PREFLIGHT_STORAGE, result)
+    assert (found[0].target_system, found[1].text) == (255, told)
+    assert station.frames[-2].client_id == station.client_id, "only who asked"
 
 
 def test_storage_goes_back_to_the_defaults(station: GroundStation) -> None:
