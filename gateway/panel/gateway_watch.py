@@ -37,6 +37,8 @@ class GatewayWatch:
         self._control = control
         self._fleet = fleet
         self._task: asyncio.Task[None] | None = None
+        self._asking = asyncio.Lock()
+        """An answer to an earlier question must not come after that to a later one."""
 
     def start(self) -> None:
         """Start polling; needs a running event loop."""
@@ -48,7 +50,11 @@ class GatewayWatch:
             self._task.cancel()
 
     async def refresh(self) -> None:
-        """Poll now."""
+        """Poll now; what is known then is not older than the call."""
+        async with self._asking:
+            await self._refresh()
+
+    async def _refresh(self) -> None:
         try:
             status = await self._control.ask("status")
         except ControlError:

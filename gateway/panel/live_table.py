@@ -59,24 +59,28 @@ class LiveTable:
     def show(self, rows: Mapping[str, Cells]) -> None:
         """Show these rows, in this order."""
         self._empty.set_visibility(not rows)
-        if list(rows) != list(self._rows):
-            self._body.clear()
-            self._rows.clear()
-            self._cells.clear()
-            self._shown.clear()
-            with self._body:
-                for key, cells in rows.items():
+        for key in self._rows.keys() - rows.keys():
+            self._rows.pop(key).delete()
+            del self._cells[key], self._shown[key]
+        for place, (key, cells) in enumerate(rows.items()):
+            if key not in self._rows:
+                with self._body:
                     self._make(key, cells)
+            # A row that stays keeps its elements: a click on its button finds them.
+            row = self._rows[key]
+            if self._body.default_slot.children[place] is not row:
+                row.move(target_index=place)
+            self._update(key, cells)
+
+    def _update(self, key: str, cells: Cells) -> None:
+        shown = self._shown[key]
+        if cells == shown:
             return
-        for key, cells in rows.items():
-            if cells == self._shown[key]:
-                continue
-            shown = self._shown[key]
-            for label, (text, kind), old in zip(self._cells[key], cells, shown, strict=True):
-                if (text, kind) != old:
-                    label.set_text(text)
-                    label.classes(replace=kind)
-            self._shown[key] = cells
+        for label, (text, kind), old in zip(self._cells[key], cells, shown, strict=True):
+            if (text, kind) != old:
+                label.set_text(text)
+                label.classes(replace=kind)
+        self._shown[key] = cells
 
     def _make(self, key: str, cells: Cells) -> None:
         self._cells[key], self._shown[key] = [], cells

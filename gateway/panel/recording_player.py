@@ -60,6 +60,7 @@ class Playback:
         self._child: asyncio.subprocess.Process | None = None
         self._control: ControlClient | None = None
         self._watching: asyncio.Task[None] | None = None
+        self._opening, self._ordering = asyncio.Lock(), asyncio.Lock()
 
     @property
     def has_twin(self) -> bool:
@@ -83,7 +84,11 @@ class Playback:
         PlaybackError
             If it cannot be played.
         """
-        self.close()
+        async with self._opening:
+            self.close()
+            await self._open(folder, name, twin=twin)
+
+    async def _open(self, folder: Path, name: str, *, twin: bool) -> None:
         try:
             files = find_recording(folder, name).files
         except RecordingError as error:
@@ -122,26 +127,37 @@ class Playback:
         PlaybackError
             If none plays, or it refuses.
         """
-        if self._control is None:
+        async with self._ordering:
+            await self._order(verb, **params)
+
+    async def toggle(self) -> None:
+        """Pause or resume; raises as `order`."""
+        async with self._ordering:
+            playing = (self.status or {}).get("state") == "playing"
+            await self._order("play.pause" if playing else "play.resume")
+
+    async def _order(self, verb: str, **params: Any) -> None:
+        """Send one request, and take its answer for the player's present state.
+
+        One at a time: else the answer to an earlier one may come after that to a later one.
+        """
+        control, before = self._control, self.status
+        if control is None:
             raise PlaybackError("no recording is open")
-        before = self.status
         try:
-            self.status = await self._control.ask(verb, **params)
+            status = await control.ask(verb, **params)
         except ControlError as error:
             raise PlaybackError(str(error)) from error
-        went_back = before is not None and (
-            self.status["position_s"] < before["position_s"] - LEAP_S
-        )
+        if control is not self._control:
+            # Closed meanwhile.
+            return
+        self.status = status
+        went_back = before is not None and (status["position_s"] < before["position_s"] - LEAP_S)
         if verb == "seek" or went_back:
             # A seek must not be drawn as a path.
             for system_id in self.aircraft:
                 if vehicle := self._fleet.vehicles.get(system_id):
                     vehicle.begin_anew()
-
-    async def toggle(self) -> None:
-        """Pause or resume; raises as `order`."""
-        playing = (self.status or {}).get("state") == "playing"
-        await self.order("play.pause" if playing else "play.resume")
 
     async def refresh(self) -> None:
         """Poll the player's status; a player that has ended is closed."""
@@ -164,13 +180,15 @@ class Playback:
         return firsts
 
     async def _start(self, files: Sequence[Path], firsts: Sequence[int]) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="mavgate-playback-")
+        self._folder = tempfile.TemporaryDirectory(
+            prefix="mavgate-playback-", ignore_cleanup_errors=True
+        )
         socket = Path(self._folder.name) / "mavgate" / "play.sock"
         arguments = ["play", *map(str, files), "--loop", "--attached"]
         arguments += ["--endpoint", f"udp:127.0.0.1:{self._uplink.playback_port}"]
         for system_id in firsts:
             arguments += ["--as", str(system_id)]
-        self._child = await asyncio.create_subprocess_exec(
+        child = self._child = await asyncio.create_subprocess_exec(
             sys.executable,
             *("-m", "gateway.cli", *arguments),
             stdin=asyncio.subprocess.PIPE,
@@ -181,15 +199,20 @@ class Playback:
         self._control = ControlClient(socket)
         try:
             async with asyncio.timeout(READY_S):
-                while not socket.exists() and self._child.returncode is None:
+                while self.status is None and child.returncode is None:
                     await asyncio.sleep(STEP_S)
+                    # Its socket is there a moment before it answers.
+                    with suppress(PlaybackError):
+                        await self.order("play.status")
         except TimeoutError:
             log.warning("the player does not start in %.0f s", READY_S)
-        if self._child.returncode is not None or not socket.exists():
+        if self._child is not child:
+            # Closed meanwhile.
+            return
+        if self.status is None:
             text = await self._complaint()
             self.close()
             raise PlaybackError(text)
-        await self.order("play.status")
         self._watching = asyncio.create_task(self._watch())
 
     async def _watch(self) -> None:

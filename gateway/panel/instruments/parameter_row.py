@@ -28,8 +28,8 @@ class ParameterRow:
         self._meta = meta
         self._system_id = dialogue.parameters.system_id
         self._shown: object = None
-        self._value = dialogue.parameters.entries[meta.name].value
-        self._settled: float | None = self._value
+        value = dialogue.parameters.entries[meta.name].value
+        self._settled: float | None = value
         """What the field holds while nothing else is typed."""
         with ui.element("div").classes("parameter").props(f"data-name={meta.name}") as self._row:
             with ui.element("div"):
@@ -37,7 +37,7 @@ class ParameterRow:
                 ui.label(meta.short).classes("meaning").tooltip(meta.long or meta.short)
                 ui.label(_range_of(meta)).classes("range")
                 self._trouble = ui.label().classes("trouble").props("role=alert")
-            self._field = self._build_field()
+            self._field = self._build_field(value)
         self.refresh(dialogue)
 
     def refresh(self, dialogue: Dialogue) -> None:
@@ -56,23 +56,22 @@ class ParameterRow:
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
         if pending:
             return
-        self._value = value
         # What is typed and not sent yet stays.
         if self._field.value == self._settled:
             self._settled = value
             self._field.set_value(value)
 
-    def _build_field(self) -> Any:
+    def _build_field(self, value: float) -> Any:
         field: Any
         meta, may = self._meta, self._context.may_change
         label = f'dense outlined aria-label="{meta.name}"'
         if meta.choices:
             options = dict(meta.choices)
-            options.setdefault(self._value, f"{self._value:g}")
-            field = ui.select(options, value=self._value, on_change=lambda e: self._set(e.value))
+            options.setdefault(value, f"{value:g}")
+            field = ui.select(options, value=value, on_change=lambda e: self._set(e.value))
             field.props(f"{label} options-dense")
         else:
-            field = ui.number(value=self._value, suffix=meta.unit, format="%.7g")
+            field = ui.number(value=value, suffix=meta.unit, format="%.7g")
             field.props(f"{label} step=any hide-bottom-space")
             # Only a finished value is sent, not each typed digit.
             field.on("keydown.enter", lambda: self._set(field.value))
@@ -82,11 +81,14 @@ class ParameterRow:
 
     def _set(self, value: float | None) -> None:
         self._settled = value
-        if value is None or value == self._value:
+        name, dialogues = self._meta.name, self._context.parts.dialogues
+        parameters = dialogues.of(self._system_id).parameters
+        has_it = value == parameters.entries[name].value and name not in parameters.pending
+        if value is None or has_it:
             return
         try:
             self._context.check_may_change()
-            self._context.parts.dialogues.change(self._system_id, self._meta.name, float(value))
+            dialogues.change(self._system_id, name, float(value))
         except (ValueError, NotAllowedError) as error:
             ui.notify(str(error), type="negative")
             return

@@ -71,8 +71,10 @@ class LinkView:
 
     async def _add(self) -> None:
         with notify_failure(self._context):
-            await self._context.ask("clients.add", url=self._url.value.strip())
-            self._url.value = ""
+            url = self._url.value
+            await self._context.ask("clients.add", url=url.strip())
+            if self._url.value == url:
+                self._url.value = ""
             await self._context.parts.watch.refresh()
             self.refresh()
 

@@ -169,9 +169,11 @@ class RecordingsView:
 
     async def _save(self) -> None:
         with notify_failure(self._context):
-            await self._context.ask("record.save", name=self._name.value.strip())
-            ui.notify(f"Saved as {self._name.value.strip()}", type="positive")
-            self._name.value = ""
+            name = self._name.value
+            await self._context.ask("record.save", name=name.strip())
+            ui.notify(f"Saved as {name.strip()}", type="positive")
+            if self._name.value == name:
+                self._name.value = ""
             await self._context.parts.watch.refresh()
             await self.refresh()
 

@@ -1,0 +1,62 @@
+"""Parts of the page that stay the same while they are refreshed, built without a browser."""
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nicegui import Client
+from nicegui.page import page
+
+from gateway.panel.dialogues import Dialogue
+from gateway.panel.instruments.parameter_row import ParameterRow
+from gateway.panel.live_table import LiveTable, RowButton
+from gateway.panel.state.dialogue.parameter_client import ParameterEntry
+from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+
+NAME = "CAL_GYRO_BIAS_Z"
+
+
+@pytest.fixture(autouse=True)
+def _page() -> Iterator[None]:
+    with Client(page("/"), request=None):
+        yield
+
+
+def rows_of(table: LiveTable) -> list[Any]:
+    return table._body.default_slot.children
+
+
+def test_a_row_that_stays_keeps_its_button_when_others_come_and_go() -> None:
+    pressed: list[str] = []
+    table = LiveTable(("Name",), "None.", buttons=[RowButton("close", "Remove", pressed.append)])
+    table.show({"b": (("1", ""),), "d": (("2", ""),)})
+    first, second = rows_of(table)
+    table.show({"a": (("0", ""),), "d": (("3", "bad"),), "b": (("1", ""),), "e": (("4", ""),)})
+    assert rows_of(table)[1:3] == [second, first]
+    assert [row.props["data-key"] for row in rows_of(table)] == ["a", "d", "b", "e"]
+    assert table._cells["d"][0].text == "3"
+    table.show({"d": (("3", "bad"),)})
+    assert rows_of(table) == [second]
+    assert first.is_deleted
+    table.show({})
+    assert rows_of(table) == []
+
+
+def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answered() -> None:
+    sent: list[float] = []
+    dialogue = Dialogue(1)
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.0, 9, 0)
+
+    def change(_: int, name: str, value: float) -> None:
+        sent.append(value)
+        dialogue.parameters.change(name, value, 0)
+
+    dialogues = SimpleNamespace(of=lambda _: dialogue, change=change)
+    context: Any = SimpleNamespace(
+        may_change=True, check_may_change=lambda: None, parts=SimpleNamespace(dialogues=dialogues)
+    )
+    row = ParameterRow(context, dialogue, ParameterMeta(name=NAME))
+    for value in (0.0, 0.8, 0.0):
+        row._set(value)
+    assert sent == [0.8, 0.0]

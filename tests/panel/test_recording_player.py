@@ -1,0 +1,119 @@
+"""The page's player, beside processes and answers that come when the test says so."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.edges.operator.control_socket import ControlError
+from gateway.panel import recording_player
+from gateway.panel.recording_player import Playback
+from gateway.panel.state.fleet_picture import FleetPicture
+
+
+class Player:
+    """Takes every request at once; its answers wait for `answers`."""
+
+    def __init__(self, *, is_playing: bool = True) -> None:
+        self.asked: list[str] = []
+        self.answers = asyncio.Event()
+        self.answers.set()
+        self.refusals = 0
+        self._state = "playing" if is_playing else "paused"
+
+    async def ask(self, verb: str, **_: Any) -> dict[str, Any]:
+        self.asked.append(verb)
+        if self.refusals:
+            self.refusals -= 1
+            raise ControlError("nobody listens")
+        self._state = {"play.pause": "paused", "play.resume": "playing"}.get(verb, self._state)
+        answer = {"state": self._state, "position_s": 0.0}
+        await asyncio.sleep(0)
+        if verb == "play.status":
+            await self.answers.wait()
+        return answer
+
+
+@pytest.fixture
+def player() -> Player:
+    return Player()
+
+
+@pytest.fixture
+def playback(player: Player) -> Playback:
+    made = Playback(None, FleetPicture())  # type: ignore[arg-type]
+    made._control = player  # type: ignore[assignment]
+    made.status = {"state": "playing", "position_s": 0.0}
+    return made
+
+
+async def started(task: asyncio.Task[None], player: Player) -> asyncio.Task[None]:
+    while not player.asked:
+        await asyncio.sleep(0)
+    return task
+
+
+async def test_a_late_answer_does_not_undo_what_came_after_its_question(
+    playback: Playback, player: Player
+) -> None:
+    player.answers.clear()
+    asking = await started(asyncio.create_task(playback.refresh()), player)
+    pausing = asyncio.create_task(playback.toggle())
+    for _ in range(10):
+        await asyncio.sleep(0)
+    player.answers.set()
+    await asyncio.gather(asking, pausing)
+    assert playback.status is not None
+    assert playback.status["state"] == "paused"
+
+
+async def test_two_quick_presses_pause_and_resume(playback: Playback, player: Player) -> None:
+    await asyncio.gather(playback.toggle(), playback.toggle())
+    assert player.asked == ["play.pause", "play.resume"]
+
+
+async def test_an_answer_after_the_close_opens_nothing(playback: Playback, player: Player) -> None:
+    player.answers.clear()
+    asking = await started(asyncio.create_task(playback.refresh()), player)
+    playback.close()
+    player.answers.set()
+    await asking
+    assert playback.status is None
+
+
+class Child:
+    """A process that runs until it is ended."""
+
+    returncode: int | None = None
+
+    def terminate(self) -> None:
+        self.returncode = -15
+
+
+async def test_a_player_that_does_not_answer_at_once_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, player: Player
+) -> None:
+    """A socket is in its folder before its process listens to it."""
+    player.refusals = 3
+
+    async def start(*_: object, env: dict[str, str], **__: object) -> Child:
+        socket = Path(env["XDG_RUNTIME_DIR"]) / "mavgate" / "play.sock"
+        socket.parent.mkdir()
+        socket.touch()
+        return Child()
+
+    monkeypatch.setattr(recording_player, "STEP_S", 0.0)
+    monkeypatch.setattr(recording_player, "ControlClient", lambda _: player)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    monkeypatch.setattr(recording_player, "look_into", lambda _: [[]])
+    (tmp_path / "day_01.tlog").write_bytes(b"")
+
+    class Uplink:
+        playback_port = 1
+
+    playback = Playback(Uplink(), FleetPicture())  # type: ignore[arg-type]
+    await playback.open(tmp_path, "day", twin=False)
+    assert playback.status == {"state": "playing", "position_s": 0.0}
+    playback.close()
+    assert playback.status is None
