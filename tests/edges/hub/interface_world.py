@@ -5,6 +5,7 @@ what each of the two clients heard as JSON.
 """
 
 import asyncio
+import contextlib
 import json
 import socket
 import subprocess
@@ -78,17 +79,18 @@ class World:
             self.hub.send(Outgoing(frame, 30))
             self.sent += 1
             await asyncio.sleep(0.005)
-            try:
-                while self.near.recv(4096):
-                    self.heard += 1
-            except BlockingIOError:
-                continue
+            self.listen()
+
+    def listen(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while self.near.recv(4096):
+                self.heard += 1
 
     def state(self) -> str:
         return self.hub.clients()[1].state
 
     async def until_open(self) -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(60):
             while any(client.state != "open" for client in self.hub.clients()):
                 await asyncio.sleep(0.01)
 
@@ -112,6 +114,7 @@ async def fly(far: "subprocess.Popen[str]") -> dict[str, object]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
         last.sendto(b"", FAR_END)
     far_heard = (await asyncio.to_thread(far.stdout.read)).count("frame")
+    world.listen()
     return {
         "state while down": state_down,
         "dropped while down": dropped,

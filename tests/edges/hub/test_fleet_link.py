@@ -270,6 +270,8 @@ class TestTrouble:
         hub.send(rig.out(rig.vehicle.attitude()))
         while not station.is_silent():
             pass
+        # Blocking reads: the loop does nothing meanwhile.
+        station.socket.settimeout(LIMIT_S)
         router.signal(signal.SIGSTOP)
         for _ in range(5000):
             for frame in (rig.vehicle.raw_imu(), rig.vehicle.command(1, 1)):

@@ -223,7 +223,7 @@ async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
         ["unshare", "--net", sys.executable, program],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
         check=False,
     )
     if "not permitted" in run.stderr:

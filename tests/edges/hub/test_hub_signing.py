@@ -106,12 +106,15 @@ async def test_frames_of_others_stay_as_they_came(rig: Any) -> None:
     autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
     for said in [pilot.heartbeat() for pilot in autopilots]:
         source.say(said)
-    await rig.until(lambda: len(hub.clients()) == 2)
-    await rig.quiet()
+
+    def received() -> int:
+        return sum(client.received for client in hub.clients())
+
+    await rig.until(lambda: received() == 1 + len(autopilots))
     said = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
     for frame in said:
         source.say(frame)
-    await rig.quiet()
+    await rig.until(lambda: received() == 1 + len(autopilots) + len(said))
     hub.send(rig.out(rig.vehicle.raw_imu()))
     got = []
     while not got or (got[-1][5:7], message_id_of(got[-1])) != (b"\1\1", 27):

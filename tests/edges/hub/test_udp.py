@@ -19,7 +19,7 @@ async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: An
     hub.send(rig.out(attitude))
     assert await station.receive() == attitude
     hub.send(rig.out(heartbeat))
-    data, station.target = station.socket.recvfrom(100)
+    data, station.target = await asyncio.get_running_loop().sock_recvfrom(station.socket, 100)
     assert data == heartbeat
     said = station.sender.heartbeat()
     station.say(said)
@@ -141,7 +141,7 @@ async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> 
         await rig.until(lambda: hub.clients()[0].received == 2)
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))
-        assert again.recv(100) == frame
+        assert await asyncio.get_running_loop().sock_recv(again, 100) == frame
     assert len(hub.clients()) == 1
 
 
@@ -197,7 +197,7 @@ async def test_a_station_that_starts_late_loses_nothing_after_its_start(rig: Any
         started.bind(("127.0.0.1", late.port))
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))
-        assert started.recv(100) == frame
+        assert await asyncio.get_running_loop().sock_recv(started, 100) == frame
 
 
 async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,7 +339,9 @@ async def test_packed_frames_share_a_datagram(rig: Any) -> None:
     assert hub.clients()[0].sent == 5
 
 
-async def test_packing_waits_for_nothing_but_what_comes_at_once(rig: Any) -> None:
+async def test_packing_waits_for_nothing_but_what_comes_at_once(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two datagrams that are read at one wake-up go on as one, without a timer."""
     station = rig.station()
     hub = rig.hub("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}?pack=1100")
@@ -349,23 +351,29 @@ async def test_packing_waits_for_nothing_but_what_comes_at_once(rig: Any) -> Non
     source.say(source.sender.heartbeat())
     assert (await station.receive())[5] == 42
     frames = [source.sender.attitude() for _ in range(3)]
+    loop = asyncio.get_running_loop()
+    now_s = loop.time()
+    monkeypatch.setattr(loop, "time", lambda: now_s)
     for frame in frames:
         source.say(frame)
-    for _ in range(20):
-        await asyncio.sleep(0)
-    assert station.socket.recv(2000) == b"".join(frames)
+    assert await station.receive() == b"".join(frames)
     assert hub._gathering == {}
 
 
-async def test_packing_may_wait(rig: Any) -> None:
+async def test_packing_may_wait(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     station = rig.station()
     hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=1100&wait=20")
     await rig.until_open(hub)
+    loop = asyncio.get_running_loop()
+    now_s = [loop.time()]
+    monkeypatch.setattr(loop, "time", lambda: now_s[0])
     frames = [rig.vehicle.attitude() for _ in range(3)]
     for frame in frames:
         hub.send(rig.out(frame))
+        now_s[0] += 0.006
         await asyncio.sleep(0)
         assert station.is_silent()
+    now_s[0] += 0.003
     assert await station.receive() == b"".join(frames)
 
 
@@ -416,7 +424,7 @@ async def test_ipv6_on_both_kinds(rig: Any) -> None:
         await rig.until_open(hub)
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))
-        assert station.recv(100) == frame
+        assert await asyncio.get_running_loop().sock_recv(station, 100) == frame
         station.sendto(rig.sender(255, 190).heartbeat(), ("::1", hub.listening_ports()[0]))
         await rig.until(lambda: len(hub.clients()) == 2)
     assert all(client.trusted for client in hub.clients())

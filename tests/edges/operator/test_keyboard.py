@@ -13,7 +13,7 @@ from gateway.edges.operator.keyboard import Keyboard, keys_of
 
 pytestmark = pytest.mark.io
 
-LIMIT_S = 30
+LIMIT_S = 60
 LOCAL_FLAGS = 3
 
 

@@ -215,8 +215,8 @@ class TestServer:
     ) -> None:
         monkeypatch.setattr(prometheus, "RETRY_S", 0.0)
         server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
-        with socket.create_server(("127.0.0.1", 0)) as taken:
-            port = taken.getsockname()[1]
+        port = free_port()
+        with socket.create_server(("127.0.0.1", port)):
             server.listen(port)
             await asyncio.sleep(0)
             (stats,) = server.listeners()

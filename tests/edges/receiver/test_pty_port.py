@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -72,7 +73,15 @@ async def play() -> Iterator[Callable[..., PtyPort]]:  # type: ignore[misc]
 
 
 async def test_every_frame_arrives(play: Callable[..., PtyPort]) -> None:
-    port = play(frames(2000))
+    def paced() -> Iterator[TimedFrame]:
+        for sent, frame in enumerate(frames(2000)):
+            # The kernel keeps some kB only, and hands them over when it has the time.
+            while sent > 100 and sent - len(reader.events) > 100:
+                select.select([reader._port], [], [], 60.0)
+                reader._read()
+            yield frame
+
+    port = play(paced())
     reader = Reader(port.path)
     port.start()
     await reader.until(2000)
@@ -156,10 +165,13 @@ async def test_goes_on_after_a_standstill(
     # An hour passes for the loop's clock: only the frame that is late comes at once.
     loop = asyncio.get_running_loop()
     clock = loop.time
+    begin_s = clock()
     monkeypatch.setattr(loop, "time", lambda: clock() + 3600.0)
     await reader.until(6)
     reader.close()
-    assert port.written < 20
+    port.close()
+    # On a busy machine more of them have become due meanwhile.
+    assert port.written <= 20 + 100 * (clock() - begin_s)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
