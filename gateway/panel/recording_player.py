@@ -23,8 +23,9 @@ from gateway.panel.uplink import Uplink
 
 log = logging.getLogger(__name__)
 
-READY_S: Final = 120.0
-"""A table of hours is opened in some seconds; a first start compiles."""
+READY_S: Final = 600.0
+"""A table of hours is opened in some seconds; a first start compiles, for minutes on a busy PC.
+A player that fails is noticed when it ends."""
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
 LEAP_S: Final = 0.5
