@@ -152,7 +152,6 @@ class Daemon:
             self._receiver.start()
         self._opening = asyncio.get_running_loop().create_task(self._open_control())
         self._poll()
-        self._notifier.ready()
 
     async def control_socket(self) -> Path:
         """Wait until the control socket listens, and return its path."""
@@ -278,6 +277,7 @@ class Daemon:
             await self._control.start()
         except ControlError as error:
             log.warning("no orders can be taken: %s", error)
+        self._notifier.ready()
 
     def _table_head(self, vehicle_id: int) -> TableHeader:
         return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)

@@ -18,6 +18,7 @@ from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
+from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.actions import Request, SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -33,7 +34,7 @@ STORE = mavlink.MAVLink_command_long_message(
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    settings = GatewaySettings(aircraft_folder=str(tmp_path))
+    settings = GatewaySettings(aircraft_folder=str(tmp_path), hub=HubSettings(endpoints=()))
     made = Daemon(settings, {}, lambda: settings)
     made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
     return made
@@ -123,6 +124,18 @@ async def test_what_is_due_is_neither_asked_for_without_rest_nor_forgotten(
     assert 0.001 <= delays[-1] <= 0.1
     assert daemon._timer is not None
     daemon._timer.cancel()
+
+
+async def test_it_is_ready_once_orders_can_be_taken(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready: list[bool] = []
+    control = daemon._control.path
+    monkeypatch.setattr(daemon._notifier, "ready", lambda: ready.append(control.is_socket()))
+    daemon.start()
+    await daemon.control_socket()
+    daemon.close()
+    assert ready == [True]
 
 
 @pytest.mark.parametrize("estimator", ["complementary", "eskf"])
