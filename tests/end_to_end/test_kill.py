@@ -16,7 +16,6 @@ def test_kills_and_cuts_lose_at_most_the_last_second() -> None:
         [sys.executable, str(TOOL), "--kills", "3", "--seed", "7"],
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert done.returncode == 0, done.stderr
