@@ -1,9 +1,11 @@
 """The gateway as a service: readiness, metrics, settings changed while it flies."""
 
-import contextlib
 import itertools
+import queue
 import signal
 import socket
+import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,43 +26,67 @@ metrics_port = {metrics}
 """
 
 
+class Systemd:
+    """Takes what a service tells as soon as it is told: the kernel would keep only a few of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.signs_of_life = 0
+        self._told: queue.Queue[bytes] = queue.Queue()
+        self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._sock.bind(str(path))
+        self._path = str(path)
+        self._thread = threading.Thread(target=self._take)
+        self._thread.start()
+
+    def _take(self) -> None:
+        while text := self._sock.recv(200).partition(b"\n")[0]:
+            if text == b"WATCHDOG=1":
+                self.signs_of_life += 1
+            else:
+                self._told.put(text)
+
+    def told(self) -> bytes:
+        """Wait for what is told next, but for signs of life."""
+        return self._told.get(timeout=START_LIMIT_S)
+
+    def is_alive(self) -> None:
+        """Wait for two signs of life, and for nothing else."""
+        wanted = self.signs_of_life + 2
+        until(lambda: self.signs_of_life >= wanted)
+        assert self._told.empty()
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
+            last.sendto(b"", self._path)
+        self._thread.join()
+        self._sock.close()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition."""
+    deadline_s = time.monotonic() + START_LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
 @pytest.fixture
-def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-        sock.bind(str(tmp_path / "notify"))
-        sock.settimeout(60)
-        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        monkeypatch.setenv("WATCHDOG_USEC", "200000")
-        yield sock
-
-
-def told(systemd: socket.socket) -> bytes:
-    """Return what is told next, but for signs of life."""
-    while (text := systemd.recv(200).partition(b"\n")[0]) == b"WATCHDOG=1":
-        pass
-    return text
-
-
-def signs_of_life(systemd: socket.socket) -> int:
-    """Count what has come; the kernel keeps only a few."""
-    signs = []
-    systemd.setblocking(False)
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            signs.append(systemd.recv(200))
-    systemd.settimeout(60)
-    assert set(signs) <= {b"WATCHDOG=1"}
-    return len(signs)
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Systemd]:
+    systemd = Systemd(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", "200000")
+    yield systemd
+    systemd.close()
 
 
 def test_a_reload_changes_clients_and_leaves_no_gap(
     start_gateway: Callable[..., Gateway],
     connect: Callable[..., Client],
-    systemd: socket.socket,
+    systemd: Systemd,
     tmp_path: Path,
 ) -> None:
     gateway = start_gateway("demo")
-    assert told(systemd) == b"READY=1"
+    assert systemd.told() == b"READY=1"
     steady = connect(gateway.port)
     steady.until(lambda seen: "ATTITUDE_QUATERNION" in seen)
     extra, metrics = free_ports(2)
@@ -74,10 +100,10 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
             )
 
     follow(50)
-    assert signs_of_life(systemd) > 1
+    systemd.is_alive()
     settings.write_text(CHANGED.format(port=gateway.port, extra=extra, metrics=metrics))
     gateway.process.send_signal(signal.SIGHUP)
-    assert [told(systemd), told(systemd)] == [b"RELOADING=1", b"READY=1"]
+    assert [systemd.told(), systemd.told()] == [b"RELOADING=1", b"READY=1"]
     follow(50)
     newcomer = connect(extra)
     seen = newcomer.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
@@ -88,13 +114,13 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert f'remote="127.0.0.1:{extra}"' in text
     settings.write_text("[hub]\nendpoints = 7\n")
     gateway.process.send_signal(signal.SIGHUP)
+    until(lambda: "settings not reloaded" in gateway.log.read_text())
     follow(100)
     steps = {(after - before) % 256 for before, after in itertools.pairwise(numbers)}
     assert steps == {1}
-    assert signs_of_life(systemd) > 1
+    systemd.is_alive()
     assert gateway.stop() == 0
-    assert told(systemd) == b"STOPPING=1"
-    assert "settings not reloaded" in gateway.log.read_text()
+    assert systemd.told() == b"STOPPING=1"
 
 
 def test_a_reload_changes_the_signing(
@@ -160,7 +186,8 @@ def test_orders_reach_the_hub(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     gateway = start_gateway("demo")
-    connect(gateway.port).until(lambda seen: "HEARTBEAT" in seen)
+    # Of the aircraft, which is heard after the control socket is there.
+    connect(gateway.port).until(lambda seen: "ATTITUDE" in seen)
     control = socket_path("run")
     extra = free_port()
     url = f"udp:127.0.0.1:{extra}?name=tablet&allow=HEARTBEAT"

@@ -19,6 +19,7 @@ from gateway.cli.support.fetching import FetchError, PiecePace, RecordingFetch
 from gateway.edges.hub.fleet_link.query_answers import RefusedQueryError
 from gateway.edges.hub.fleet_link.recording_answers import MAX_PIECE, RecordingAnswers
 from gateway.edges.operator.control_socket import ControlError, request
+from tests.edges.hub.conftest import LIMIT_S
 from tests.fleet.conftest import World
 
 pytestmark = pytest.mark.io
@@ -96,7 +97,7 @@ class TestOverTheSession:
         def noting(verb: str, params: dict[str, Any], wait_s: float) -> Any:
             asked.append((verb, params.get("offset")))
             if len(asked) == 20:
-                assert gone.wait(30)
+                assert gone.wait(LIMIT_S)
             return ask(verb, params, wait_s)
 
         def wait(seconds: float) -> None:

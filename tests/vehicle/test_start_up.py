@@ -60,8 +60,11 @@ def load_parameters(station: GroundStation) -> dict[int, Any]:
     while len(had()) < count and silence_s < 0.1:
         fresh = "PARAM_VALUE" in kinds(station.wait(station.slice_s))
         silence_s = 0.0 if fresh else silence_s + station.slice_s
-    for index in set(range(count)) - set(had()):
-        read = mavlink.MAVLink_param_request_read_message(SYSTEM, COMPONENT, b"", index)
+    for _ in range(20 * count):
+        # What comes next may be another one: still of the list, or asked for before.
+        if not (missing := set(range(count)) - set(had())):
+            break
+        read = mavlink.MAVLink_param_request_read_message(SYSTEM, COMPONENT, b"", min(missing))
         station.ask(read, "PARAM_VALUE", retries=20, timeout_s=0.01)
     assert set(had()) == set(range(count))
     return had()

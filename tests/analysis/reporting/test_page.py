@@ -116,7 +116,7 @@ def test_a_browser_shows_the_page(folder: Path, tmp_path: Path, width: int, heig
             f"--window-size={width},{height}", f"--screenshot={picture}",
             (folder / "index.html").as_uri(),
         ],
-        check=True, capture_output=True, timeout=60,
+        check=True, capture_output=True, timeout=240,
     )  # fmt: skip
     with Image.open(picture) as image:
         assert image.size == (width, height)

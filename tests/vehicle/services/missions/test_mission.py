@@ -64,10 +64,18 @@ def download(station: GroundStation, kind: int = MISSION) -> list[Any]:
     listing = mavlink.MAVLink_mission_request_list_message(1, 1, kind)
     [first, *_] = station.ask(listing, "MISSION_COUNT", retries=20)
     assert first.mission_type == kind
-    found = []
-    for seq in range(first.count):
-        answers = station.ask(request(seq, kind), "MISSION_ITEM_INT", retries=20, timeout_s=0.25)
-        found.append(next(m for m in answers if m.seq == seq))
+
+    def ask_for(seq: int) -> Any:
+        for _ in range(20):
+            # An item that was asked for twice is answered twice.
+            for m in station.ask(
+                request(seq, kind), "MISSION_ITEM_INT", retries=20, timeout_s=0.25
+            ):
+                if m.seq == seq:
+                    return m
+        raise AssertionError(f"item {seq} never came")
+
+    found = [ask_for(seq) for seq in range(first.count)]
     station.send(mavlink.MAVLink_mission_ack_message(1, 1, ACCEPTED, kind))
     return found
 
