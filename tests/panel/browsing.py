@@ -56,7 +56,9 @@ needs_chromium = pytest.mark.skipif(
 
 
 def launch(playwright: Playwright) -> Browser:
-    return playwright.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+    return playwright.chromium.launch(
+        executable_path=str(CHROMIUM), args=ARGUMENTS, timeout=START_LIMIT_MS
+    )
 
 
 class Process:

@@ -33,8 +33,12 @@ def documented_page(port: int) -> str:
 @pytest.fixture
 async def page() -> AsyncIterator[Page]:
     async with async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield await browser.new_page()
+        browser = await playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=4000 * LIMIT_S
+        )
+        page = await browser.new_page()
+        page.set_default_timeout(1000 * LIMIT_S)
+        yield page
         await browser.close()
 
 
