@@ -43,8 +43,8 @@ def test_a_row_that_stays_keeps_its_button_when_others_come_and_go() -> None:
     assert rows_of(table) == []
 
 
-def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answered() -> None:
-    sent: list[float] = []
+def row_of(sent: list[float]) -> tuple[ParameterRow, Dialogue]:
+    """Build a row of a parameter that is 0, of an aircraft that never answers."""
     dialogue = Dialogue(1)
     dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.0, 9, 0)
 
@@ -56,7 +56,29 @@ def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answe
     context: Any = SimpleNamespace(
         may_change=True, check_may_change=lambda: None, parts=SimpleNamespace(dialogues=dialogues)
     )
-    row = ParameterRow(context, dialogue, ParameterMeta(name=NAME))
+    return ParameterRow(context, dialogue, ParameterMeta(name=NAME)), dialogue
+
+
+def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answered() -> None:
+    sent: list[float] = []
+    row, _ = row_of(sent)
     for value in (0.0, 0.8, 0.0):
         row._set(value)
     assert sent == [0.8, 0.0]
+
+
+def test_what_is_typed_is_not_written_over_by_its_own_answer() -> None:
+    sent: list[float] = []
+    row, dialogue = row_of(sent)
+    row._field.set_value(0.8)
+    row._set(0.8)
+    # As 32 bits have it.
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.800000011920929, 9, 0)
+    dialogue.parameters._changes.clear()
+    row.refresh(dialogue)
+    assert row._field.value == 0.8
+    row._set(0.8)
+    assert sent == [0.8]
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.5, 9, 0)
+    row.refresh(dialogue)
+    assert row._field.value == 0.5

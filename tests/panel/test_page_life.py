@@ -101,6 +101,7 @@ def test_viewer_looks_over_tls_and_does_not_touch(
         "fetch('/recordings/forged', {method: 'PUT', body: 'x'}).then((answer) => answer.status)"
     )
     assert status == 403
-    aircraft = request(tmp_path / "mavgate" / "run.sock", "status")["aircraft"]
+    socket = tmp_path / "mavgate" / "run.sock"
+    aircraft = request(socket, "status", timeout_s=WAIT_MS / 1000)["aircraft"]
     assert [one["mark"] for one in aircraft] == [None, None]
     page.close()

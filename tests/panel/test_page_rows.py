@@ -297,7 +297,7 @@ def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
     )
     expect(view.locator(".pin.mark")).to_be_visible()
     socket = demo.log.parent / "mavgate" / "run.sock"
-    aircraft, _ = request(socket, "status")["aircraft"]
+    aircraft, _ = request(socket, "status", timeout_s=WAIT_MS / 1000)["aircraft"]
     # Until the mark is acknowledged, it is known by rounded distance and bearing alone.
     page.wait_for_function(
         "(mark) => ['lat_deg', 'lon_deg'].every("

@@ -54,7 +54,7 @@ class Desk:
 
     @property
     def status(self) -> dict[str, Any]:
-        return request(self.folder / "mavgate" / "run.sock", "status")
+        return request(self.folder / "mavgate" / "run.sock", "status", timeout_s=WAIT_MS / 1000)
 
     @property
     def home(self) -> tuple[float, float]:

@@ -50,14 +50,12 @@ class ParameterRow:
         self._shown = (value, trouble, pending)
         self._trouble.set_text("waiting for the answer …" if pending else trouble)
         self._trouble.set_visibility(bool(trouble) or pending)
-        changed = math.isfinite(self._meta.default) and not math.isclose(
-            value, self._meta.default, rel_tol=1e-6, abs_tol=1e-12
-        )
+        changed = math.isfinite(self._meta.default) and not _is_same(value, self._meta.default)
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
         if pending:
             return
-        # What is typed and not sent yet stays.
-        if self._field.value == self._settled:
+        # What is typed and not sent yet stays; what is the same needs no writing over.
+        if self._field.value == self._settled and not _is_same(self._settled, value):
             self._settled = value
             self._field.set_value(value)
 
@@ -81,10 +79,12 @@ class ParameterRow:
 
     def _set(self, value: float | None) -> None:
         self._settled = value
+        if value is None:
+            return
         name, dialogues = self._meta.name, self._context.parts.dialogues
         parameters = dialogues.of(self._system_id).parameters
-        has_it = value == parameters.entries[name].value and name not in parameters.pending
-        if value is None or has_it:
+        has_it = name not in parameters.pending and _is_same(value, parameters.entries[name].value)
+        if has_it:
             return
         try:
             self._context.check_may_change()
@@ -93,6 +93,11 @@ class ParameterRow:
             ui.notify(str(error), type="negative")
             return
         self._shown = None
+
+
+def _is_same(value: float | None, other: float) -> bool:
+    """Compare to the digits of a parameter on the wire, which has 32 bits."""
+    return value is not None and math.isclose(value, other, rel_tol=1e-6, abs_tol=1e-12)
 
 
 def _range_of(meta: ParameterMeta) -> str:
