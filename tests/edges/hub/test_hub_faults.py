@@ -26,7 +26,10 @@ FRAMES = 2000
 
 TCP_CLIENT = """
 import socket, sys
-link = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+link = socket.socket()
+# Little room, which is soon full.
+link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+link.connect(("127.0.0.1", int(sys.argv[1])))
 print("up", flush=True)
 while link.recv(4096):
     pass
