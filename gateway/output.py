@@ -95,9 +95,13 @@ def write_new(
         As `check_output`, or if the disk fails.
     """
     check_output(path, inputs, overwrite=overwrite)
-    claimed = _claim(path)
+    claimed = not overwrite
+    if claimed:
+        # So that no other program takes the name. What may be replaced needs no such thing, and
+        # whoever looks, or starts after a power loss, finds it whole or not at all.
+        path.touch(exist_ok=False)
     if rights is None:
-        rights = READABLE & ~_mask() if claimed else stat.S_IMODE(path.stat().st_mode)
+        rights = stat.S_IMODE(path.stat().st_mode) if path.exists() else READABLE & ~_mask()
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
     fresh, size = Path(name), 0
     try:
@@ -126,15 +130,6 @@ def sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _claim(path: Path) -> bool:
-    """Create the file, so that no other program takes the name; False if it exists."""
-    try:
-        path.touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True
 
 
 def _mask() -> int:

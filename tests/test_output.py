@@ -96,6 +96,17 @@ def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(tmp_path: Path) ->
     assert (tmp_path / "a").read_bytes() == b"first"
 
 
+def test_what_may_be_replaced_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    """A gateway that is killed while it writes a mission must not find it empty afterwards."""
+
+    def looking() -> Iterator[bytes]:
+        assert not (tmp_path / "a").exists()
+        yield b"1"
+
+    write_new(tmp_path / "a", looking(), overwrite=True)
+    assert (tmp_path / "a").read_bytes() == b"1"
+
+
 def test_a_file_of_the_user_beside_it_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "a.partial").write_bytes(b"mine")
     write_new(tmp_path / "a", [b"1"])
