@@ -18,7 +18,7 @@ from gateway.cli.app import app
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
 from gateway.season.batch.flight_tasks import FlightResult, FuseTask, InfoTask, without_secrets
-from gateway.season.batch.result_folder import RESULTS, ResultFolder
+from gateway.season.batch.result_folder import RESULTS, ResultFolder, read_results
 from gateway.season.batch.season_run import run_season
 from gateway.season.batch.storage import StorageError, items_of
 from gateway.season.executors import LocalProcesses, WorkError, WorkFailed, failure_of
@@ -143,6 +143,16 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert again.find("k") == result
     (tmp_path / RESULTS / "k.json").write_bytes(b"")
     assert again.find("k") is None
+
+
+def test_results_of_one_tick_of_the_clock_stand_by_name(tmp_path: Path) -> None:
+    folder = ResultFolder(tmp_path)
+    for key in ("b", "z", "a", "m", "c", "y"):
+        result = FlightResult(place=key, digest="d", key=key, task="info", version="1")
+        folder.keep(result, {})
+        os.utime(tmp_path / RESULTS / f"{key}.json", ns=(1, 1))
+    os.utime(tmp_path / RESULTS / "b.json", ns=(2, 2))
+    assert [found.place for found in read_results(tmp_path)] == [*"acmyzb"]
 
 
 def test_info_tells_every_file(season: Path, tmp_path: Path) -> None:

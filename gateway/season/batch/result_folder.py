@@ -63,9 +63,12 @@ class ResultFolder:
 
 
 def read_results(folder: Path) -> Iterator[FlightResult]:
-    """Read all results of a folder, the newest last; raises OSError if there is none."""
+    """Read all results of a folder, the newest last; raises OSError if there is none.
+
+    Those of one tick of the file system's clock stand by name.
+    """
     paths = list((folder / RESULTS).iterdir())
-    for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns):
+    for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
         if path.suffix == ".json" and (found := _read(path)) is not None:
             yield found
 
