@@ -1,5 +1,6 @@
 """Parts of the page that stay the same while they are refreshed, built without a browser."""
 
+import asyncio
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from nicegui.page import page
 
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.instruments.parameter_row import ParameterRow
+from gateway.panel.instruments.strip_chart import StripChart
 from gateway.panel.live_table import LiveTable, RowButton
 from gateway.panel.state.dialogue.parameter_client import ParameterEntry
 from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
@@ -82,3 +84,20 @@ def test_what_is_typed_is_not_written_over_by_its_own_answer() -> None:
     dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.5, 9, 0)
     row.refresh(dialogue)
     assert row._field.value == 0.5
+
+
+def test_a_browser_that_is_slow_to_draw_a_picture_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limits_s: list[float] = []
+    answers = {"range": [1.0, 2.0], "picture": "data:"}
+
+    async def run(name: str, *, timeout: float = 1.0) -> object:
+        limits_s.append(timeout)
+        return answers[name]
+
+    chart = StripChart()
+    monkeypatch.setattr(chart, "run_method", run)
+    assert asyncio.run(chart.span_ms()) == (1.0, 2.0)
+    assert asyncio.run(chart.picture()) == "data:"
+    assert min(limits_s) >= 60.0

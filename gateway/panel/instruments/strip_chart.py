@@ -2,11 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from nicegui import ui
 
 from gateway.panel.state.field_history import FloatArray, IntArray
 from gateway.panel.view_context import WEB
+
+ANSWER_S: Final = 60.0
+"""Longest wait for the browser: drawing a picture takes seconds of a small or busy computer."""
 
 Points = tuple[IntArray, FloatArray]
 """Times in ms since 1970, and values."""
@@ -54,12 +58,12 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
 
     async def span_ms(self) -> tuple[float, float]:
         """Return the visible span, in ms since 1970."""
-        begin, end = await self.run_method("range")
+        begin, end = await self.run_method("range", timeout=ANSWER_S)
         return float(begin), float(end)
 
     async def picture(self) -> str:
         """Return the chart as a data URL of a PNG."""
-        return str(await self.run_method("picture"))
+        return str(await self.run_method("picture", timeout=ANSWER_S))
 
 
 def _plain(points: Points) -> tuple[list[int], list[float | None]]:
