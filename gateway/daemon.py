@@ -101,7 +101,7 @@ class Daemon:
             on_foreign=lambda frame: self._recorder.frame(frame),
             on_gone=self._on_gone,
             on_trouble=self._on_trouble,
-            seal=lambda frame, sequence: self._pipeline.seal(frame, sequence, self.now_us),
+            seal=partial(self._pipeline.seal, now_us=self.now_us),
             recordings=Path(settings.recording.folder).expanduser(),
         )
         self._recorder = Recorder(

@@ -1,9 +1,10 @@
 """What a compiled estimator looks like from outside: one sample live, or a whole log."""
 
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Generic, TypeVar, cast
+from typing import Final, Generic, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -31,6 +32,9 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
+
+_ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
+"""Fills the row of one sample in half the time that numpy takes for a tuple."""
 
 Heard = tuple[int, BaroSample | GpsFix]
 """A height or a fix, and the number of the IMU sample before which it arrived."""
@@ -103,6 +107,7 @@ class KernelEstimator(Generic[State, Gains]):
         self._time_us = np.zeros(1, np.int64)
         self._row, self._fix = np.zeros(IMU_COLUMNS), np.zeros(GPS_COLUMNS)
         self._output = np.empty(NAV_COLUMNS)
+        self._row_view = self._row.data
         self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
         self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
         # A first call on a scrap state loads, or compiles, what a sample would wait for.
@@ -169,7 +174,8 @@ class KernelEstimator(Generic[State, Gains]):
         NavState
             State at its time.
         """
-        self._time_us[0], self._row[:] = sample.time_us, imu_row(sample)
+        self._time_us[0] = sample.time_us
+        _ROW.pack_into(self._row_view, 0, *imu_row(sample))
         self._kernels.imus(
             self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at
         )

@@ -115,11 +115,11 @@ class NodeCalibration(Settings, frozen=True):
 def transform(matrix: Matrix3, v: Vec3) -> Vec3:
     """Multiply a matrix and a vector."""
     x, y, z = v
-    a, b, c = matrix
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
     return (
-        a[0] * x + a[1] * y + a[2] * z,
-        b[0] * x + b[1] * y + b[2] * z,
-        c[0] * x + c[1] * y + c[2] * z,
+        xx * x + xy * y + xz * z,
+        yx * x + yy * y + yz * z,
+        zx * x + zy * y + zz * z,
     )
 
 

@@ -110,13 +110,10 @@ class FrameDecoder:
             Every frame that the chunk completes and every fault it reveals, in order. Never
             raises on data.
         """
-        events: list[Frame | Fault] = []
         *complete, rest = data.split(DELIMITER)
-        for piece in complete:
-            self._take(piece)
-            if event := self._finish():
-                events.append(event)
-        self._take(rest)
+        events = [event for piece in complete if (event := self._finish(piece))]
+        if rest:
+            self._keep(rest)
         return events
 
     def reset(self) -> None:
@@ -124,20 +121,23 @@ class FrameDecoder:
         self._partial = b""
         self._skipped = 0
 
-    def _take(self, piece: bytes) -> None:
+    def _keep(self, piece: bytes) -> None:
         if self._skipped or len(self._partial) + len(piece) > MAX_ENCODED:
             self._skipped += len(self._partial) + len(piece)
             self._partial = b""
         else:
             self._partial += piece
 
-    def _finish(self) -> Frame | Fault | None:
+    def _finish(self, piece: bytes) -> Frame | Fault | None:
+        """End a frame, of which most often nothing came before this piece."""
+        if self._partial or len(piece) > MAX_ENCODED or self._skipped:
+            self._keep(piece)
+            piece, self._partial = self._partial, b""
         if self._skipped:
             fault = Fault(FaultKind.TOO_LONG, self._skipped)
             self._skipped = 0
             return fault
-        stuffed, self._partial = self._partial, b""
-        return _open(stuffed) if stuffed else None
+        return _open(piece) if piece else None
 
 
 def _open(stuffed: bytes) -> Frame | Fault:

@@ -98,9 +98,8 @@ class Announcer:
 
     def poll(self, now_us: int) -> list[Any]:
         """Return the states that changed while their topics were held."""
-        return [
-            message for topic in self._topics.values() for message in self._announce(topic, now_us)
-        ]
+        changed = [topic for topic in self._topics.values() if topic.state != topic.announced]
+        return [message for topic in changed for message in self._announce(topic, now_us)]
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to announce."""
