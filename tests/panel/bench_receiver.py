@@ -25,6 +25,8 @@ GPS_EVERY = 10
 GYRO_BIAS = (33, -21, 12)
 """In counts of 1/32.8 degrees a second: what a calibration at rest finds."""
 FIELD = 430
+MOST_TILT_RAD = 0.5
+"""Too little for a calibration: it goes on until the test ends it, however long that takes."""
 IMU, GPS = NodeId(1, 0), NodeId(1, 1)
 IMU_SENSORS, GPS_SENSORS = 0b0011, 0b1000
 
@@ -39,7 +41,7 @@ class BenchReceiver(threading.Thread):
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
         self.is_turned = False
-        """Whether the field is felt from all sides, as of a compass that is turned by hand."""
+        """Whether the field is felt from many sides, as of a compass that is turned by hand."""
         self.has_gps = True
         self._ended = threading.Event()
         self._numbers = {IMU: itertools.count(), GPS: itertools.count()}
@@ -81,7 +83,7 @@ class BenchReceiver(threading.Thread):
     def _imu(self, step: int) -> ImuPayload:
         mag = (200, 30, -380)
         if self.is_turned:
-            turn, tilt = step * 0.3, math.sin(step * 0.003) * math.pi / 2
+            turn, tilt = step * 0.3, math.sin(step * 0.006) * MOST_TILT_RAD
             mag = (
                 round(FIELD * math.cos(turn) * math.cos(tilt)),
                 round(FIELD * math.sin(turn) * math.cos(tilt)),
