@@ -33,6 +33,14 @@ gps_first_fix_s = 0.5
 """
 
 
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition."""
+    deadline_s = time.monotonic() + START_LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
 class Gateway:
     """A running `mavgate` process."""
 

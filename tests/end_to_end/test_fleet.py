@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,8 +22,8 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 
 from gateway.cli.support.warm_up import make_ready
 from gateway.estimation.select import EstimationSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
-from tests.end_to_end.test_ground_stations import WAYPOINTS
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, until
+from tests.end_to_end.test_ground_stations import WAYPOINTS, answered
 from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -138,9 +140,9 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
             async with asyncio.timeout(START_LIMIT_S):
                 params = [ParamAsync(system) for system in (first, second, third)]
                 name = "SENS_ACC_CUTOFF"
-                before = [await param.get_param_float(name) for param in params]
-                await params[1].set_param_float(name, before[1] + 1.5)
-                after = [await param.get_param_float(name) for param in params]
+                before = [await answered(param.get_param_float, name) for param in params]
+                await answered(params[1].set_param_float, name, before[1] + 1.5)
+                after = [await answered(param.get_param_float, name) for param in params]
                 assert after == [before[0], before[1] + 1.5, before[2]]
             mavproxy.type(f"vehicle {ids['field-3']}")
             mavproxy.type("wp load way.txt")
@@ -148,7 +150,7 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
             await asyncio.to_thread(mavproxy.until, found)
             async with asyncio.timeout(START_LIMIT_S):
                 missions = [MissionRawAsync(system) for system in (first, second, third)]
-                items = [await mission.download_mission() for mission in missions]
+                items = [await answered(mission.download_mission) for mission in missions]
             assert [len(found) for found in items] == [0, 0, 2]
     finally:
         mavproxy.process.kill()
@@ -173,13 +175,20 @@ def test_clocks_that_are_wrong_by_years(
     client.sock.close()
     for site, system_id in fleet.ids().items():
         assert abs(told_s[system_id] - now_s - OFF_S.get(site, 0)) < YEAR_S / 365
-    assert set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES)
+    until(lambda: set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES))
+    logs: dict[str, list[bytes]] = {}
+
+    def fetched(site: str) -> bool:
+        """Fetch what is on the site's disk by now."""
+        with suppress(subprocess.CalledProcessError):
+            fleet.ask("recordings", "get", site, "last", "--to", str(tmp_path / site))
+        logs[site] = [log.read_bytes() for log in sorted((tmp_path / site).glob("*.tlog"))]
+        return sum(map(len, logs[site])) > 10_000
+
     for site in OFF_S:
-        fleet.ask("recordings", "get", site, "last", "--to", str(tmp_path / site))
+        until(partial(fetched, site))
     assert [gateway.stop() for gateway in fleet.sites.values()] == [0, 0, 0]
     for site, off_s in OFF_S.items():
         # A second part begins where GPS tells another time than the clock, as in a late start.
-        logs = [log.read_bytes() for log in sorted((tmp_path / site).glob("*.tlog"))]
-        first_s = int.from_bytes(logs[0][:8], "big") / 1e6
+        first_s = int.from_bytes(logs[site][0][:8], "big") / 1e6
         assert abs(first_s - now_s - off_s) < YEAR_S / 365
-        assert sum(map(len, logs)) > 10_000

@@ -5,7 +5,6 @@ import queue
 import signal
 import socket
 import threading
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.edges.operator.control_socket import ControlError, request, socket_path
-from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway
+from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway, until
 from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -60,14 +59,6 @@ class Systemd:
             last.sendto(b"", self._path)
         self._thread.join()
         self._sock.close()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition."""
-    deadline_s = time.monotonic() + START_LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 @pytest.fixture
