@@ -29,15 +29,22 @@ def feed(
     seed: int,
     noise_mps: float = 0.0,
     pull_mps2: float = 3.0,
+    lasts_s: float = 0.0,
+    fixes: int = 50,
 ) -> None:
-    """Ten seconds of accelerations, seen in a frame that lies in NED by `attitude`."""
+    """Ten seconds of accelerations, seen in a frame that lies in NED by `attitude`.
+
+    Each lasts for 0.2 s, or is correlated over `lasts_s`.
+    """
     rng = np.random.default_rng(seed)
     state.pair_s = -1e9
     force_i, vel = np.zeros(3), np.zeros(3)
-    for k in range(50):
+    kept = math.exp(-0.2 / lasts_s) if lasts_s else 0.0
+    accel = rng.normal(0.0, pull_mps2, 3)
+    for k in range(fixes):
         told = vel + rng.normal(0.0, noise_mps, 3) if noise_mps else vel
         align_by_velocity(state, 0.2 * k, tuple(told), tuple(force_i), 0.2)
-        accel = rng.normal(0.0, pull_mps2, 3)
+        accel = kept * accel + rng.normal(0.0, pull_mps2, 3) * math.sqrt(1.0 - kept * kept)
         vel = vel + 0.2 * accel
         force_n = accel - [0.0, 0.0, STANDARD_GRAVITY_MPS2]
         force_i = force_i + 0.2 * attitude.inv().apply(force_n)
@@ -67,6 +74,23 @@ def test_the_standard_deviations_are_honest() -> None:
         heading.append(heading_difference(q, true) / stds[1])
     assert 0.2 < np.sqrt(np.mean(np.square(level))) < 1.2
     assert 0.2 < np.sqrt(np.mean(np.square(heading))) < 1.2
+
+
+@pytest.mark.parametrize("fixes", [4, 7, 10, 16])
+def test_a_level_from_a_pull_of_any_direction_is_as_unsure_as_the_pull_is_large(
+    fixes: int,
+) -> None:
+    """Without a heading, one mean force fits a whole cone of verticals."""
+    off = []
+    for seed in range(60):
+        attitude = Rotation.random(rng=np.random.default_rng(seed))
+        state = new_record(AlignmentState)
+        feed(state, attitude, seed, 0.2, pull_mps2=1.5, lasts_s=2.0, fixes=fixes)
+        q = solve_alignment(state)
+        level_std, _ = alignment_std(state, misfit(state, q), 0.0)
+        true = tuple(attitude.as_quat(scalar_first=True))
+        off.append(level_difference(q, true) / level_std)
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.3
 
 
 def test_a_doubtful_bias_makes_the_heading_doubtful_and_the_more_the_less_pulls() -> None:

@@ -53,6 +53,8 @@ SQUARINGS: Final = 14
 """The matrix to the power of 2**14 is its leading eigenvector but for what cannot be told apart."""
 UNKNOWN_RAD: Final = 3.0
 """Standard deviation of an angle of which nothing is known."""
+ANY_HEADING_VAR: Final = 2.0
+"""Mean square of the chord by which a heading that may be any turns what lies level, rad2."""
 
 
 class AlignmentState:
@@ -317,7 +319,10 @@ def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[
     if level < 1.0:
         return (UNKNOWN_RAD, UNKNOWN_RAD)
     determinant = c * level - a * f * f - b * e * e + 2.0 * d * e * f
-    level_var = (a + b) / level
+    # What pulls one way, with no heading to say which, may be tilt: the level is as unsure as that.
+    known = determinant + level / ANY_HEADING_VAR
+    told = c + 1.0 / ANY_HEADING_VAR
+    level_var = ((a + b) * told - e * e - f * f) / known
     heading_var = UNKNOWN_RAD * UNKNOWN_RAD
     if determinant > 0.1 * level:
         # Where the frame drifts off level, gravity seems to pull: the less there was of real pull,

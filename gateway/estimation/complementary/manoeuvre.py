@@ -26,6 +26,7 @@ from gateway.estimation.complementary.drift import (
     start_level,
 )
 from gateway.estimation.complementary.heading import is_heading_good
+from gateway.estimation.complementary.unaided import unaided_level_std
 from gateway.estimation.kernel_record import as_quat, as_vec, write_vec
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import Vec3
@@ -94,7 +95,7 @@ def take_fix_velocity(
         accel = (0.0, 0.0, 0.0)
     carry_drift(s, p)
     if s.level_by_gps == 0 and is_heading_good(s):
-        start_level(s, p, LEVEL_STD_RAD)
+        start_level(s, p, max(LEVEL_STD_RAD, unaided_level_std(s)))
     force = rotate(as_quat(s.q_ei), mean)
     variance = match_variance(s, force, noise_mps) / dt
     for axis in range(3):

@@ -109,6 +109,7 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
     level = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found)
     q_ib = as_quat(s.q_ib)
     write_quat(s.q_ei, normalise(multiply(level, (q_ib[0], -q_ib[1], -q_ib[2], -q_ib[3]))))
+    s.unaided_level_sq = s.level_std * s.level_std
     hold_level(s)
     if s.by_gps == 1 and s.heading_known == 1:
         start_level(s, p, max(s.level_std, LEAST_LEVEL_RAD))
