@@ -332,3 +332,34 @@ def test_velocity_of_an_aircraft_at_rest_is_zero(estimator: KernelEstimator) -> 
     rows = as_rows(feed(estimator, [*still(0, 3.0), fix(3_000_000), *still(3_000_000, 8.0)]))
     assert np.abs(rows[-1, NAV_VEL : NAV_VEL + 3]).max() < 0.3
     assert int(rows[-1, NAV_FLAGS]) & NavFlags.AT_REST
+
+
+def circling(start_us: int, seconds: float, silent_from_us: int) -> Items:
+    """Turn right at 0.2 rad/s and 10 m/s, level; the IMU falls silent, the fixes go on."""
+    out: Items = []
+    for t in times(seconds):
+        turned = 0.2 * (start_us + t) * 1e-6
+        if t % 200_000 == 0:
+            then = turned - 0.2 * REFERENCE.gps_latency_s
+            vel = (10.0 * math.cos(then), 10.0 * math.sin(then), 0.0)
+            out.append(fix(start_us + t, 50.0 * math.sin(then), -50.0 * math.cos(then), vel))
+        if start_us + t < silent_from_us:
+            sine, cosine = math.sin(turned), math.cos(turned)
+            mag = (cosine * MAG[0] + sine * MAG[1], cosine * MAG[1] - sine * MAG[0], MAG[2])
+            out.append(imu(start_us + t, (0.0, 2.0, -G), (0.0, 0.0, 0.2), mag))
+    return out
+
+
+def test_fixes_in_a_silence_say_nothing_of_the_attitude(estimator: KernelEstimator) -> None:
+    """A turn goes on for the whole of it, not for the time between two fixes."""
+    states = feed(estimator, circling(0, 16.0, 12_000_000))
+    assert NavFlags.ATTITUDE_VALID in states[-1].flags
+    after = feed(estimator, [imu(16_000_000, (0.0, 2.0, -G), (0.0, 0.0, 0.2))])[-1]
+    assert NavFlags.ATTITUDE_VALID not in after.flags
+    assert estimator.state.lost == 1
+
+
+def test_a_rest_goes_on_in_a_silence_with_fixes(estimator: KernelEstimator) -> None:
+    fixes = [fix(t) for t in range(8_000_000, 18_000_000, 200_000)]
+    feed(estimator, [*still(0, 8.0), *fixes, *still(18_000_000, 0.05)])
+    assert estimator.state.lost == 0

@@ -45,7 +45,12 @@ from gateway.estimation.filtering.fix_intake import (
     place_fix,
     wanted_time_s,
 )
-from gateway.estimation.filtering.sample_clock import silence_before, silent_rate
+from gateway.estimation.filtering.sample_clock import (
+    is_rest_silent,
+    silence_before,
+    silent_rate,
+    silent_variance,
+)
 from gateway.estimation.kernel_record import (
     FloatArray,
     as_quat,
@@ -65,7 +70,7 @@ SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)
 def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
     s.fault = 1
-    still = s.at_rest == 1
+    still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     for k in range(3):
@@ -78,9 +83,8 @@ def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
         half = 0.5 * turn_rad
         turn = (math.cos(half), 0.0, 0.0, math.sin(half))
         write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
-    turned = (GAP_TILT_RATE + turning) * dt
-    raise_attitude_variance(s, turned)
-    if turned > GAP_LOST_RAD and not still:
+    raise_attitude_variance(s, math.sqrt(silent_variance(s, GAP_TILT_RATE + turning, dt)))
+    if s.silent_rad > GAP_LOST_RAD and not still:
         lose_attitude(s, p)
     refresh(s)
 

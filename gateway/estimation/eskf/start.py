@@ -24,7 +24,12 @@ from gateway.estimation.eskf.eskf_state import (
 )
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
-from gateway.estimation.filtering.sample_clock import begin_clock, silent_rate
+from gateway.estimation.filtering.sample_clock import (
+    begin_clock,
+    is_rest_silent,
+    silent_rate,
+    silent_variance,
+)
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import bent_share_sq
@@ -217,16 +222,16 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     propagate(s, p)
     s.fault = 1
-    still = s.at_rest == 1
+    still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.gyro_bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     flown = GAP_TILT_RATE if s.aided == 1 else GAP_HAND_RATE
-    turned = (GAP_REST_RATE if still else flown + turning) * dt
+    turned_var = silent_variance(s, GAP_REST_RATE if still else flown + turning, dt)
     turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt)
     for k in range(3):
         if s.aided == 1:
             s.pos_n[k] += s.vel_n[k] * dt
-        s.P[TILT + k, TILT + k] += turned * turned
+        s.P[TILT + k, TILT + k] += turned_var
         s.P[VEL + k, VEL + k] += (GAP_ACCEL_MPS2 * dt) ** 2
         s.P[POS + k, POS + k] += (0.5 * GAP_ACCEL_MPS2 * dt * dt) ** 2
         for first in (TILT, VEL, POS):
@@ -236,7 +241,7 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     s.rest_s = 0.0
     s.at_rest = 0
     s.rest_unsure = 1 if still else 0
-    if turned > GAP_LOST_RAD and not still:
+    if s.silent_rad > GAP_LOST_RAD and not still:
         lose_attitude(s, p)
 
 

@@ -56,6 +56,10 @@ class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState,
     """Time of the newest sample, and of the one that `time_s` counts from."""
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
+    silent_rad: float
+    """How far the attitude may have turned in a silence of the IMU that has not ended, else 0."""
+    silent_rest: int
+    """1 while such a silence goes on that began at rest."""
     declination_rad: float
     earth_dip_rad: float
     """Dip of the Earth's field at the place; NaN before the first fix."""

@@ -43,6 +43,8 @@ def step_clock(s: FilterState, time_us: int) -> float:
             s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
         return dt
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    if dt <= GAP_S:
+        s.silent_rad, s.silent_rest = 0.0, 0
     return dt
 
 
@@ -58,8 +60,26 @@ def silence_before(s: FilterState, valid_s: float) -> float:
 
 
 @compiled
+def is_rest_silent(s: FilterState) -> bool:
+    """Return whether a silence began at rest, also one that fixes have come in."""
+    s.silent_rest = 1 if s.at_rest == 1 or s.silent_rest == 1 else 0
+    return s.silent_rest == 1
+
+
+@compiled
 def silent_rate(s: FilterState, bias_b: Vec3) -> Vec3:
     """Return the rate in body FRD at which a turn goes on in a silence, rad/s; none at rest."""
-    if s.at_rest == 1:
+    if s.silent_rest == 1:
         return (0.0, 0.0, 0.0)
     return (s.gyro_lp[0] - bias_b[0], s.gyro_lp[1] - bias_b[1], s.gyro_lp[2] - bias_b[2])
+
+
+@compiled
+def silent_variance(s: FilterState, radps: float, dt: float) -> float:
+    """Return what the next part of a silence adds to the attitude's variance, rad2.
+
+    Whatever turns goes on turning: the angle grows with the time, however many fixes part it.
+    """
+    before = s.silent_rad
+    s.silent_rad += radps * dt
+    return s.silent_rad * s.silent_rad - before * before
