@@ -11,6 +11,7 @@ from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import TILT, EskfState
 from gateway.estimation.eskf.measure import update_by_compass
 from gateway.estimation.eskf.start import start_heading_by_compass
+from gateway.estimation.flagbits import HEADING_VALID_RAD
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
@@ -23,14 +24,23 @@ REFERENCE = ReferenceSettings(declination="fixed", declination_deg=0.0)
 GAINS = make_gains(EskfSettings(), REFERENCE, RestSettings(), CompassSettings())
 
 
-def last_state(samples: Iterable[ImuSample]) -> NavState:
-    estimator = make_estimator(EstimationSettings(estimator="eskf", reference=REFERENCE))
-    return [estimator.update_imu(sample) for sample in samples][-1]
+def states(samples: Iterable[ImuSample], name: str = "eskf") -> list[NavState]:
+    estimator = make_estimator(EstimationSettings(estimator=name, reference=REFERENCE))
+    return [estimator.update_imu(sample) for sample in samples]
 
 
 def field(dip_deg: float) -> tuple[float, float, float]:
     dip = math.radians(dip_deg)
     return (45.0 * math.cos(dip), 0.0, 45.0 * math.sin(dip))
+
+
+def carried_off(bent_deg: float) -> Iterable[ImuSample]:
+    """Stand for 8 s and be carried about then; only over iron is the field another then."""
+    for t in times(14.0):
+        moves = t >= 8_000_000
+        swing = 2.0 * math.sin(6.0e-6 * t) if moves else 0.0
+        mag = field(30.0 if moves else 30.0 - bent_deg) if t % 50_000 == 0 else None
+        yield imu(t, (swing, 0.0, -G), mag=mag)
 
 
 @pytest.mark.parametrize("tilt_rad", [(0.03, 0.0), (0.0, -0.03)])
@@ -60,17 +70,16 @@ def test_a_first_heading_knows_of_the_tilt_it_was_read_with(tilt_rad: tuple[floa
 def test_a_heading_read_over_iron_is_as_unsure_as_the_field_has_proved_bent(
     bent_deg: float, low_deg: float, high_deg: float
 ) -> None:
-    """It stands for 8 s and is then carried about; only over iron is its field another then."""
-
-    def samples() -> Iterable[ImuSample]:
-        for t in times(14.0):
-            moves = t >= 8_000_000
-            swing = 2.0 * math.sin(6.0e-6 * t) if moves else 0.0
-            mag = field(30.0 if moves else 30.0 - bent_deg) if t % 50_000 == 0 else None
-            yield imu(t, (swing, 0.0, -G), mag=mag)
-
-    state = last_state(samples())
+    state = states(carried_off(bent_deg))[-1]
     assert low_deg < math.degrees(state.attitude_std_rad[2]) < high_deg
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_heading_is_valid_exactly_where_it_is_reported_as_sure(name: str) -> None:
+    found = states(carried_off(30.0), name)
+    sure = [state.attitude_std_rad[2] < HEADING_VALID_RAD for state in found]
+    assert set(sure) == {False, True}
+    assert [NavFlags.HEADING_VALID in state.flags for state in found] == sure
 
 
 @pytest.mark.parametrize(
@@ -83,7 +92,7 @@ def test_a_rest_that_ended_in_a_silence_is_noticed_at_the_first_sample(
 ) -> None:
     before = [imu(t) for t in times(10.0)]
     after = imu(before[-1].time_us + 4_000_000 + 10_000, accel)
-    state = last_state([*before, imu(after.time_us - 10_000, accel), after])
+    state = states([*before, imu(after.time_us - 10_000, accel), after])[-1]
     assert (NavFlags.ATTITUDE_VALID in state.flags) is known
 
 

@@ -5,10 +5,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
+    GPS_DECLINATION,
     GPS_LAT,
     GYRO,
+    MAG,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
     NAV_FLAGS,
@@ -119,6 +122,30 @@ def test_it_beats_the_filter_without_gps_too(flight: Flight) -> None:
     assert after["heading"] < before["heading"]
     # Without a fix the declination is not known, and hindsight does not tell it.
     assert (smoothed[flight.counts, NAV_ATTITUDE_STD + 2] > NO_DECLINATION_RAD).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 23, 25])
+def test_a_heading_read_over_iron_is_unsure_from_then_on(seed: int) -> None:
+    """The filter learns of the iron as the aircraft leaves it; what the heading errs stays one."""
+    flight = simulated_flight(seed, calibrated=True)
+    true = Rotation.from_quat(flight.q_nb, scalar_first=True)
+    stands = np.cumsum(np.linalg.norm(flight.truth["vel"], axis=1) > 0.5) == 0
+    imu = flight.log.imu.copy()
+    imu[stands, MAG : MAG + 3] += true[stands].inv().apply((-5.0, 3.5, 5.0))
+    declination_deg = float(np.degrees(flight.log.gps[-1, GPS_DECLINATION]))
+    reference = msgspec.structs.replace(
+        flight.reference, declination="fixed", declination_deg=declination_deg
+    )
+    bent = replace(flight, log=replace(flight.log, imu=imu), reference=reference)
+    smoothed = run_smoothed(bent.with_gps(np.zeros(len(flight.log.gps), bool)))
+    read = stands & (flight.log.imu_time_us > 2_000_000)
+    found = Rotation.from_quat(smoothed[:, :4], scalar_first=True)
+    off_rad = np.abs((true * found.inv()).as_rotvec()[read, 2])
+    told_rad = smoothed[read, NAV_ATTITUDE_STD + 2]
+    assert (off_rad > np.radians(3.0)).all()
+    assert (off_rad < 2.0 * told_rad).all()
+    assert (told_rad < np.radians(20.0)).all()
 
 
 @pytest.mark.slow

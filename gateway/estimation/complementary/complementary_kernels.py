@@ -7,7 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
-from gateway.estimation.complementary.accuracy import watch_accuracy
+from gateway.estimation.complementary.accuracy import watch_accuracy, write_attitude_std
 from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
     write_output,
@@ -105,6 +105,7 @@ def begin(
     take_gravity(s, accel, 1.0, 1e-3)
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
     refresh(s)
+    write_attitude_std(s)
 
 
 @compiled

@@ -16,6 +16,7 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
+from gateway.estimation.eskf.iron import standing_field_var
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR
 from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
@@ -40,8 +41,6 @@ from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 
 LEVEL_VAR = 0.1**2
-HEADING_VAR = HEADING_VALID_RAD**2
-NO_HEADING_RAD = math.sqrt(NO_HEADING_VAR)
 NO_HOLD_S = 1.0
 
 
@@ -69,16 +68,18 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     fill(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], NAN)
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
-        if s.heading_known == 0:
-            row[NAV_ATTITUDE_STD + 2] = NO_HEADING_RAD
-        level_ut = math.hypot(s.field_n[0], s.field_n[1])
-        if s.iron_search_started == 0 and level_ut > 0.0:
-            # Iron that nothing tells from the heading yet turns it for as long as a flight lasts.
-            std_rad = math.hypot(row[NAV_ATTITUDE_STD + 2], s.left_iron_ut / level_ut)
-            row[NAV_ATTITUDE_STD + 2] = std_rad
-        if s.heading_known == 1 and s.heading_true == 0:
-            row[NAV_ATTITUDE_STD + 2] = math.hypot(row[NAV_ATTITUDE_STD + 2], NO_DECLINATION_RAD)
+        row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_place(s, row)
+
+
+@compiled
+def heading_std_rad(s: EskfState) -> float:
+    """Return how sure the heading is: what iron and the declination add to the covariance, too."""
+    variance = s.P[TILT + 2, TILT + 2] if s.heading_known == 1 else NO_HEADING_VAR
+    variance += standing_field_var(s)
+    if s.heading_known == 1 and s.heading_true == 0:
+        variance += NO_DECLINATION_RAD * NO_DECLINATION_RAD
+    return math.sqrt(max(variance, 0.0))
 
 
 @compiled
@@ -110,7 +111,7 @@ def flags_of(s: EskfState) -> int:
     if s.started == 1 and max(s.P[TILT, TILT], s.P[TILT + 1, TILT + 1]) < LEVEL_VAR:
         flags |= ATTITUDE_VALID
     known = s.heading_known == 1 and s.heading_true == 1
-    if known and s.P[TILT + 2, TILT + 2] < HEADING_VAR:
+    if known and heading_std_rad(s) < HEADING_VALID_RAD:
         flags |= HEADING_VALID
     if s.has_height == 1 or s.baro_known == 1:
         flags |= ALTITUDE_VALID

@@ -113,3 +113,15 @@ def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
         norm, usual, turned = s.mag_new_norm, s.mag_norm_ref, s.mag_new_dip - s.mag_dip_ref
         apart_sq = norm * norm + usual * usual - 2.0 * norm * usual * math.cos(turned)
         s.left_iron_ut = math.sqrt(max(0.5 * apart_sq, p.mag_bias_var))
+
+
+@compiled
+def standing_field_var(s: EskfState) -> float:
+    """Return the variance of a heading by iron that nothing tells from it yet, rad2.
+
+    It is one error for as long as the flight lasts, until GPS makes the iron a state of its own.
+    """
+    level_ut = math.hypot(s.field_n[0], s.field_n[1])
+    if s.iron_search_started == 1 or level_ut == 0.0:
+        return 0.0
+    return (s.left_iron_ut / level_ut) ** 2

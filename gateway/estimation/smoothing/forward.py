@@ -38,6 +38,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
+from gateway.estimation.eskf.iron import standing_field_var
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply
@@ -128,10 +129,12 @@ def share_doubt(s: EskfState, copy: EskfState) -> None:
 
 @compiled
 def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
-    """Leave of the standard deviations told only what they hold beyond the covariance."""
+    """Leave of the standard deviations told only what is no state and no lasting doubt."""
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         for k in range(3):
             beyond = row[column + k] ** 2 - s.P[first + k, first + k]
+            if first + k == TILT + 2:
+                beyond -= standing_field_var(s)
             # NaN, which is told of what is not known, stays.
             row[column + k] = 0.0 if beyond < 0.0 else math.sqrt(beyond)
 
@@ -167,6 +170,7 @@ def run_forward(
     d: FloatArray,
     anew: BoolArray,
     shown: FloatArray,
+    doubt: FloatArray,
 ) -> None:
     """Run the filter, and a copy of it from each node to the next.
 
@@ -192,6 +196,8 @@ def run_forward(
     shown : ndarray, shape (m, SHOWN)
         What is known beforehand of flight without GPS, by stretch: `unaided_sq` and `flies`. Filled
         with what this pass has shown.
+    doubt : ndarray, shape (m + 1,)
+        Filled: `standing_field_var` at each node and at the end, rad2.
     """
     s, copy = states[0], states[1]
     taken = np.zeros(2, np.int64)
@@ -199,6 +205,7 @@ def run_forward(
         s.unaided_sq = max(s.unaided_sq, shown[k, 0])
         s.flies = max(s.flies, int(shown[k, 1]))
         begin_node(s, p, P[k], F[k])
+        doubt[k] = standing_field_var(s)
         states[1] = states[0]
         for i in range(nodes[k], nodes[k + 1]):
             now = imu_time_us[i]
@@ -220,3 +227,4 @@ def run_forward(
         flown = s.aided == 0 and s.at_rest == 0
         shown[k, 0] = s.unaided_sq if flown else 0.0
         shown[k, 1] = s.flies if flown else 0.0
+    doubt[nodes.shape[0] - 1] = standing_field_var(s)

@@ -91,11 +91,11 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, foreseen = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
-    shown = np.zeros((count, SHOWN))
+    shown, doubt = np.zeros((count, SHOWN)), np.empty(count + 1)
     arguments = (
         states, gains, nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
-        out, P, F, foreseen, d, anew, shown,
+        out, P, F, foreseen, d, anew, shown, doubt,
     )  # fmt: skip
     run_forward(*arguments)
     if shown.any():
@@ -104,6 +104,7 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
         run_forward(*arguments)
     found = _backward(P, F, foreseen, d, states[0]["P"])
     begins, ends, variances = (numbers[:, :MOVED] for numbers in found)
+    variances[:, TILT + 2] += _lasting_doubt(doubt, F)
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out, latency_s
 
@@ -148,6 +149,29 @@ def _hindsight(shown: FloatArray) -> FloatArray:
     # What shows a flight is the way of the last seconds.
     for _ in range(round(WAY_S / NODE_S)):
         known[:-1, 1] = np.maximum(known[:-1, 1], known[1:, 1])
+    return known
+
+
+def _lasting_doubt(doubt: FloatArray, F: FloatArray) -> FloatArray:
+    """Doubt a heading as much before the field in motion contradicted it as after.
+
+    It is one error all along, until the heading begins anew.
+
+    Parameters
+    ----------
+    doubt : ndarray, shape (m + 1,)
+        Variance of the heading by `standing_field_var` at each node, rad2.
+    F : ndarray, shape (m, STATES, STATES)
+        Transitions between the nodes.
+
+    Returns
+    -------
+    ndarray, shape (m + 1,)
+    """
+    known = doubt.copy()
+    for k in range(len(F) - 1, -1, -1):
+        if F[k, TILT + 2, TILT + 2] != 0.0:
+            known[k] = max(known[k], known[k + 1])
     return known
 
 
