@@ -14,7 +14,7 @@ from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.routing.hub_settings import HubSettings
 from gateway.simulator.receiver import simulate
-from tests.end_to_end.processes import Client
+from tests.end_to_end.processes import START_LIMIT_S, Client
 from tests.end_to_end.station import Station
 from tests.ports import free_port
 from tests.vehicle.services.missions.test_mission import (
@@ -77,8 +77,15 @@ async def run(folder: Path, use: Callable[[int], Any], *beside: str) -> Any:
     )
     line = simulate(settings.simulator, START_UNIX_US).frames()
     daemon = Daemon(settings, {}, lambda: settings, line)
+    assert daemon._receiver is not None
+    begin, daemon._receiver.start = daemon._receiver.start, lambda: None
     daemon.start()
     try:
+        # Endpoints open beside the loop: no aircraft is heard before all of them listen.
+        async with asyncio.timeout(START_LIMIT_S):
+            while any(client.state != "open" for client in daemon._hub.clients()):
+                await asyncio.sleep(0.01)
+        begin()
         return await asyncio.to_thread(use, port)
     finally:
         daemon.close()
