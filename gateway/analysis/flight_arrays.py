@@ -143,8 +143,10 @@ class Flight:
 
     @property
     def rate_hz(self) -> float:
-        """IMU samples a second, by the median interval."""
-        return float(US_PER_S / np.median(np.diff(self.time_us)))
+        """IMU samples a second, by the median interval; by the mean one where most are zero."""
+        intervals_us = np.diff(self.time_us)
+        typical_us = float(np.median(intervals_us)) or max(float(np.mean(intervals_us)), 1.0)
+        return US_PER_S / typical_us
 
     @property
     def latency_s(self) -> float:

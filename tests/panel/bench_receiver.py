@@ -4,6 +4,7 @@ import itertools
 import math
 import os
 import threading
+import time
 import tty
 from collections.abc import Iterator
 
@@ -32,7 +33,7 @@ IMU_SENSORS, GPS_SENSORS = 0b0011, 0b1000
 
 
 class BenchReceiver(threading.Thread):
-    """Sends at a true rate until it is ended."""
+    """Sends at a true rate until it is ended, later than due only where it has to wait itself."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -48,8 +49,10 @@ class BenchReceiver(threading.Thread):
 
     def run(self) -> None:
         frame_seq = 0
+        begun_s = time.monotonic()
         for step in itertools.count():
-            if self._ended.wait(1 / RATE_HZ):
+            # Not a pause after each: the nodes' clocks would run slow, each heard in another way.
+            if self._ended.wait(max(begun_s + step / RATE_HZ - time.monotonic(), 0.0)):
                 return
             for node, payload in self._payloads(step):
                 time_us = step * 1_000_000 // RATE_HZ

@@ -1,6 +1,8 @@
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.estimation.select import ESTIMATORS
 from gateway.panel.estimator_trial import ComparisonError, compare, settings_of
 from gateway.panel.state.sample_memory import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
@@ -33,6 +35,17 @@ def test_too_little_to_fuse_is_said() -> None:
         memory.take(1, imu(n * 20_000), n * 20_000)
     with pytest.raises(ComparisonError, match="2 s of samples at 50 Hz"):
         compare(memory.frames(1), {})
+
+
+def test_samples_that_bunch_at_one_time_are_fused_too() -> None:
+    memory = SampleMemory()
+    for n in range(1200):
+        memory.take(1, imu(n // 5 * 100_000), n * 20_000)
+    found = compare(memory.frames(1), {})
+    assert [each.name for each in found] == list(ESTIMATORS)
+    assert {len(each.time_us) for each in found} == {120}
+    # NaN until they have started.
+    assert all(np.isfinite(each.roll_deg[10:]).all() for each in found)
 
 
 def test_only_the_last_minutes_of_sensors_are_remembered() -> None:

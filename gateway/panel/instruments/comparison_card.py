@@ -7,6 +7,7 @@ import numpy as np
 from nicegui import ui
 
 from gateway.edges.clock import unix_time_us
+from gateway.edges.reasons import reason_of
 from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
 from gateway.panel.instruments.strip_chart import StripChart
 from gateway.panel.state.field_history import FloatArray, IntArray
@@ -65,6 +66,9 @@ class ComparisonCard:
         except ComparisonError as error:
             self._story.set_text(f"{error}. Samples are being collected; try again in a moment.")
             return
+        except Exception as error:
+            self._story.set_text(f"Cannot be compared: {reason_of(error)}.")
+            raise
         finally:
             self._button.enable()
         seconds = np.ptp(self._estimates[0].time_us) / 1e6
