@@ -6,6 +6,7 @@ from typing import Any
 from nicegui import ui
 
 from gateway.panel.dialogues import Dialogue
+from gateway.panel.state.dialogue.parameter_client import is_same_value
 from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
 from gateway.panel.view_context import NotAllowedError, ViewContext
 
@@ -50,12 +51,14 @@ class ParameterRow:
         self._shown = (value, trouble, pending)
         self._trouble.set_text("waiting for the answer …" if pending else trouble)
         self._trouble.set_visibility(bool(trouble) or pending)
-        changed = math.isfinite(self._meta.default) and not _is_same(value, self._meta.default)
+        changed = math.isfinite(self._meta.default) and not is_same_value(value, self._meta.default)
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
         if pending:
             return
         # What is typed and not sent yet stays; what is the same needs no writing over.
-        if self._field.value == self._settled and not _is_same(self._settled, value):
+        settled = self._settled
+        is_shown = settled is not None and is_same_value(settled, value)
+        if self._field.value == settled and not is_shown:
             self._settled = value
             self._field.set_value(value)
 
@@ -83,8 +86,8 @@ class ParameterRow:
             return
         name, dialogues = self._meta.name, self._context.parts.dialogues
         parameters = dialogues.of(self._system_id).parameters
-        has_it = name not in parameters.pending and _is_same(value, parameters.entries[name].value)
-        if has_it:
+        kept = parameters.entries[name].value
+        if name not in parameters.pending and is_same_value(value, kept):
             return
         try:
             self._context.check_may_change()
@@ -93,11 +96,6 @@ class ParameterRow:
             ui.notify(str(error), type="negative")
             return
         self._shown = None
-
-
-def _is_same(value: float | None, other: float) -> bool:
-    """Compare to the digits of a parameter on the wire, which has 32 bits."""
-    return value is not None and math.isclose(value, other, rel_tol=1e-6, abs_tol=1e-12)
 
 
 def _range_of(meta: ParameterMeta) -> str:

@@ -64,6 +64,11 @@ class _Change:
     """The value to send once this one is answered."""
 
 
+def is_same_value(value: float, other: float) -> bool:
+    """Compare to the digits of a parameter on the wire, which has 32 bits."""
+    return math.isclose(value, other, rel_tol=1e-6, abs_tol=1e-12)
+
+
 class ParameterClient:
     """Parameters of one vehicle.
 
@@ -152,7 +157,7 @@ class ParameterClient:
         self._indices.add(index)
         self.count = min(message.param_count, MAX_PARAMETERS) or self.count
         wanted = self._answered(name, now_us)
-        if wanted is not None and not math.isclose(value, wanted, rel_tol=1e-6, abs_tol=1e-9):
+        if wanted is not None and not is_same_value(value, wanted):
             self.refused[name] = f"the aircraft keeps {value:g}"
         if self.state is ListState.LOADING:
             self._due_us = now_us + QUIET_US
