@@ -7,22 +7,29 @@ first: a supply that sags when the radio sends, a broken cable to the sensors, a
 | ------ | ---------------------------------------------- | ------------------------------------ |
 | supply | below the limit of the settings                | `HYSTERESIS_V` above it              |
 | bus    | an error more than in the report before        | `QUIET_REPORTS` without one          |
-| radio  | `FAILED_SHARE` of what it sends is not taken   | `QUIET_REPORTS` without that         |
+| radio  | as many sends fail in `RADIO_SPAN_US` as       | less than half as many fail          |
+|        | `FAILED_SHARE` of the samples in it            |                                      |
 | pipe   | the receiver had no room for a payload of it   | `QUIET_REPORTS` of the receiver's    |
 """
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import LinkReport, NodeStatus
+from gateway.units import US_PER_S
 from gateway.vehicle.telemetry import fields
 from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
 
 HYSTERESIS_V: Final = 0.1
 QUIET_REPORTS: Final = 10
 FAILED_SHARE: Final = 0.1
+RADIO_SPAN_US: Final = 10 * US_PER_S
+"""A GPS node sends so seldom that one lost payload is a tenth of a second's."""
+MAX_REPORTS: Final = 20
+"""In that time; a node reports once a second."""
 WORD: Final = 0xFFFF
 """The nodes' counters have 16 bits, and wrap."""
 CELLS: Final = 10
@@ -50,11 +57,30 @@ class _Trouble:
 
 
 @dataclass(slots=True)
+class _Radio:
+    """Failed sends of the last seconds, of which some are no trouble."""
+
+    failed: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_REPORTS))
+    """Time of each report and what it added."""
+    is_bad: bool = False
+
+    def note(self, time_us: int, failed: int, rate_hz: int) -> int:
+        """Take in a report, and return how many sends failed in `RADIO_SPAN_US`."""
+        self.failed.append((time_us, failed))
+        while self.failed[0][0] <= time_us - RADIO_SPAN_US:
+            self.failed.popleft()
+        total = sum(number for _, number in self.failed)
+        most = FAILED_SHARE * rate_hz * RADIO_SPAN_US / US_PER_S
+        self.is_bad = 0 < (most / 2 if self.is_bad else most) <= total
+        return total
+
+
+@dataclass(slots=True)
 class _Node:
     status: NodeStatus
     low: bool = False
     bus: _Trouble = field(default_factory=_Trouble)
-    radio: _Trouble = field(default_factory=_Trouble)
+    radio: _Radio = field(default_factory=_Radio)
     pipe: _Trouble = field(default_factory=_Trouble)
     overruns: int | None = None
 
@@ -112,7 +138,7 @@ class NodeHealth:
             before = status
         errors = status.bus_errors - before.bus_errors & WORD
         failed = status.radio_failed - before.radio_failed & WORD
-        share = failed / status.sample_rate_hz if status.sample_rate_hz else 0.0
+        failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
         number = status.node.node_id
         return [
             self._supply(known, name),
@@ -124,8 +150,8 @@ class NodeHealth:
             ),
             _finding(
                 f"radio {number}",
-                known.radio.note(share >= FAILED_SHARE),
-                f"{name}: {min(share, 1.0):.0%} of radio sends failed",
+                known.radio.is_bad,
+                f"{name}: radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s",
                 f"{name}: radio OK again",
             ),
         ]

@@ -7,8 +7,8 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus, PipeCounters, ReceiverStatus
-from gateway.vehicle.telemetry.events import INFO, WARNING
-from gateway.vehicle.telemetry.node_health import QUIET_REPORTS, NodeHealth
+from gateway.vehicle.telemetry.events import HOLD_US, INFO, WARNING
+from gateway.vehicle.telemetry.node_health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.samples import decode
@@ -100,10 +100,38 @@ def test_bus_errors_are_reported_once_also_where_the_counter_begins_anew(flying:
 
 
 def test_a_radio_that_is_not_heard(flying: Flying) -> None:
-    flying.report(radio_failed=19)
+    flying.report(radio_failed=50)
+    flying.report(radio_failed=109)
     assert flying.told == []
-    flying.report(radio_failed=42)
-    assert flying.told == [(WARNING, "IMU node 0: 23% of radio sends failed")]
+    flying.report(radio_failed=110)
+    assert flying.told == [(WARNING, "IMU node 0: radio sends failed, 100 in 10 s")]
+    for _ in range(RADIO_SPAN_US // SECOND_US - 1):
+        flying.report()
+    assert flying.told[1:] == [(INFO, "IMU node 0: radio OK again")]
+
+
+def test_few_lost_payloads_of_a_slow_node_are_no_trouble(flying: Flying) -> None:
+    for second in range(60):
+        flying.report(sample_rate_hz=10, radio_failed=10 + second // 3)
+    assert flying.told == []
+
+
+def test_a_radio_that_is_bad_again_soon_is_announced_later_with_what_failed(flying: Flying) -> None:
+    flying.report(radio_failed=110)
+    for _ in range(RADIO_SPAN_US // SECOND_US):
+        flying.report()
+    flying.report(radio_failed=250)
+    flying.report()
+    assert flying.told[1:] == [(INFO, "IMU node 0: radio OK again")]
+    found = decode(flying.vehicle.poll(flying.status.time_us + HOLD_US))
+    texts = [message.text for message in found if message.get_type() == "STATUSTEXT"]
+    assert texts == ["IMU node 0: radio sends failed, 140 in 10 s"]
+
+
+def test_a_node_without_samples_is_not_judged_by_its_reports(flying: Flying) -> None:
+    for failed in range(11, 20):
+        flying.report(sample_rate_hz=0, radio_failed=failed)
+    assert flying.told == []
 
 
 def test_a_restart_is_no_error(flying: Flying) -> None:
