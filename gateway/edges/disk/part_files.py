@@ -1,4 +1,4 @@
-"""The files of one part on the disk; everything here may block and runs in the recorder's worker.
+"""The files of one part on the disk; everything here may block and runs in the recorder's threads.
 
 Files are only ever appended to, so a power cut at any moment leaves what was written before. Only
 a record that was written partly is removed again.
@@ -7,8 +7,9 @@ a record that was written partly is removed again.
 import contextlib
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -74,16 +75,15 @@ class PartFiles:
         self._part = part
         self._files: dict[str, int] = {}
         self._sizes: dict[str, int] = {}
+        self._has_new_names = False
 
-    def write(self, pieces: Mapping[str, bytes], sync: bool) -> DiskState:
-        """Append to files.
+    def write(self, pieces: Mapping[str, bytes]) -> DiskState:
+        """Append to files, without waiting for the physical disk.
 
         Parameters
         ----------
         pieces : mapping of str to bytes
             What to append, by the ending of the file's name: `.tlog`, `_v1.csv`.
-        sync : bool
-            Wait until all of it is on the physical disk.
 
         Returns
         -------
@@ -99,11 +99,17 @@ class PartFiles:
                 self._open(ending)
             self._append(ending, data)
         for file in self._files.values():
-            if sync:
-                os.fdatasync(file)
             if os.fstat(file).st_nlink == 0:
                 raise FileNotFoundError(errno.ENOENT, "removed while it was written")
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
+
+    def sync_job(self) -> Callable[[], None]:
+        """Return what waits until all that was written is on the physical disk.
+
+        It raises OSError if the disk fails. Other threads may write meanwhile, but not close.
+        """
+        folder, self._has_new_names = self._folder if self._has_new_names else None, False
+        return partial(_sync, tuple(self._files.values()), folder)
 
     def rename(self, to_name: str) -> None:
         """Rename the recording between two writes, also before the first.
@@ -119,22 +125,34 @@ class PartFiles:
             check_free(self._folder, to_name)
         self.session = to_name
 
-    def close(self) -> None:
-        """Close all files, keep what was written, and remove empty files."""
+    def close(self, pieces: Mapping[str, bytes]) -> None:
+        """Append the last bytes, sync, close all files, and remove empty ones.
+
+        Raises
+        ------
+        OSError
+            If the disk refuses something; all files are closed then, too.
+        """
+        try:
+            self.write(pieces)
+        finally:
+            try:
+                self.sync_job()()
+            finally:
+                self._close_all()
+
+    def _close_all(self) -> None:
         files, self._files = self._files, {}
         for ending, file in files.items():
-            try:
-                os.fdatasync(file)
-            finally:
-                os.close(file)
-                if not self._sizes[ending]:
-                    self._path(ending).unlink(missing_ok=True)
+            os.close(file)
+            if not self._sizes[ending]:
+                self._path(ending).unlink(missing_ok=True)
 
     def _open(self, ending: str) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
         self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
         self._sizes[ending] = 0
-        sync_folder(self._folder)
+        self._has_new_names = True
 
     def _path(self, ending: str) -> Path:
         return self._folder / (part_stem(self.session, self._part) + ending)
@@ -150,3 +168,10 @@ class PartFiles:
                 os.ftruncate(file, size)
             raise
         self._sizes[ending] = size + len(data)
+
+
+def _sync(files: Iterable[int], folder: Path | None) -> None:
+    if folder is not None:
+        sync_folder(folder)
+    for file in files:
+        os.fdatasync(file)

@@ -1,29 +1,32 @@
 """The recorder: records what passes through the gateway, and never delays it.
 
 Linux has no way to write to a disk without waiting for it: a card that cleans up, or a network
-folder, blocks for seconds. So a second thread does all disk work. It gets immutable bytes and
-returns a result; nothing is shared, so there is nothing to lock. Meanwhile the event loop buffers
+folder, blocks for seconds. So two other threads do all disk work. They get immutable values and
+return results; nothing is shared, so there is nothing to lock. Meanwhile the event loop buffers
 the next bytes, up to a limit.
 
-Every `flush_s` the buffered bytes go to the kernel, which survives a crash of the gateway; every
-`sync_s` the kernel must write them to the disk, which survives a power loss. By default both are
-half a second, so that either costs less than a second; a card that is worn by this may be synced
-less often.
+Every `flush_s` one thread gives the buffered bytes to the kernel, which survives a crash of the
+gateway; every `sync_s` the other has the kernel write them to the disk, which survives a power
+loss, and it closes, renames and copies what is finished. So no write waits for a slow sync, and
+the next sync begins once the last has ended. By default both times are half a second, so that
+either costs less than a second on a disk that syncs as fast; a card that is worn by this may be
+synced less often. Only between two parts of a recording, once in hours, the buffer waits until the
+first is closed.
 """
 
 import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import msgspec
 
 from gateway.edges.disk.part_files import DiskState, PartFiles, free_bytes_near, reason_of
 from gateway.edges.disk.recordings import RecordingError, part_of, rename_recording
 from gateway.edges.disk.restamp import Restamper, clear_copies
-from gateway.edges.disk.worker import begin_worker
+from gateway.edges.disk.worker import begin_worker, done_by
 from gateway.flightlog.session import (
     Announce,
     ClosePart,
@@ -42,9 +45,6 @@ from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
-
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
 
 
 class Recorder:
@@ -88,7 +88,9 @@ class Recorder:
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
-        self._worker = begin_worker("recorder")
+        self._syncing: Future[None] | None = None
+        """The sync that runs, or ended since the last flush."""
+        self._writer, self._syncer = begin_worker("recorder"), begin_worker("syncer")
         self._wake = asyncio.Event()
         self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
@@ -116,13 +118,14 @@ class Recorder:
         for task in (self._task, self._restamping):
             if task is not None:
                 task.cancel()
-        self._worker.shutdown(wait=True)
+        self._writer.shutdown(wait=True)
+        self._syncer.shutdown(wait=True)
         files, self._files = self._files, None
         try:
             if files is not None and self._part is not None:
                 self._part.flush_rows()
-                files.write(self._part.take(), sync=True)
-                files.close()
+                files.close(self._part.take())
+            self._check_sync()
         except OSError as error:
             log.warning("Recording: the last bytes are lost: %s", reason_of(error))
         self._restamper.finish()
@@ -168,9 +171,9 @@ class Recorder:
         await self._restamped()
         old, files = self._session.name, self._files
         if files is None:
-            await self._on_disk(rename_recording, self.folder, old, name)
+            await done_by(self._syncer, rename_recording, self.folder, old, name)
         else:
-            await self._on_disk(files.rename, name)
+            await done_by(self._writer, files.rename, name)
         self._session.name = name
         if self._part is not None:
             self._part.session = name
@@ -275,17 +278,25 @@ class Recorder:
         now_us, part, files = self._clock(), self._part, self._files
         try:
             if part is None or files is None:
-                self._disk = DiskState(0, await self._on_disk(free_bytes_near, self.folder))
+                free_bytes = await done_by(self._writer, free_bytes_near, self.folder)
+                self._disk = DiskState(0, free_bytes)
                 return []
             if part.size > PENDING_LIMIT:
                 return self._session.failed("disk is too slow", now_us)
-            sync = now_us >= self._sync_due_us
-            if sync:
-                self._sync_due_us = now_us + round(self._settings.sync_s * US_PER_S)
-            self._disk = await self._on_disk(files.write, part.take(), sync)
+            self._disk = await done_by(self._writer, files.write, part.take())
+            self._check_sync()
         except OSError as error:
             return self._session.failed(reason_of(error), self._clock())
+        if self._syncing is None and now_us >= self._sync_due_us:
+            self._sync_due_us = now_us + round(self._settings.sync_s * US_PER_S)
+            self._syncing = self._syncer.submit(files.sync_job())
         return []
+
+    def _check_sync(self) -> None:
+        """Forget the last sync if it has ended; raises the OSError with which it failed."""
+        if self._syncing is not None and self._syncing.done():
+            ended, self._syncing = self._syncing, None
+            ended.result()
 
     async def _perform(self, actions: list[SessionAction]) -> list[SessionAction]:
         """Carry out the session's actions; return its actions upon their outcome."""
@@ -332,7 +343,7 @@ class Recorder:
 
     async def _open_part(self, action: OpenPart) -> list[SessionAction]:
         try:
-            files = await self._on_disk(PartFiles, self.folder, action.session, action.part)
+            files = await done_by(self._writer, PartFiles, self.folder, action.session, action.part)
         except OSError as error:
             self._part = None
             return self._session.failed(reason_of(error), self._clock())
@@ -347,21 +358,22 @@ class Recorder:
 
     async def _close_part(self, part: Part | None) -> None:
         files, self._files = self._files, None
+        syncing, self._syncing = self._syncing, None
         if part is None or files is None:
             return
         try:
-            await self._on_disk(files.write, part.take(), True)
+            await done_by(self._syncer, files.close, part.take())
+            if syncing is not None:
+                syncing.result()
         except OSError as error:
             log.warning("Recording: the end of %s is lost: %s", files.session, reason_of(error))
-        with contextlib.suppress(OSError):
-            await self._on_disk(files.close)
 
     async def _rename(self, action: Rename) -> None:
         """Rename a session after its true time, and queue its finished parts to be shifted."""
         await self._restamped()
         old, new = action.session, action.to_session
         try:
-            found = await self._on_disk(rename_recording, self.folder, old, new)
+            found = await done_by(self._syncer, rename_recording, self.folder, old, new)
         except (OSError, RecordingError) as error:
             log.warning("Recording %s keeps its name and times: %s", old, error)
             return
@@ -369,19 +381,10 @@ class Recorder:
         for path in found.files:
             self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
         self._offsets = dict.fromkeys(self._offsets, true_us)
-        run = self._restamper.run(lambda step: self._on_disk(step))
+        run = self._restamper.run(lambda step: done_by(self._syncer, step))
         self._restamping = asyncio.get_running_loop().create_task(run)
 
     async def _restamped(self) -> None:
         """Wait until no file is being copied, so that its name may change."""
         if self._restamping is not None:
             await self._restamping
-
-    async def _on_disk(
-        self,
-        job: Callable[Parameters, Result],
-        *args: Parameters.args,
-        **kwargs: Parameters.kwargs,
-    ) -> Result:
-        assert not kwargs
-        return await asyncio.get_running_loop().run_in_executor(self._worker, job, *args)

@@ -1,7 +1,7 @@
 """Give finished files their true times, once GPS has provided them.
 
 A part may be larger than the memory and the disk slow, so a file is copied in small steps, between
-which the present recording is written. The copy replaces the file in one step: a power cut leaves
+which the present recording is synced. The copy replaces the file in one step: a power cut leaves
 either.
 """
 
@@ -46,7 +46,7 @@ class Restamper:
             self._waiting.append((path, self._steps(path, shift_us)))
 
     async def run(self, on_disk: Callable[[Callable[[], bool]], Awaitable[bool]]) -> None:
-        """Process the queue, running each step in the disk's thread."""
+        """Process the queue, running each step in the thread that syncs."""
         while await on_disk(self.step):
             pass
 

@@ -1,6 +1,13 @@
 """The threads that do what the event loop must not wait for."""
 
+import asyncio
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import ParamSpec, TypeVar
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
 def begin_worker(name: str) -> ThreadPoolExecutor:
@@ -19,3 +26,22 @@ def begin_worker(name: str) -> ThreadPoolExecutor:
     worker = ThreadPoolExecutor(1, name)
     worker.submit(int)
     return worker
+
+
+async def done_by(
+    worker: ThreadPoolExecutor,
+    job: Callable[Parameters, Result],
+    *args: Parameters.args,
+    **kwargs: Parameters.kwargs,
+) -> Result:
+    """Return a job's result; the job is done even if the task that waits for it is cancelled.
+
+    Parameters
+    ----------
+    worker : ThreadPoolExecutor
+        Whose thread does it, behind its earlier jobs.
+    job : callable
+        Called with the other arguments.
+    """
+    job_alone = partial(job, *args, **kwargs)
+    return await asyncio.shield(asyncio.get_running_loop().run_in_executor(worker, job_alone))

@@ -392,18 +392,18 @@ def test_a_file_that_got_nothing_is_not_left_behind(
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", refuse)
         with pytest.raises(OSError, match="full"):
-            files.write({".tlog": b"x"}, sync=False)
-    files.close()
+            files.write({".tlog": b"x"})
+    files.close({})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
     first = PartFiles(tmp_path, "a", 2)
-    first.write({".tlog": b"x"}, sync=False)
+    first.write({".tlog": b"x"})
     second = PartFiles(tmp_path, "a", 2)
     with pytest.raises(FileExistsError):
-        second.write({".tlog": b"y"}, sync=False)
-    first.close()
+        second.write({".tlog": b"y"})
+    first.close({})
 
 
 async def test_it_records_only_once_the_disk_has_taken_something(
