@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -100,7 +100,7 @@ class Daemon:
             self.now_us,
             on_foreign=lambda frame: self._recorder.frame(frame),
             on_gone=self._on_gone,
-            on_trouble=self._on_trouble,
+            on_trouble=partial(self._announce, True),
             seal=partial(self._pipeline.seal, now_us=self.now_us),
             recordings=Path(settings.recording.folder).expanduser(),
         )
@@ -265,9 +265,6 @@ class Daemon:
     def _mark(self, place: Place | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
 
-    def _on_trouble(self, text: str) -> None:
-        self._announce(True, text)
-
     def _announce(self, is_trouble: bool, text: str) -> None:
         status = StatusText(WARNING if is_trouble else INFO, text)
         self._perform(self._pipeline.say(status, self.now_us()))
@@ -302,10 +299,13 @@ class Daemon:
         self._pipeline.forget_client(client_id)
         self._budget.forget_client(client_id)
 
-    def _record_sent(self, sent: Outgoing) -> None:
-        frame, to = sent.frame, sent.client_id
-        if to is None or self._budget.takes(to, len(frame), self.now_us()):
-            self._recorder.frame(frame)
+    def _send(self, frames: Sequence[Outgoing]) -> None:
+        self._hub.send_all(frames)
+        for sent in frames:
+            self._sent[sent.message_id] += 1
+            frame, to = sent.frame, sent.client_id
+            if to is None or self._budget.takes(to, len(frame), self.now_us()):
+                self._recorder.frame(frame)
 
     def _poll(self) -> None:
         # First, so that the next turn comes whatever happens below.
@@ -324,14 +324,12 @@ class Daemon:
         self._timer.cancel()
         self._timer = loop.call_later(wait_s, self._poll)
 
-    def _perform(self, actions: Iterable[Action]) -> None:
-        """Carry out the actions of the pure stages."""
+    def _perform(self, actions: Sequence[Action]) -> None:
+        """Carry out the actions of the pure stages, frames first."""
+        if frames := [action for action in actions if isinstance(action, Outgoing)]:
+            self._send(frames)
         for action in actions:
             match action:
-                case Outgoing():
-                    self._sent[action.message_id] += 1
-                    self._hub.send(action)
-                    self._record_sent(action)
                 case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
                     self._recorder.flight(action)
                 case ClientInterval():

@@ -171,7 +171,7 @@ async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
 
     if is_full:
         monkeypatch.setattr("gateway.config.write_new", fail)
-    monkeypatch.setattr(daemon._hub, "send", note)
+    monkeypatch.setattr(daemon._hub, "_send", note)
     bias = mavlink.MAVLink_param_set_message(1, 1, b"CAL_GYRO_BIAS_X", 0.01, 9)
     for message in (bias, STORE):
         daemon._on_frame(Incoming(5, frame(message), True))

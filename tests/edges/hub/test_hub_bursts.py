@@ -1,0 +1,86 @@
+"""Many frames of ours at once: over how many turns of the loop they go, and in which order."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from gateway.edges.hub.hub import MAX_WAITING, SENDS_AT_ONCE
+from gateway.records import Incoming
+
+pytestmark = pytest.mark.io
+
+STATIONS = 4
+FRAMES_A_TURN = SENDS_AT_ONCE // STATIONS
+
+
+@pytest.fixture
+async def crowd(rig: Any) -> Any:
+    """Some stations that hear every frame."""
+    rig.stations = [rig.station() for _ in range(STATIONS)]
+    rig.world = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in rig.stations))
+    await rig.until_open(rig.world)
+    return rig
+
+
+def burst(rig: Any, count: int) -> list[bytes]:
+    return [rig.vehicle.attitude() for _ in range(count)]
+
+
+async def test_a_burst_goes_in_its_order_a_few_frames_a_turn(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 3 * FRAMES_A_TURN + 1)
+    sent = []
+    hub.send_all(map(crowd.out, frames))
+    while not sent or sent[-1] < len(frames):
+        sent.append(hub.counters().published)
+        await asyncio.sleep(0)
+    assert sent == [FRAMES_A_TURN, 2 * FRAMES_A_TURN, 3 * FRAMES_A_TURN, len(frames)]
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_answers_to_one_client_are_counted_once(crowd: Any) -> None:
+    hub, asker = crowd.world, crowd.world.clients()[0].client_id
+    hub.send_all(crowd.out(frame, asker) for frame in burst(crowd, SENDS_AT_ONCE + 1))
+    assert hub.counters().published == SENDS_AT_ONCE
+    await asyncio.sleep(0)
+    assert hub.counters().published == SENDS_AT_ONCE + 1
+
+
+async def test_what_comes_behind_a_burst_does_not_overtake_it(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 2 * FRAMES_A_TURN)
+    hub.send_all(map(crowd.out, frames[:-1]))
+    hub.send_all([crowd.out(frames[-1])])
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_a_loop_that_is_too_slow_holds_no_more_than_so_many(crowd: Any) -> None:
+    hub = crowd.world
+    hub.send_all(map(crowd.out, burst(crowd, 2 * MAX_WAITING)))
+    assert hub.counters().published == MAX_WAITING
+
+
+async def test_a_burst_ends_before_the_hub_closes(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 2 * FRAMES_A_TURN)
+    hub.send_all(map(crowd.out, frames))
+    hub.close()
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_a_burst_is_charged_to_the_client_that_caused_it(
+    crowd: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its frames are for all and leave long after its request was served."""
+    hub, router = crowd.world, crowd.world._router
+    charged: list[tuple[int, int]] = []
+    monkeypatch.setattr(
+        router._requests, "charge", lambda payer, size: charged.append((payer, size))
+    )
+    frames = burst(crowd, 2 * FRAMES_A_TURN)
+    router._on_frame = lambda _: hub.send_all(map(crowd.out, frames))
+    asker = hub.clients()[0].client_id
+    router._requests.offer(Incoming(asker, frames[0], True), 0)
+    router._serve()
+    assert charged == [(asker, STATIONS * len(frame)) for frame in frames]
