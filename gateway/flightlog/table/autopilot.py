@@ -2,7 +2,9 @@
 
 The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
 SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
-definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen.
+definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen; it
+never falls within a kind of message. The IMU keeps its own time whatever the others say: theirs may
+be of another clock, as a GPS receiver's.
 
 GPS_RAW_INT has no velocity down: it is GLOBAL_POSITION_INT's, or unknown. Heights do not tell it,
 for that of a receiver that finds or loses its fix jumps by any amount. Of what the autopilot itself
@@ -45,6 +47,9 @@ IMU_RANK: Final = {
 _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
 _PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
 
+_STREAMS: Final = {FIX: 1, PRESSURE: 2, ATTITUDE: 3}
+"""What has a clock of its own besides the IMU, which is 0."""
+
 _BARO, _GPS, _IMU = 1, 2, 3
 """The order of a row: what is not behind its predecessor in it begins a row."""
 _HEAD: Final = slice(0, 4)
@@ -64,8 +69,12 @@ class AutopilotReader:
         self.unix_us_at_zero: int | None = None
         """Civil time of the rows' time zero, by the times of the recording."""
         self._rank = 0
-        self._clock = np.zeros(2, np.int64)
-        """The vehicle's own time at zero, and the newest of the rows' times."""
+        self._zero_us = np.zeros(2, np.int64)
+        """What the vehicle's own time, and that of the recording, were at the rows' zero."""
+        self._newest_us = np.zeros(1 + len(_STREAMS), np.int64)
+        """Of each stream, on the rows' clock."""
+        self._sampled_us = np.zeros(1, np.int64)
+        """When the newest IMU sample was recorded, or what was first."""
         self._places = np.empty(0, _PLACE)
         self._places_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
@@ -125,7 +134,7 @@ class AutopilotReader:
     def _times(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
     ) -> IntArray:
-        """Put messages on the rows' clock, which never falls."""
+        """Put messages on the rows' clock."""
         own_us = np.zeros(len(message_ids), np.int64)
         for message_id, values in fields.items():
             if "time_usec" in (values.dtype.names or ()):
@@ -138,9 +147,15 @@ class AutopilotReader:
         if self.unix_us_at_zero is None and clocked.any():
             first = int(np.argmax(clocked))
             self.unix_us_at_zero = int(recorded_us[first])
-            self._clock[0] = own_us[first] or recorded_us[first]
+            self._zero_us[:] = own_us[first] or recorded_us[first], recorded_us[first]
+            self._sampled_us[0] = recorded_us[first]
         own_us[~clocked] = -1
-        return _on_clock(own_us, recorded_us, self.unix_us_at_zero or 0, self._clock)
+        streams = np.zeros(len(message_ids), np.int64)
+        for message_id, stream in _STREAMS.items():
+            streams[message_ids == message_id] = stream
+        return _on_clock(
+            streams, own_us, recorded_us, self._zero_us, self._newest_us, self._sampled_us
+        )
 
     def _places_at(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
@@ -223,30 +238,44 @@ class AutopilotReader:
 
 @dispatched
 def _on_clock(
-    own_us: IntArray, recorded_us: IntArray, unix_us_at_zero: int, clock: IntArray
+    streams: IntArray,
+    own_us: IntArray,
+    recorded_us: IntArray,
+    zero_us: IntArray,
+    newest_us: IntArray,
+    sampled_us: IntArray,
 ) -> IntArray:
     """Give each message its time since zero.
 
     Parameters
     ----------
+    streams : ndarray, shape (n,)
+        0 for the IMU, or of `_STREAMS`.
     own_us : ndarray, shape (n,)
         By the vehicle; 0 where it tells none, less for a message that has no time.
     recorded_us : ndarray, shape (n,)
-    unix_us_at_zero : int
-        When the first was recorded.
-    clock : ndarray, shape (2,)
-        The vehicle's time at zero, and the newest time, which is changed.
+    zero_us : ndarray, shape (2,)
+        The vehicle's time at zero, and that of the recording.
+    newest_us : ndarray, shape (4,)
+        The newest time of each stream, which is changed.
+    sampled_us : ndarray, shape (1,)
+        When the newest IMU sample was recorded, which is changed.
     """
     found = np.empty_like(own_us)
-    zero_us, newest_us = clock[0], clock[1]
     for i in range(len(own_us)):
+        stream = streams[i]
         if own_us[i] >= 0:
             told_us = recorded_us[i] if own_us[i] == 0 else own_us[i]
-            elapsed_us = told_us - zero_us
-            if not 0 <= elapsed_us - newest_us <= US_PER_S:
+            elapsed_us = told_us - zero_us[0]
+            if not 0 <= elapsed_us - newest_us[0] <= US_PER_S:
                 # Another clock than the IMU's, or a restart: use the time of recording.
-                elapsed_us = recorded_us[i] - unix_us_at_zero
-            newest_us = max(newest_us, elapsed_us)
-        found[i] = newest_us
-    clock[1] = newest_us
+                if stream == 0:
+                    elapsed_us = recorded_us[i] - zero_us[1]
+                else:
+                    # The two clocks drift apart, so only since the newest sample.
+                    elapsed_us = newest_us[0] + max(recorded_us[i] - sampled_us[0], 0)
+            newest_us[stream] = max(newest_us[stream], elapsed_us)
+            if stream == 0:
+                sampled_us[0] = recorded_us[i]
+        found[i] = newest_us[stream]
     return found

@@ -27,6 +27,7 @@ UT_PER_GAUSS: Final = 100.0
 MILLI: Final = 1e-3
 CENTI: Final = 1e-2
 UNKNOWN_U16: Final = 65535
+IMU: Final = "IMU"
 MAG_FIELDS: Final = 0b111 << 6
 """HIGHRES_IMU's bits of what is new."""
 UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
@@ -59,7 +60,8 @@ class SingleReader:
         self._decoder = mavlink.MAVLink(None)
         self._zero_us: int | None = None
         self._rank = 0
-        self._newest_us = 0
+        self._newest_us: dict[str, int] = {}
+        self._sampled_us = 0
         self._place: Any = None
         """The newest GLOBAL_POSITION_INT, and when it was recorded."""
         self._place_us = 0
@@ -112,7 +114,7 @@ class SingleReader:
         return True
 
     def _time(self, message: Any, recorded_us: int) -> int:
-        """Put a message on the records' clock, which never falls."""
+        """Put a message on the records' clock, which never falls within a kind of message."""
         if hasattr(message, "time_usec"):
             own_us = int(message.time_usec)
         else:
@@ -121,13 +123,21 @@ class SingleReader:
             own_us = recorded_us
         if self._zero_us is None:
             self._zero_us = own_us
-            self.unix_us_at_zero = recorded_us
+            self.unix_us_at_zero = self._sampled_us = recorded_us
         elapsed_us = own_us - self._zero_us
-        if not 0 <= elapsed_us - self._newest_us <= US_PER_S:
+        is_imu = message.get_msgId() in _IMU_RANK
+        kind = IMU if is_imu else message.get_type()
+        sample_us = self._newest_us.get(IMU, 0)
+        if not 0 <= elapsed_us - sample_us <= US_PER_S:
             # Another clock than the IMU's, or a restart: what was recorded then is true.
-            elapsed_us = recorded_us - (self.unix_us_at_zero or 0)
-        self._newest_us = max(self._newest_us, elapsed_us)
-        return self._newest_us
+            if is_imu:
+                elapsed_us = recorded_us - (self.unix_us_at_zero or 0)
+            else:
+                elapsed_us = sample_us + max(recorded_us - self._sampled_us, 0)
+        if is_imu:
+            self._sampled_us = recorded_us
+        self._newest_us[kind] = max(self._newest_us.get(kind, 0), elapsed_us)
+        return self._newest_us[kind]
 
     def _highres_imu(self, m: Any, recorded_us: int) -> list[Imported]:
         time_us = self._time(m, recorded_us)

@@ -149,6 +149,36 @@ def test_the_clock_never_falls_whatever_the_messages_say() -> None:
     assert stamps[-1] <= 60_000
 
 
+@pytest.mark.parametrize("lead_us", [300_000, 900_000, 1_500_000, -300_000])
+def test_fixes_of_another_clock_leave_the_imu_its_spacing(lead_us: int) -> None:
+    messages: list[tuple[int, Message]] = []
+    for at_us in range(0, 4_000_000, 20_000):
+        messages.append((at_us, raw(2_000_000 + at_us)))
+        if at_us % 200_000 == 100_000:
+            messages.append((at_us + 5_000, gps(2_000_000 + at_us + lead_us)))
+            messages.append((at_us + 6_000, attitude((2_000_000 + at_us) // 1000 + 8)))
+    records = read(messages)
+    samples = [r.time_us for r in records if isinstance(r, ImuCalibrated)]
+    assert samples == [*range(0, 4_000_000, 20_000)]
+    # A fix whose stamp cannot be of the IMU's clock came when it was recorded.
+    late_us = lead_us if 0 <= lead_us <= 1_000_000 else 5_000
+    fixes = [r.time_us for r in records if isinstance(r, GpsFix)]
+    assert fixes == [*range(100_000 + late_us, 4_000_000 + late_us, 200_000)]
+    states = [r.time_us for r in records if isinstance(r, NavState)]
+    assert states == [*range(108_000, 4_000_000, 200_000)]
+
+
+def test_a_fix_without_a_stamp_follows_the_imu_though_the_recording_drifts() -> None:
+    """The recording's clock is slower by a percent; a fix comes 4 ms after each tenth sample."""
+    messages: list[tuple[int, Message]] = []
+    for at_us in range(0, 4_000_000, 20_000):
+        messages.append((at_us * 99 // 100, raw(2_000_000 + at_us)))
+        if at_us % 200_000 == 0:
+            messages.append((at_us * 99 // 100 + 4_000, gps(0)))
+    fixes = [r.time_us for r in read(messages) if isinstance(r, GpsFix)]
+    assert fixes == [*range(4_000, 4_000_000, 200_000)]
+
+
 def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
     return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
 
