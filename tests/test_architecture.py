@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | JOINED
     | {"replay", "edges", "flights", "analysis", "extensions", "output"},
     "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis", "season"},
-    "fleet": FOUNDATION | STAGES | {"edges"},
+    "fleet": FOUNDATION | STAGES | {"edges", "output"},
     "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "fleet", "output"},
     "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
     "extensions": set(),

@@ -117,7 +117,7 @@ class FleetServer:
         if self._task is not None:
             self._task.cancel()
         self._session.close()
-        self._ids_file.keep()
+        self._ids_file.close()
         self._metrics.close()
         self._hub.close()
         self._control.close()
@@ -148,7 +148,7 @@ class FleetServer:
         about_hub = hub_families(hub.counters(), hub.listeners(), clients, self._now_us())
         return text_of(chain(fleet_families(status), about_hub))
 
-    def _set_id(self, params: IdParams) -> list[str]:
+    async def _set_id(self, params: IdParams) -> list[str]:
         if not SITE_NAME.fullmatch(params.site):
             raise ControlError(f"site {params.site!r}: letters, digits, . _ and - only")
         try:
@@ -158,7 +158,11 @@ class FleetServer:
                 self._ids.set_by_hand(params.site, params.system_id, params.own_id)
         except ValueError as error:
             raise ControlError(str(error)) from error
-        self._ids_file.keep()
+        if reason := await self._ids_file.keep():
+            raise ControlError(
+                f"the id counts from now on, but is not kept: {self._ids_file.file}: {reason}; "
+                "it is tried again until the fleet ends"
+            )
         return [
             f"{site}/{system} {f'= {own_id}' if own_id else 'is left out'}"
             for (site, system), own_id in self._ids.items()
@@ -167,7 +171,7 @@ class FleetServer:
     async def _keep(self) -> None:
         while True:
             await self._session.open()
-            self._ids_file.keep()
+            await self._ids_file.keep()
             now_us = self._now_us()
             for site in self._sites.values():
                 site.translation.mark(now_us)

@@ -1,12 +1,14 @@
 """The file that keeps which system id a vehicle of a site has here."""
 
-import json
 import logging
 from pathlib import Path
 
 import msgspec
 
+from gateway.edges.disk.worker import begin_worker, done_by
+from gateway.edges.reasons import reason_of
 from gateway.fleet.id_map import LEFT_OUT, IdMap, Vehicle
+from gateway.output import write_new
 from gateway.routing.endpoint import SITE_NAME
 
 log = logging.getLogger(__name__)
@@ -27,23 +29,51 @@ class IdsFile:
     """
 
     def __init__(self, file: Path) -> None:
-        self._file = file
+        self.file = file
+        """Where it is."""
         self.ids = IdMap(_read(file))
         self._kept = self.ids.version
+        self._worker = begin_worker("ids")
+        self._trouble = ""
 
-    def keep(self) -> None:
-        """Write what has changed; a disk that takes nothing is logged once."""
-        if self._kept == self.ids.version:
-            return
+    async def keep(self) -> str:
+        """Write what has changed, and wait until the disk has it.
+
+        Returns
+        -------
+        str
+            Why the disk did not take it, also logged; empty if it did. The next call tries again.
+        """
+        version = self.ids.version
+        if version != self._kept:
+            reason = await done_by(self._worker, self._write, self._text())
+            self._note(version, reason)
+        return self._trouble
+
+    def close(self) -> None:
+        """Write what has changed, and end; waits for the disk."""
+        self._worker.shutdown(wait=True)
+        if self.ids.version != self._kept:
+            self._note(self.ids.version, self._write(self._text()))
+
+    def _text(self) -> bytes:
         table = {f"{site}/{system}": own_id for (site, system), own_id in self.ids.items()}
+        return msgspec.json.format(msgspec.json.encode(table)) + b"\n"
+
+    def _write(self, text: bytes) -> str:
         try:
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            fresh = self._file.with_suffix(".new")
-            fresh.write_text(json.dumps(table, indent=2) + "\n")
-            fresh.replace(self._file)
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            write_new(self.file, [text], overwrite=True)
         except OSError as error:
-            log.warning("%s: %s; ids are kept only until the end", self._file, error.strerror)
-        self._kept = self.ids.version
+            return reason_of(error)
+        return ""
+
+    def _note(self, version: int, reason: str) -> None:
+        if not reason:
+            self._kept = max(self._kept, version)
+        elif reason != self._trouble:
+            log.warning("%s: %s; new ids count only until the end", self.file, reason)
+        self._trouble = reason
 
 
 def _read(file: Path) -> dict[Vehicle, int]:

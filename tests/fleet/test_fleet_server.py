@@ -1,7 +1,9 @@
 """Sites and a fleet with real sessions: two ways, presence, loops, names, and the kept ids."""
 
 import asyncio
+import errno
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -12,7 +14,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.operator.control_socket import request
+from gateway.edges.operator.control_socket import ControlError, request
+from gateway.fleet import ids_file
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings
 from gateway.routing.hub_settings import HubSettings
@@ -133,6 +136,21 @@ async def test_ids_are_kept_shown_and_set_by_hand(world: World, settings: FleetS
     await world.until(lambda: 77 in world.systems())
     status = await asyncio.to_thread(request, socket_path, "fleet.status", {})
     assert status["sites"][0]["vehicles"][0]["id"] == 77
+    assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
+
+
+async def test_an_id_that_the_disk_does_not_keep_is_an_error(
+    world: World, settings: FleetSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    params = {"site": "field-a", "system_id": 1, "own_id": 77}
+    with monkeypatch.context() as patch:
+        patch.setattr(ids_file, "write_new", refuse)
+        with pytest.raises(ControlError, match=r"not kept: .*fleet\.json: No space left"):
+            await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", params)
+    await world.until(Path(settings.ids_file).exists)
     assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
 
 

@@ -1,0 +1,87 @@
+"""The ids of a fleet on the disk."""
+
+import asyncio
+import errno
+import json
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.fleet import ids_file
+from gateway.fleet.ids_file import IdsFile
+
+pytestmark = pytest.mark.io
+
+NO_SPACE = "No space left on device"
+
+
+def refuse(*_: object, **__: object) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[IdsFile]:
+    made = IdsFile(tmp_path / "folder" / "fleet.json")
+    yield made
+    made.close()
+
+
+def on_disk(kept: IdsFile) -> object:
+    return json.loads(kept.file.read_bytes())
+
+
+async def test_ids_are_kept_for_the_next_start(kept: IdsFile) -> None:
+    assert await kept.keep() == ""
+    assert not kept.file.exists()
+    kept.ids.set_by_hand("field-a", 1, 77)
+    kept.ids.leave_out("field-b", 2)
+    assert await kept.keep() == ""
+    assert on_disk(kept) == {"field-b/2": 0, "field-a/1": 77}
+    again = IdsFile(kept.file)
+    assert again.ids.items() == kept.ids.items()
+    again.close()
+
+
+async def test_they_are_kept_only_once_the_disk_has_them(
+    kept: IdsFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_write, begun, write_new = threading.Event(), asyncio.Event(), ids_file.write_new
+    loop = asyncio.get_running_loop()
+
+    def slow(path: Path, pieces: list[bytes], *, overwrite: bool) -> int:
+        loop.call_soon_threadsafe(begun.set)
+        may_write.wait()
+        return write_new(path, pieces, overwrite=overwrite)
+
+    monkeypatch.setattr(ids_file, "write_new", slow)
+    kept.ids.set_by_hand("field-a", 1, 77)
+    keeping = asyncio.create_task(kept.keep())
+    try:
+        await begun.wait()
+        assert not keeping.done()
+    finally:
+        may_write.set()
+    assert await keeping == ""
+    assert on_disk(kept) == {"field-a/1": 77}
+
+
+async def test_a_disk_that_refuses_is_reported_and_tried_again(
+    kept: IdsFile, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept.ids.set_by_hand("field-a", 1, 77)
+    with monkeypatch.context() as patch:
+        patch.setattr(ids_file, "write_new", refuse)
+        assert await kept.keep() == NO_SPACE
+        assert await kept.keep() == NO_SPACE
+    assert [record.getMessage().count(NO_SPACE) for record in caplog.records] == [1]
+    assert await kept.keep() == ""
+    assert on_disk(kept) == {"field-a/1": 77}
+
+
+async def test_the_last_ids_are_kept_at_the_end(kept: IdsFile) -> None:
+    kept.ids.set_by_hand("field-a", 1, 77)
+    kept.close()
+    assert on_disk(kept) == {"field-a/1": 77}
