@@ -86,6 +86,7 @@ class ControlServer:
         self._for_group = "RUNTIME_DIRECTORY" in os.environ
         self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
         self._server: asyncio.Server | None = None
+        self._is_closed = False
         self._writers: set[asyncio.StreamWriter] = set()
         self.register("verbs", NoParams, lambda _: sorted(self._verbs))
 
@@ -136,7 +137,7 @@ class ControlServer:
         if self._server is None:
             return
         self._server.close()
-        self._server = None
+        self._server, self._is_closed = None, True
         for writer in self._writers:
             writer.close()
         self.path.unlink(missing_ok=True)
@@ -163,7 +164,9 @@ class ControlServer:
         return self._verbs[verb]
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._writers) >= MAX_CONNECTIONS or not self._is_allowed(writer):
+        # One that was accepted just before the end is served only after it.
+        is_refused = self._is_closed or len(self._writers) >= MAX_CONNECTIONS
+        if is_refused or not self._is_allowed(writer):
             writer.close()
             return
         self._writers.add(writer)

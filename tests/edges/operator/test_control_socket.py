@@ -25,6 +25,9 @@ from gateway.edges.operator.control_socket import (
 
 pytestmark = pytest.mark.io
 
+LIMIT_S = 60.0
+"""After which a connection that nobody closes makes its test fail."""
+
 
 class Seek(msgspec.Struct, forbid_unknown_fields=True):
     offset_s: float
@@ -113,6 +116,27 @@ async def test_too_many_connections_are_turned_away(server: ControlServer) -> No
     for _, writer in links:
         writer.close()
         await writer.wait_closed()
+
+
+async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "run.sock")
+    accepted, ended, serve = asyncio.Event(), asyncio.Event(), server._serve
+
+    async def serve_late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        accepted.set()
+        await ended.wait()
+        await serve(reader, writer)
+
+    server._serve = serve_late  # type: ignore[method-assign]
+    await server.start()
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    await accepted.wait()
+    server.close()
+    ended.set()
+    async with asyncio.timeout(LIMIT_S):
+        assert await reader.read() == b""
+    writer.close()
+    await writer.wait_closed()
 
 
 async def test_a_path_that_is_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
