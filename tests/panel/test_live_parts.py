@@ -1,7 +1,10 @@
 """Parts of the page that stay the same while they are refreshed, built without a browser."""
 
 import asyncio
+import errno
+import os
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +13,9 @@ from nicegui import Client
 from nicegui.page import page
 
 from gateway.panel.dialogues import Dialogue
+from gateway.panel.estimator_trial import ComparisonError
+from gateway.panel.instruments import comparison_card
+from gateway.panel.instruments.comparison_card import ComparisonCard
 from gateway.panel.instruments.parameter_row import ParameterRow
 from gateway.panel.instruments.strip_chart import StripChart
 from gateway.panel.live_table import LiveTable, RowButton
@@ -101,3 +107,45 @@ def test_a_browser_that_is_slow_to_draw_a_picture_is_waited_for(
     assert asyncio.run(chart.span_ms()) == (1.0, 2.0)
     assert asyncio.run(chart.picture()) == "data:"
     assert min(limits_s) >= 60.0
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (BrokenProcessPool("the process ended"), "Cannot be compared: the process ended."),
+        (
+            OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
+            "Cannot be compared: Cannot allocate memory.",
+        ),
+        (MemoryError(), "Cannot be compared: MemoryError."),
+    ],
+)
+def test_a_comparison_that_fails_says_why_and_may_be_tried_again(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, text: str
+) -> None:
+    card, failures = comparison_of(monkeypatch, [error, ComparisonError("no samples")])
+    with pytest.raises(type(error)):
+        asyncio.run(card._compare())
+    assert (card._story.text, card._button.enabled) == (text, True)
+    asyncio.run(card._compare())
+    again = "no samples. Samples are being collected; try again in a moment."
+    assert (card._story.text, card._button.enabled) == (again, True)
+    assert failures == []
+
+
+def comparison_of(
+    monkeypatch: pytest.MonkeyPatch, failures: list[Exception]
+) -> tuple[ComparisonCard, list[Exception]]:
+    """Build a card whose comparisons fail in these ways, one after the other."""
+    dialogues = SimpleNamespace(of=lambda _: Dialogue(1))
+    samples = SimpleNamespace(frames=lambda _: [])
+    parts = SimpleNamespace(dialogues=dialogues, samples=samples)
+    context: Any = SimpleNamespace(system_id=1, may_change=False, parts=parts)
+    card = ComparisonCard(context)
+
+    async def fail(*_: object) -> None:
+        assert not card._button.enabled
+        raise failures.pop(0)
+
+    monkeypatch.setattr(comparison_card, "compare_apart", fail)
+    return card, failures
