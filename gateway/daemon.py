@@ -144,6 +144,8 @@ class Daemon:
         """Open everything; needs a running event loop. What is missing is retried."""
         if self._settings.hub.realtime_priority:
             set_realtime_priority(self._settings.hub.realtime_priority)
+        # Several, since a network that is down holds each look-up of a name for seconds.
+        asyncio.get_running_loop().set_default_executor(begin_worker("lookups", 8))
         self._hub.start()
         self._recorder.start()
         self._serve_metrics()

@@ -138,6 +138,15 @@ async def test_it_is_ready_once_orders_can_be_taken(
     assert ready == [True]
 
 
+async def test_the_thread_for_look_ups_is_there_before_the_first(daemon: Daemon) -> None:
+    others = set(threading.enumerate())
+    daemon.start()
+    begun = {thread for thread in set(threading.enumerate()) - others if "lookups" in thread.name}
+    await daemon.control_socket()
+    daemon.close()
+    assert len(begun) == 1
+
+
 @pytest.mark.parametrize("estimator", ["complementary", "eskf"])
 async def test_a_reload_tells_of_what_needs_a_new_start(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, estimator: str

@@ -63,9 +63,12 @@ class _Outlet:
     stamps: dict[tuple[int, int], _Stamp] = field(default_factory=dict)
 
     def stamp_of(self, origin: tuple[int, int]) -> _Stamp:
-        if len(self.stamps) >= MAX_PLANS:
-            self.stamps.clear()
-        return self.stamps.setdefault(origin, _Stamp())
+        stamp = self.stamps.get(origin)
+        if stamp is None:
+            if len(self.stamps) >= MAX_PLANS:
+                self.stamps.clear()
+            stamp = self.stamps[origin] = _Stamp()
+        return stamp
 
     def interval_us(self, key: bytes, plan: "_Plan") -> int:
         """Return the least time between two frames; the settings bound a client's request."""

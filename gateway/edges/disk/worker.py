@@ -10,20 +10,22 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def begin_worker(name: str) -> ThreadPoolExecutor:
-    """Start a thread for files at once: when its first job comes, the loop would wait for it.
+def begin_worker(name: str, most: int = 1) -> ThreadPoolExecutor:
+    """Start a thread at once: when its first job comes, the loop would wait for it.
 
     Parameters
     ----------
     name : str
         Prefix of the thread's name.
+    most : int
+        Threads there may be; another starts where a job comes and all are busy.
 
     Returns
     -------
     ThreadPoolExecutor
-        With this one thread.
+        With one thread.
     """
-    worker = ThreadPoolExecutor(1, name)
+    worker = ThreadPoolExecutor(most, name)
     worker.submit(int)
     return worker
 
