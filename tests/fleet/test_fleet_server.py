@@ -131,7 +131,7 @@ async def test_ids_are_kept_shown_and_set_by_hand(world: World, settings: FleetS
     await world.until(lambda: bool(world.systems()))
     socket_path = world.fleet.control_socket
     params = {"site": "field-a", "system_id": 1, "own_id": 77}
-    answer = await asyncio.to_thread(request, socket_path, "fleet.id", params)
+    answer = await asyncio.to_thread(request, socket_path, "fleet.id", params, timeout_s=LIMIT_S)
     assert answer == ["field-a/1 = 77"]
     await world.until(lambda: 77 in world.systems())
     status = await asyncio.to_thread(request, socket_path, "fleet.status", {})

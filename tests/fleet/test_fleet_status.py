@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.edges.operator.control_socket import request
+from tests.edges.hub.conftest import LIMIT_S
 from tests.fleet.conftest import World, run
 from tests.ports import free_port
 
@@ -81,5 +82,6 @@ async def test_a_vehicle_that_is_left_out(world: World, tmp_path: Path) -> None:
     assert "left out by hand: field-a/1" in await run("fleet", "status")
     assert json.loads((tmp_path / "fleet.json").read_text())["field-a/1"] == 0
     params = {"site": "field-a", "system_id": 1, "own_id": 9}
-    await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", params)
+    path = world.fleet.control_socket
+    await asyncio.to_thread(request, path, "fleet.id", params, timeout_s=LIMIT_S)
     await world.until(lambda: 9 in world.systems())

@@ -5,7 +5,7 @@ import logging
 import signal
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -24,6 +24,9 @@ from gateway.routing.endpoint import SITE_NAME
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
+
+DISK_S: Final = 60.0
+"""Longest wait for a file that is written: a worn card takes seconds for each of its steps."""
 
 group = AskingTyper(
     help="Show the vehicles of many sites here, through a Zenoh router.",
@@ -113,7 +116,7 @@ def set_id(
     if not name or not system.isdecimal():
         refuse(f"{vehicle!r} is not SITE/SYSTEM, as in field-1/1")
     params = {"site": name, "system_id": int(system), "own_id": own_id}
-    for line in ask("fleet.id", params, of="fleet"):
+    for line in ask("fleet.id", params, of="fleet", wait_s=DISK_S):
         print(line)
 
 

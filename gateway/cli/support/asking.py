@@ -26,7 +26,13 @@ Command = TypeVar("Command", bound=Callable[..., object])
 _named: ContextVar[Path | None] = ContextVar("socket", default=None)
 
 
-def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> Any:
+def ask(
+    verb: str,
+    params: dict[str, Any] | None = None,
+    *,
+    of: str = "run",
+    wait_s: float | None = None,
+) -> Any:
     """Send a request to the running gateway (or player); end the command if that fails.
 
     Parameters
@@ -37,9 +43,11 @@ def ask(verb: str, params: dict[str, Any] | None = None, *, of: str = "run") -> 
         Its parameters.
     of : str
         `run` for the gateway, `play` for a player.
+    wait_s : float, optional
+        Longest wait, where it is not that of `request`.
     """
     try:
-        return request(_named.get() or find_socket(of), verb, params)
+        return request(_named.get() or find_socket(of), verb, params, timeout_s=wait_s)
     except ControlError as error:
         refuse(str(error))
 
