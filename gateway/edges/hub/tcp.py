@@ -21,14 +21,12 @@ CHUNK_BYTES: Final = 4096
 """Joined into one write while a queue drains; also read at once."""
 READ_BUDGET: Final = 16
 """Chunks taken at one wake-up, so that one flooding peer cannot starve the others."""
-ACCEPT_BUDGET: Final = 16
-"""Connections accepted at one wake-up."""
 USER_TIMEOUT_MS: Final = 30_000
 """A peer that acknowledges nothing for so long is gone; a paused one may come back sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
 """Small, so that frames wait in our queue, where old ones make room for new ones."""
 ACCEPT_BACKLOG: Final = 128
-"""A thousand pages that connect again at once find room within a few wake-ups."""
+"""Pages that connect again at once wait there, since each wake-up accepts one."""
 
 
 class StreamClient(Client):
@@ -243,21 +241,21 @@ class StreamListener(Listener[Peer]):
         return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(ACCEPT_BUDGET):
-            try:
-                connection, address = sock.accept()
-            except BlockingIOError:
-                return
-            except OSError as error:
-                # Out of descriptors: the waiting client would wake us for ever.
-                self._complain(error)
-                self._loop.remove_reader(sock)
-                return
-            if not self._has_room(str(address[0])):
-                self.turned_away += 1
-                connection.close()
-                continue
+        # One at a wake-up: admitting it takes as long as serving the others several times.
+        try:
+            connection, address = sock.accept()
+        except BlockingIOError:
+            return
+        except OSError as error:
+            # Out of descriptors: the waiting client would wake us for ever.
+            self._complain(error)
+            self._loop.remove_reader(sock)
+            return
+        if self._has_room(str(address[0])):
             self._admit(connection, host_and_port(*address[:2]))
+        else:
+            self.turned_away += 1
+            connection.close()
 
     def _has_room(self, host: str) -> bool:
         """Return whether there is room for a newcomer, after removing another if needed."""

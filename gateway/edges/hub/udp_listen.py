@@ -21,8 +21,6 @@ from gateway.wire.mavlink_splitter import origin_of, split_datagram
 IP_PKTINFO: Final = 8
 """Not exported by `socket` before Python 3.14; gives the local address of a datagram."""
 ANCILLARY_BYTES: Final = 64
-STRANGERS: Final = 4
-"""Admitted at one wake-up: admitting one takes as long as serving the others several times."""
 PARTINGS: Final = 32
 """Dead clients removed at one tick; they cost nothing until then."""
 
@@ -99,12 +97,12 @@ class UdpListener(Listener[UdpPeer]):
         return sock
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(STRANGERS):
-            try:
-                data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
-            except OSError:
-                return
-            self._take(data, address, _local_host(ancillary))
+        # One at a wake-up: admitting a stranger takes as long as serving the others several times.
+        try:
+            data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
+        except OSError:
+            return
+        self._take(data, address, _local_host(ancillary))
 
     def _take(self, data: bytes, address: Address, local_host: str) -> None:
         presence = self.table.find((str(address[0]), int(address[1])))

@@ -1,6 +1,8 @@
-"""Many frames of ours at once: over how many turns of the loop they go, and in which order."""
+"""Much at once: over how many turns of the loop it goes, and in which order."""
 
 import asyncio
+import itertools
+import socket
 from typing import Any
 
 import pytest
@@ -84,3 +86,24 @@ async def test_a_burst_is_charged_to_the_client_that_caused_it(
     router._requests.offer(Incoming(asker, frames[0], True), 0)
     router._serve()
     assert charged == [(asker, STATIONS * len(frame)) for frame in frames]
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp", "ws"])
+async def test_those_who_come_at_once_are_admitted_one_a_turn(rig: Any, kind: str) -> None:
+    hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+    port = hub.listening_ports()[0]
+    for _ in range(STATIONS):
+        if kind == "udp":
+            station = rig.station(port)
+            station.say(station.sender.heartbeat())
+        else:
+            rig.closing.append(socket.create_connection(("127.0.0.1", port)).close)
+    (listener,) = hub._endpoints.values()
+    seen = [0]
+
+    def are_all_in() -> bool:
+        seen.append(len(listener._clients) + len(getattr(listener, "_callers", ())))
+        return seen[-1] == STATIONS
+
+    await rig.until(are_all_in)
+    assert all(after - before <= 1 for before, after in itertools.pairwise(seen))
