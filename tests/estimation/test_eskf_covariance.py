@@ -13,6 +13,7 @@ from gateway.estimation.eskf.covariance import (
     propagate,
     update_scalar,
 )
+from gateway.estimation.eskf.eskf_kernels import collect_roughness
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -27,7 +28,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
-from gateway.estimation.kernel_record import copy_record, new_record
+from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
@@ -83,19 +84,38 @@ def test_propagation_is_the_matrix_product(state: EskfState, rng: np.random.Gene
     assert state.pending_s == 0.0
 
 
-def test_a_turn_leaks_into_the_axes_beside_its_own(rng: np.random.Generator) -> None:
-    turn_b, R = np.array([0.1, -0.2, 0.3]), Rotation.random(random_state=rng).as_matrix()
-    gains = copy_record(GAINS)
-    gains.gyro_axes_var = 1e-3
+def test_a_turn_makes_every_axis_less_sure() -> None:
     variances = []
-    for p in (GAINS, gains):
+    for turned_rad in (0.0, 0.3):
         s = new_record(EskfState)
-        s.pending_s, s.pending_scaled[:] = 0.02, R * turn_b
-        propagate(s, p)
+        s.pending_s, s.pending_rad = 0.02, turned_rad
+        propagate(s, GAINS)
+        assert s.pending_rad == 0.0
         variances.append(np.diag(s.P)[TILT : TILT + 3])
-    angle = np.linalg.norm(turn_b)
-    expected = 1e-3 * angle * (1.0 - (R @ turn_b / angle) ** 2)
+    expected = np.full(3, 0.3 * GAINS.gyro_turn_var)
     np.testing.assert_allclose(variances[1] - variances[0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+def test_noise_is_told_from_a_rate_that_grows(gain: float, rng: np.random.Generator) -> None:
+    s, dt, noise, count = new_record(EskfState), 0.01, 0.03, 4000
+    steady = np.arange(count)[:, None] * gain * dt + np.zeros(3)
+    gyro, accel = (steady + noise * rng.standard_normal((count, 3)) for _ in range(2))
+    for g, a in zip(gyro.tolist(), accel.tolist(), strict=True):
+        collect_roughness(s, tuple(g), tuple(a), dt)
+        s.gyro_last[:], s.accel_last[:] = g, a
+    expected = pytest.approx(count * (noise * dt) ** 2, rel=0.1)
+    assert s.rough_gyro == expected
+    assert s.rough_accel == expected
+
+
+def test_a_sample_that_is_no_number_is_forgotten() -> None:
+    s = new_record(EskfState)
+    for rate in (0.0, math.nan, 0.0, 0.0):
+        collect_roughness(s, (rate, 0.0, 0.0), (0.0, 0.0, rate), 0.01)
+        s.gyro_last[:], s.accel_last[:] = (rate, 0.0, 0.0), (0.0, 0.0, rate)
+    assert s.rough_gyro == s.rough_accel == 0.0
+    assert s.gyro_change.tolist() == s.accel_change.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator) -> None:

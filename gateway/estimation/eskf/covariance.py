@@ -55,11 +55,9 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     mirror(s.P)
     apply_transition(s, s.P, MOVED)
     symmetrise(s.P)
-    turned = p.gyro_roughness_sq * s.rough_gyro
+    turned = p.gyro_roughness_sq * s.rough_gyro + p.gyro_turn_var * s.pending_rad
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
-    s.pending_accel_sq = s.rough_gyro = s.rough_accel = 0.0
-    if p.gyro_axes_var > 0.0:
-        add_axes_error(s, p)
+    s.pending_accel_sq = s.rough_gyro = s.rough_accel = s.pending_rad = 0.0
     kept = math.exp(-dt / p.gps_wander_s)
     for k in range(3):
         s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
@@ -76,23 +74,6 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     for k in range(3):
         for j in range(3):
             s.pending_turn[k, j] = s.pending_scaled[k, j] = 0.0
-
-
-@compiled
-def add_axes_error(s: EskfState, p: EskfGains) -> None:
-    """Add what a turn leaks into the axes beside its own, since those of a gyroscope are off."""
-    W = s.pending_scaled
-    north, east, down = (
-        W[0, 0] + W[0, 1] + W[0, 2],
-        W[1, 0] + W[1, 1] + W[1, 2],
-        W[2, 0] + W[2, 1] + W[2, 2],
-    )
-    angle = math.sqrt(north * north + east * east + down * down)
-    if angle == 0.0:
-        return
-    s.P[TILT, TILT] += p.gyro_axes_var * (angle - north * north / angle)
-    s.P[TILT + 1, TILT + 1] += p.gyro_axes_var * (angle - east * east / angle)
-    s.P[TILT + 2, TILT + 2] += p.gyro_axes_var * (angle - down * down / angle)
 
 
 @compiled

@@ -129,13 +129,19 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
 
 @compiled
 def collect_roughness(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
-    """Measure the noise by the changes from sample to sample, before the last sample goes."""
+    """Measure the noise by how the changes from sample to sample change: motion goes on, noise not.
+
+    What the sum over a steady change is late by, the next change takes back: that is no noise.
+    """
     turn, pull = 0.0, 0.0
     for k in range(3):
-        turn += (gyro[k] - s.gyro_last[k]) ** 2
-        pull += (accel[k] - s.accel_last[k]) ** 2
-    # Two samples' noise, three axes.
-    share = dt * dt / 6.0
+        turned, pulled = gyro[k] - s.gyro_last[k], accel[k] - s.accel_last[k]
+        turn += (turned - s.gyro_change[k]) ** 2
+        pull += (pulled - s.accel_change[k]) ** 2
+        s.gyro_change[k] = turned if abs(turned) < ROUGH_LIMIT else 0.0
+        s.accel_change[k] = pulled if abs(pulled) < ROUGH_LIMIT else 0.0
+    # The noise of three samples, the middle one twice, of three axes.
+    share = dt * dt / 18.0
     if turn < ROUGH_LIMIT and pull < ROUGH_LIMIT:
         s.rough_gyro += share * turn
         s.rough_accel += share * pull
@@ -212,6 +218,7 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
     x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
     f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
     s.pending_s += dt
+    s.pending_rad += dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     force_i = rotate(as_quat(s.q_ib), (f0, f1, f2))
     follows = s.aided == 0 and s.time_s - s.fix_s < FRESH_GPS_S and math.isfinite(s.fix_vel[2])
     for k in range(3):

@@ -1,5 +1,6 @@
 """Settings and gains of the error-state Kalman filter."""
 
+import math
 from typing import Annotated, Final
 
 from gateway.estimation.filtering.filter_state import FilterGains, filter_gains
@@ -11,6 +12,8 @@ from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
 VELOCITY_CORRELATION_S: Final = 0.25
+LASTING_RAD: Final = 0.005
+"""Axes and scales of the sensors are off by about this for a whole flight."""
 
 
 class EskfSettings(Settings, frozen=True):
@@ -23,12 +26,12 @@ class EskfSettings(Settings, frozen=True):
     gyro_roughness: Annotated[
         float,
         setting(
-            "How much of the sample-to-sample change of the angular rate is taken for noise, "
-            "vibration and what the sampling misses; 1 if all of it.",
+            "How much of what is uneven in the angular rate from sample to sample is taken for "
+            "noise, vibration and what the sampling misses; 1 if all of it, were it white.",
             ge=0.0,
             le=10.0,
         ),
-    ] = 0.94
+    ] = 1.5
     gyro_scale: Annotated[
         float,
         setting(
@@ -143,8 +146,8 @@ class EskfGains(FilterGains):
     gyro_roughness_sq: float
     accel_roughness_sq: float
     gyro_scale_var: float
-    gyro_axes_var: float
-    """Squared angle that a turn by one radian leaks into each axis beside its own, rad2/rad."""
+    gyro_turn_var: float
+    """Variance of the attitude after a turn of 1 rad, by scale and axes of the gyroscope, rad2."""
     accel_density: float
     """m2/s3."""
     accel_scale_sq: float
@@ -205,7 +208,9 @@ def make_gains(
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_var": s.gyro_scale**2,
-        "gyro_axes_var": 0.0,
+        # What is off by a lasting angle errs by no more than twice that in a turn, and not at all
+        # after a circle; on average over the circle, such a walk errs as much.
+        "gyro_turn_var": LASTING_RAD**2 / math.pi,
         "accel_density": s.accel_noise_mpsprs**2,
         "accel_scale_sq": s.accel_scale**2,
         "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,

@@ -35,7 +35,7 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.covariance import MOVED
-from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_settings import LASTING_RAD, EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
 from gateway.estimation.eskf.unaided_velocity import FLOWN_S, WAY_S
 from gateway.estimation.kernel import KernelEstimator, SampleLog
@@ -49,8 +49,8 @@ VELOCITY_CORRELATION_S: Final = 0.75
 FIELD_MEMORY_S: Final = 5.0
 """What lasts is noise to a filter that forgets, and an error to one that averages over minutes:
 the smoother counts fewer GPS velocities as independent, and doubts a disturbed field for longer."""
-LASTING_RAD: Final = 0.005
-"""Axes and scales of the sensors are off for a whole flight; averages do not lessen that."""
+LASTING_ROUGHNESS: Final = 1.5
+"""The same of vibration, which sampling folds down to slow errors: its variance counts for more."""
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Share of its own variance that each state foreseen is blurred by, so that all can be divided."""
@@ -114,9 +114,7 @@ def _gains_of(estimator: KernelEstimator[Any, Any]) -> EskfGains:
     gains: EskfGains = copy_record(estimator.gains)
     gains.velocity_correlation_s = VELOCITY_CORRELATION_S
     gains.field_memory_s = FIELD_MEMORY_S
-    # Axes off by a lasting angle err by no more than twice that in a turn, and not at all after a
-    # circle; on average over the circle, such a walk errs as much.
-    gains.gyro_axes_var = LASTING_RAD**2 / math.pi
+    gains.gyro_roughness_sq *= LASTING_ROUGHNESS
     return gains
 
 
@@ -256,6 +254,7 @@ def _correct(
         out[aided, NAV_LON] += np.degrees(off[aided, POS + 1] / parallel_m)
         out[aided, NAV_ALT] -= off[aided, POS + 2]
     variance = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
+    # The axes are off for a whole flight; averages do not lessen that.
     variance[:, TILT : TILT + 3] += LASTING_RAD**2
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         beyond = out[:, column : column + 3]
