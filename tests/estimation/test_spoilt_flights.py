@@ -301,6 +301,12 @@ def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(
     check_back(read_flight(data_dir / f"{name}.csv.gz"), "eskf", how)
 
 
+def test_fast_motion_is_no_noise_at_a_low_rate(data_dir: Path) -> None:
+    """Beside a magnet the heading is the gyroscope's for most of the time."""
+    flight = read_flight(data_dir / "broad_30_disturbed_stationary_magnet_C.csv.gz")
+    check_back(flight, "eskf", "half_rate")
+
+
 @pytest.mark.parametrize("begin_s", [65.0, 97.0])
 @pytest.mark.parametrize(
     "name", ["broad_15_undisturbed_fast_translation_A", "broad_30_disturbed_stationary_magnet_C"]
