@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.estimation.columns import (
+    ACCEL,
     GPS_ALT,
     GPS_LAT,
     GPS_VEL,
@@ -35,6 +36,12 @@ RECOVERY_S = 20.0
 """So long after the disturbance an estimator has to be back."""
 GYRO_OFF_RADPS = math.radians(1.0)
 ZERO_ROWS = 3
+ODD_SHARE = 0.003
+BLANK_SHARE = 0.01
+ODD_RADPS = 35.0
+ODD_MPS2 = 160.0
+ODD_SEED = 5
+"""Of the samples that are whatever the bus made of them, anything that the sensors can read."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +169,25 @@ def half_rate(flight: Flight) -> Spoilt:
     return Spoilt(spoilt, first_fix_s(flight))
 
 
+def odd_samples(flight: Flight) -> Spoilt:
+    """Put noise from the sensors' bus, or nothing at all, in the place of single samples."""
+    rng, imu = np.random.default_rng(ODD_SEED), flight.log.imu.copy()
+    luck = rng.random(len(imu))
+    odd, blank = luck < ODD_SHARE, luck > 1.0 - BLANK_SHARE
+    imu[odd, GYRO : GYRO + 3] = rng.uniform(-ODD_RADPS, ODD_RADPS, (odd.sum(), 3))
+    imu[odd, ACCEL : ACCEL + 3] = rng.uniform(-ODD_MPS2, ODD_MPS2, (odd.sum(), 3))
+    imu[blank, : len(IMU_NAMES)] = 0.0
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+
+
+def mag_hangs(flight: Flight) -> Spoilt:
+    """Let the magnetometer repeat one field from the middle of the flight on."""
+    imu, begin_s = flight.log.imu.copy(), middle_s(flight)
+    told = np.flatnonzero((flight.log.imu_time_us * 1e-6 > begin_s) & np.isfinite(imu[:, MAG]))
+    imu[told, MAG : MAG + 3] = imu[told[0], MAG : MAG + 3]
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), begin_s)
+
+
 SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "zero_rows": zero_rows,
     "late_gps": late_gps,
@@ -173,6 +199,8 @@ SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "mid_air": mid_air,
     "gyro_off": gyro_off,
     "half_rate": half_rate,
+    "odd_samples": odd_samples,
+    "mag_hangs": mag_hangs,
 }
 GPS_SPOILS = ("late_gps", "no_velocity", "no_height")
 
@@ -182,7 +210,7 @@ def applies(how: str, flight: Flight) -> bool:
     log = flight.log
     if how in GPS_SPOILS:
         return len(log.gps) > 0
-    if how == "no_mag":
+    if how in ("no_mag", "mag_hangs"):
         return bool(np.isfinite(log.imu[:, MAG]).any())
     return how != "no_baro" or len(log.baro_alt_m) > 0
 

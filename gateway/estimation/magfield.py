@@ -8,7 +8,8 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray
+from gateway.estimation.kernel_record import FloatArray, write_vec
+from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
@@ -27,6 +28,8 @@ STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
 """How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
+STUCK_TURN_RAD: Final = 0.2
+"""A field that is the same to the last digit after so much of a turn is none: a sensor hangs."""
 LIKE_NORM_SHARE: Final = 0.04
 LIKE_DIP_RAD: Final = 0.035
 """A field this much stronger or steeper than usual counts half."""
@@ -75,6 +78,42 @@ class FieldState:
     mag_new_dip: float
     mag_new_s: float
     mag_disturbed: int
+    mag_last: Annotated[FloatArray, (3,)]
+    mag_turned: Annotated[FloatArray, (3,)]
+    """Turn in body FRD since the field was another, rad."""
+
+
+@compiled
+def is_field_told(s: FieldState, mag_b: Vec3, dt: float) -> bool:
+    """Return whether a sample tells a field; to be asked at each one.
+
+    Parameters
+    ----------
+    s : FieldState
+        Changed in place.
+    mag_b : tuple of 3 floats
+        Calibrated field in body FRD, uT; NaN unless new.
+    dt : float
+        Time since the sample before, s.
+
+    Returns
+    -------
+    bool
+        False where it is not new, all zeros, or that of a compass that hangs.
+    """
+    turned = s.mag_turned
+    for k in range(3):
+        turned[k] += s.rate_b[k] * dt
+    blank = not (mag_b[0] or mag_b[1] or mag_b[2])
+    if blank or not math.isfinite(mag_b[0] + mag_b[1] + mag_b[2]):
+        return False
+    last = s.mag_last
+    if mag_b[0] == last[0] and mag_b[1] == last[1] and mag_b[2] == last[2]:
+        turned_sq = turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]
+        return bool(turned_sq < STUCK_TURN_RAD * STUCK_TURN_RAD)
+    write_vec(last, mag_b)
+    write_vec(turned, (0.0, 0.0, 0.0))
+    return True
 
 
 @compiled

@@ -144,8 +144,8 @@ def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
 
 
 def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
-    """Scale HMC5883L counts to uT in sensor axes; None if an axis overflowed."""
-    if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw:
+    """Scale HMC5883L counts to uT in sensor axes; None if an axis overflowed, or all are zero."""
+    if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw or not any(raw):
         return None
     scale = UT_PER_GAUSS / lsb_per_gauss
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
@@ -184,7 +184,7 @@ def vectors_from_counts(
         if unit is not None:
             found[ranges == one] = counts[ranges == one] * unit[0]
     if scaled is mag_from_counts:
-        found[(counts == MAG_OVERFLOW).any(axis=1)] = np.nan
+        found[(counts == MAG_OVERFLOW).any(axis=1) | ~counts.any(axis=1)] = np.nan
     return found
 
 
@@ -201,7 +201,7 @@ def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (n, 3)
-        NaN unless it is new and none of its axes overflowed.
+        NaN unless it is new, none of its axes overflowed, and not all are zero.
     """
     told = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
     field = vectors_from_counts(mag_from_counts, counts[:, 6:9], counts[:, 12])

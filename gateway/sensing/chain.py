@@ -6,7 +6,15 @@ from typing import Annotated, Final
 import msgspec
 import numpy as np
 
-from gateway.records import BaroRaw, BaroSample, ImuFlags, ImuRaw, ImuSample, Vec3
+from gateway.records import (
+    UNKNOWN_VEC3,
+    BaroRaw,
+    BaroSample,
+    ImuFlags,
+    ImuRaw,
+    ImuSample,
+    Vec3,
+)
 from gateway.sensing.calibration import (
     IDENTITY3,
     Correction,
@@ -39,6 +47,8 @@ RETUNE_RATIO: Final = 0.1
 """Difference of measured and designed rate that makes a new design worth its small step."""
 
 ICAO_PRESSURE_PA: Final = 101_325.0
+BLANK: Final = (0, 0, 0)
+"""The accelerometer's counts from an MPU6050 that was reset, which then tells no rate either."""
 _Memory = tuple[float, FilterState | None, FilterState | None, int | None, tuple[int, int]]
 """Rate, low-pass, high-pass, time of the last sample, window of the rate."""
 
@@ -147,16 +157,20 @@ class SensorChain:
         Returns
         -------
         ImuSample
-            Calibrated SI values, unfiltered and filtered.
+            Calibrated SI values, unfiltered and filtered; NaN where the sensor told none.
         """
+        accel = gyro = UNKNOWN_VEC3
+        if raw.accel_raw != BLANK:
+            accel = self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g))
+            gyro = self._gyro.apply(gyro_from_counts(raw.gyro_raw, raw.gyro_range_dps))
         mag = None
         if raw.flags & ImuFlags.MAG_NEW and not raw.flags & ImuFlags.MAG_ABSENT:
             counts = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
             mag = None if counts is None else self._mag.apply(counts)
         return self.imu_si(
             raw.time_us,
-            self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g)),
-            self._gyro.apply(gyro_from_counts(raw.gyro_raw, raw.gyro_range_dps)),
+            accel,
+            gyro,
             mag,
             temperature_from_counts(raw.temperature_raw),
             raw.flags,
@@ -233,11 +247,13 @@ class SensorChain:
         Returns
         -------
         accel, gyro, mag : ndarray, shape (n, 3)
-            In body FRD; the field NaN unless it is new.
+            In body FRD; the field NaN unless it is new, the others where they were not told.
         temperature_degc : ndarray, shape (n,)
         """
         accel = vectors_from_counts(accel_from_counts, counts[:, 0:3], counts[:, 10])
         gyro = vectors_from_counts(gyro_from_counts, counts[:, 3:6], counts[:, 11])
+        blank = (counts[:, 0:3] == BLANK).all(axis=1)
+        accel[blank] = gyro[blank] = np.nan
         return (
             self._accel.apply_all(accel),
             self._gyro.apply_all(gyro),

@@ -1,6 +1,7 @@
 """The filter's hand-written matrix products against the matrices themselves."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -101,9 +102,9 @@ def test_noise_is_told_from_a_rate_that_grows(gain: float, rng: np.random.Genera
     s, dt, noise, count = new_record(EskfState), 0.01, 0.03, 4000
     steady = np.arange(count)[:, None] * gain * dt + np.zeros(3)
     gyro, accel = (steady + noise * rng.standard_normal((count, 3)) for _ in range(2))
-    for g, a in zip(gyro.tolist(), accel.tolist(), strict=True):
-        collect_roughness(s, tuple(g), tuple(a), dt)
-        s.gyro_last[:], s.accel_last[:] = g, a
+    samples = [(tuple(g), tuple(a)) for g, a in zip(gyro.tolist(), accel.tolist(), strict=True)]
+    for before, now in pairwise(samples):
+        collect_roughness(s, *now, *before, dt)
     expected = pytest.approx(count * (noise * dt) ** 2, rel=0.1)
     assert s.rough_gyro == expected
     assert s.rough_accel == expected
@@ -111,9 +112,9 @@ def test_noise_is_told_from_a_rate_that_grows(gain: float, rng: np.random.Genera
 
 def test_a_sample_that_is_no_number_is_forgotten() -> None:
     s = new_record(EskfState)
-    for rate in (0.0, math.nan, 0.0, 0.0):
-        collect_roughness(s, (rate, 0.0, 0.0), (0.0, 0.0, rate), 0.01)
-        s.gyro_last[:], s.accel_last[:] = (rate, 0.0, 0.0), (0.0, 0.0, rate)
+    for before, rate in pairwise((0.0, math.nan, 0.0, 0.0)):
+        one, other = (before, 0.0, 0.0), (0.0, 0.0, before)
+        collect_roughness(s, (rate, 0.0, 0.0), (0.0, 0.0, rate), one, other, 0.01)
     assert s.rough_gyro == s.rough_accel == 0.0
     assert s.gyro_change.tolist() == s.accel_change.tolist() == [0.0, 0.0, 0.0]
 

@@ -19,9 +19,11 @@ from gateway.estimation.local_position import PlaceState, is_relocked, move_orig
 from gateway.estimation.magfield import (
     LIKE_DIP_RAD,
     NEW_FIELD_S,
+    STUCK_TURN_RAD,
     CompassSettings,
     compare_field,
     field_unlikeness,
+    is_field_told,
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
@@ -166,11 +168,91 @@ def test_stuck_sensors() -> None:
     state = new_record(HealthState)
     rng = np.random.default_rng(1)
     for _ in range(150):
-        verdict = check_sensors(state, (0.3, 0.0, 0.0), tuple(rng.normal(size=3)), 0.01)
+        verdict = check_sensors(state, (0.3, 0.0, 0.0), tuple(rng.normal(size=3)), 0.0, 0.01)
     assert tuple(verdict) == (False, True)
     for _ in range(150):
-        verdict = check_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.01)
+        verdict = check_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.0, 0.01)
     assert tuple(verdict) == (True, True)
+
+
+class TestOddSamples:
+    """One sample in 10 ms that is far from the others, as after noise on the sensors' bus."""
+
+    STILL = (0.01, 0.0, 0.0)
+
+    @pytest.fixture
+    def state(self) -> HealthState:
+        state = new_record(HealthState)
+        self.settle(state)
+        return state
+
+    def settle(self, state: HealthState, gyro=STILL, accel=LEVEL, samples: int = 100) -> None:
+        for _ in range(samples):
+            check_sensors(state, gyro, accel, 0.0, 0.01)
+
+    def verdict(self, state: HealthState, gyro=STILL, accel=LEVEL) -> tuple[bool, bool]:
+        return tuple(check_sensors(state, gyro, accel, 0.0, 0.01))
+
+    @pytest.mark.parametrize(
+        "odd", [{"gyro": (30.0, 0.0, 0.0)}, {"accel": (0.0, 150.0, 0.0)}], ids=["rate", "force"]
+    )
+    def test_is_left_out_and_no_fault(self, state: HealthState, odd) -> None:
+        assert self.verdict(state, **odd) == (False, False)
+        assert state.fault == 0
+        assert tuple(state.gyro_held) == self.STILL
+        assert tuple(state.accel_held) == LEVEL
+        assert self.verdict(state) == (True, True)
+
+    def test_is_believed_if_the_next_one_agrees(self, state: HealthState) -> None:
+        turning = (0.0, 12.0, 0.0)
+        assert self.verdict(state, turning) == (False, False)
+        assert self.verdict(state, turning) == (True, True)
+        assert self.verdict(state) == (False, False)
+        assert self.verdict(state) == (True, True)
+
+    def test_two_that_differ_are_both_left_out(self, state: HealthState) -> None:
+        assert self.verdict(state, (30.0, 0.0, 0.0)) == (False, False)
+        assert self.verdict(state, (0.0, -30.0, 0.0)) == (False, False)
+        assert self.verdict(state) == (True, True)
+
+    def test_what_an_agile_multirotor_does_is_not_odd(self, state: HealthState) -> None:
+        for k in range(20):
+            assert self.verdict(state, (0.01 + 1.5 * k, 0.0, 0.0)) == (True, True)
+
+    def test_a_vibration_is_believed_within_half_a_second(self, state: HealthState) -> None:
+        rng = np.random.default_rng(2)
+        shaken = rng.normal(LEVEL, 60.0, (200, 3))
+        believed = [self.verdict(state, accel=tuple(force))[1] for force in shaken]
+        assert not believed[0]
+        assert all(believed[50:])
+
+    def test_all_zeros_are_no_sample(self, state: HealthState) -> None:
+        assert self.verdict(state, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) == (False, False)
+        assert self.verdict(state, (0.0, 0.0, 0.0)) == (True, True)
+
+
+class TestFieldThatIsTold:
+    FIELD = (20.0, -3.0, 41.0)
+
+    def test_not_without_a_value(self) -> None:
+        state = new_record(ComplementaryState)
+        for field in ((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)):
+            assert not is_field_told(state, field, 0.01)
+
+    def test_one_that_stands_still_while_the_aircraft_turns_is_not_believed(self) -> None:
+        state = new_record(ComplementaryState)
+        state.rate_b[2] = 0.5
+        told = [is_field_told(state, self.FIELD, 0.01) for _ in range(100)]
+        assert told.index(False) == pytest.approx(STUCK_TURN_RAD / 0.5 / 0.01, abs=2)
+        assert is_field_told(state, (20.1, -3.0, 41.0), 0.01)
+
+    def test_one_that_stands_still_at_rest_or_between_its_own_samples_is(self) -> None:
+        state = new_record(ComplementaryState)
+        assert all(is_field_told(state, self.FIELD, 0.01) for _ in range(1000))
+        state.rate_b[2] = 3.0
+        for k in range(20):
+            field = (20.0, -3.0 - k, 41.0)
+            assert all(is_field_told(state, field, 0.01) for _ in range(5))
 
 
 def test_rejected_fixes_are_believed_when_they_agree() -> None:

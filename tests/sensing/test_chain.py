@@ -42,11 +42,19 @@ def test_level_board_in_si_and_body_axes(chain: SensorChain) -> None:
         replace(LEVEL, flags=ImuFlags(0)),
         replace(LEVEL, flags=ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT),
         replace(LEVEL, mag_raw=(0, -4096, 0)),
+        replace(LEVEL, mag_raw=(0, 0, 0)),
     ],
-    ids=["old", "absent", "overflow"],
+    ids=["old", "absent", "overflow", "blank"],
 )
 def test_no_magnetometer_value_where_there_is_none(chain: SensorChain, raw: ImuRaw) -> None:
     assert chain.imu(raw).mag_b_ut is None
+
+
+def test_a_payload_of_a_sensor_that_was_just_reset_tells_nothing(chain: SensorChain) -> None:
+    before = chain.imu(LEVEL)
+    sample = chain.imu(replace(LEVEL, time_us=10_000, accel_raw=(0, 0, 0), gyro_raw=(0, 0, 0)))
+    assert all(math.isnan(value) for value in (*sample.accel_b_mps2, *sample.gyro_b_radps))
+    assert sample.accel_lowpass_b_mps2 == before.accel_lowpass_b_mps2
 
 
 def test_nothing_is_filtered_twice(chain: SensorChain) -> None:

@@ -17,20 +17,21 @@ CALIBRATION = NodeCalibration(
 
 
 def payloads(seed: int) -> list[ImuRaw]:
-    """Make payloads of all ranges and flags, with gaps, overflows and clocks that go back."""
+    """Make payloads of all ranges and flags, with gaps, overflows, blanks, and clocks set back."""
     rng = np.random.default_rng(seed)
     found, time_us = [], 0
     for _ in range(400):
         time_us += int(rng.choice([10_000, 10_000, 10_000, 20_000, 0, -5_000, 700_000]))
+        blank = rng.random() < 0.03
         mag = tuple(rng.choice([-300, 200, 5, MAG_OVERFLOW], 3, p=[0.4, 0.3, 0.25, 0.05]).tolist())
         found.append(
             ImuRaw(
                 time_us=time_us,
                 node=NODE,
                 node_time_us=time_us,
-                accel_raw=tuple(rng.integers(-32768, 32768, 3).tolist()),
+                accel_raw=(0, 0, 0) if blank else tuple(rng.integers(-32768, 32768, 3).tolist()),
                 gyro_raw=tuple(rng.integers(-32768, 32768, 3).tolist()),
-                mag_raw=mag,
+                mag_raw=(0, 0, 0) if blank else mag,
                 temperature_raw=int(rng.integers(-4000, 4000)),
                 accel_range_g=int(rng.choice([2, 4, 8, 16])),
                 gyro_range_dps=int(rng.choice([250, 500, 1000, 2000, 125, 0])),

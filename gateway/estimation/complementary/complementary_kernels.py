@@ -48,6 +48,7 @@ from gateway.estimation.kernel_record import (
     write_vec,
 )
 from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.magfield import is_field_told
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors, is_start
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -59,7 +60,6 @@ EPOCH_S: Final = 0.1
 
 PULL_MPS2: Final = 0.5
 """An acceleration of this much, by GPS, shows more in the level than the bias does."""
-ZERO: Final = (0.0, 0.0, 0.0)
 
 
 @compiled
@@ -131,10 +131,9 @@ def take_imu(
     if dt > GAP_S:
         bridge_gap(s, p, dt)
         return
-    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
-    s.fault = 0 if sound_gyro and sound_accel and row[CLIPPED] == 0.0 else 1
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
-    if math.isfinite(mag[0]) and math.isfinite(mag[1]) and math.isfinite(mag[2]):
+    if is_field_told(s, mag, dt):
         take_mag(s, p, mag)
     refresh(s)
 
@@ -151,16 +150,13 @@ def advance(
 ) -> None:
     """Integrate one sample and correct by gravity where GPS does not do it better."""
     if not sound_gyro:
-        held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
-        s.missing_gyro_s += dt
-        gyro = (held[0] + s.bias_b[0], held[1] + s.bias_b[1], held[2] + s.bias_b[2])
-    else:
-        s.missing_gyro_s = 0.0
+        gyro = as_vec(s.gyro_held) if s.missing_gyro_s < HOLD_S else as_vec(s.bias_b)
     strapdown(s, gyro, dt)
     refresh(s)
     note_turn(s, dt)
     if not sound_accel:
-        accel = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+        level = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+        accel = as_vec(s.accel_held) if s.missing_accel_s < HOLD_S else level
     since_fix = s.time_s - s.fix_s
     moving = since_fix < FRESH_GPS_S and speed(s) > p.rest_speed_mps
     if sound_gyro and sound_accel:

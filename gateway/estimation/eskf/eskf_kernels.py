@@ -43,7 +43,13 @@ from gateway.estimation.kernel_record import (
     write_vec,
 )
 from gateway.estimation.local_position import BARO_STALE_S
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, field_unlikeness, take_field
+from gateway.estimation.magfield import (
+    MIN_FIELD_UT,
+    STALE_MAG_S,
+    field_unlikeness,
+    is_field_told,
+    take_field,
+)
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import HOLD_S, check_sensors
 from gateway.geometry.quaternion import (
@@ -68,7 +74,6 @@ PUSH_MPS2: Final = 0.3
 """A steady level force beyond this, and beyond three standard deviations of tilt, is no rest."""
 PUSHED_MPS: Final = 40.0
 """No steady force pushes to more than this without a turn or a gust."""
-ZERO: Final = (0.0, 0.0, 0.0)
 
 
 @compiled
@@ -107,20 +112,19 @@ def take_imu(
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
     take_substitutes(s, p)
-    if math.isfinite(mag[0]) and math.isfinite(mag[1]) and math.isfinite(mag[2]):
+    if is_field_told(s, mag, dt):
         take_mag(s, p, mag)
 
 
 @compiled
 def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bool:
     """Integrate one sample, or what stands in for it; tells whether both sensors were sound."""
-    collect_roughness(s, gyro, accel, dt)
-    sound_gyro, sound_accel = check_sensors(s, gyro, accel, dt)
-    s.fault = 0 if sound_gyro and sound_accel and clipped == 0.0 else 1
+    gyro_before, accel_before = as_vec(s.gyro_held), as_vec(s.accel_held)
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
+    if sound_gyro and sound_accel:
+        collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
     if not sound_gyro:
-        gyro = substitute_rate(s, dt)
-    else:
-        s.missing_gyro_s = 0.0
+        gyro = as_vec(s.gyro_held if s.missing_gyro_s < HOLD_S else s.gyro_bias_b)
     if not sound_accel:
         accel = substitute_force(s)
     integrate(s, gyro, accel, dt)
@@ -128,14 +132,16 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
 
 
 @compiled
-def collect_roughness(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
+def collect_roughness(
+    s: EskfState, gyro: Vec3, accel: Vec3, gyro_before: Vec3, accel_before: Vec3, dt: float
+) -> None:
     """Measure the noise by how the changes from sample to sample change: motion goes on, noise not.
 
     What the sum over a steady change is late by, the next change takes back: that is no noise.
     """
     turn, pull = 0.0, 0.0
     for k in range(3):
-        turned, pulled = gyro[k] - s.gyro_last[k], accel[k] - s.accel_last[k]
+        turned, pulled = gyro[k] - gyro_before[k], accel[k] - accel_before[k]
         turn += (turned - s.gyro_change[k]) ** 2
         pull += (pulled - s.accel_change[k]) ** 2
         s.gyro_change[k] = turned if abs(turned) < ROUGH_LIMIT else 0.0
@@ -148,17 +154,10 @@ def collect_roughness(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
 
 
 @compiled
-def substitute_rate(s: EskfState, dt: float) -> Vec3:
-    """Hold the last rate for a moment, then none, where the gyroscope fails."""
-    held = as_vec(s.rate_b) if s.missing_gyro_s < HOLD_S else ZERO
-    s.missing_gyro_s += dt
-    b = s.gyro_bias_b
-    return (held[0] + b[0], held[1] + b[1], held[2] + b[2])
-
-
-@compiled
 def substitute_force(s: EskfState) -> Vec3:
-    """Assume no acceleration where the accelerometer fails."""
+    """Hold the last force for a moment, then gravity's alone, where the accelerometer fails."""
+    if s.missing_accel_s < HOLD_S:
+        return as_vec(s.accel_held)
     f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
     b = s.accel_bias_b
     return (f[0] + b[0], f[1] + b[1], f[2] + b[2])

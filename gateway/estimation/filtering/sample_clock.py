@@ -17,6 +17,8 @@ def begin_clock(s: FilterState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     write_vec(s.force_first_i, accel)
     write_vec(s.force_mean_i, accel)
     write_vec(s.rate_b, gyro)
+    write_vec(s.gyro_held, gyro)
+    write_vec(s.accel_held, accel)
 
 
 @compiled
