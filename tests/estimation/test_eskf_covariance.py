@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.eskf.covariance import (
+    MAX_TILT_VAR,
     clear,
     consider,
     inject,
@@ -66,7 +67,7 @@ def transition(
 def test_propagation_is_the_matrix_product(state: EskfState, rng: np.random.Generator) -> None:
     force, turn, dt = rng.normal(size=3), rng.normal(size=(3, 3)), 0.02
     scaled = rng.normal(size=(3, 3))
-    state.P[TILT + 2, TILT + 2] = 0.5
+    state.P *= 0.01
     before = state.P.copy()
     state.pending_s = dt
     state.pending_force_n[:], state.pending_turn[:] = force, turn
@@ -117,6 +118,19 @@ def test_a_sample_that_is_no_number_is_forgotten() -> None:
         collect_roughness(s, (rate, 0.0, 0.0), (0.0, 0.0, rate), one, other, 0.01)
     assert s.rough_gyro == s.rough_accel == 0.0
     assert s.gyro_change.tolist() == s.accel_change.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_heading_of_which_nothing_is_known_keeps_its_correlations(
+    state: EskfState, rng: np.random.Generator
+) -> None:
+    """A smaller variance alone would make them greater than one, and updates run away."""
+    state.P[TILT + 2] *= 100.0
+    state.P[:, TILT + 2] *= 100.0
+    assert state.P[TILT + 2, TILT + 2] > MAX_TILT_VAR
+    state.pending_s = 1e-9
+    propagate(state, GAINS)
+    assert state.P[TILT + 2, TILT + 2] == pytest.approx(MAX_TILT_VAR)
+    assert np.linalg.eigvalsh(state.P).min() > -1e-9
 
 
 def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator) -> None:

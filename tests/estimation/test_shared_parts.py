@@ -14,6 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
     make_gains,
 )
 from gateway.estimation.complementary.intake import reported_noise
+from gateway.estimation.filtering.filter_state import is_height_odd
 from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.local_position import PlaceState, is_relocked, move_origin
 from gateway.estimation.magfield import (
@@ -229,6 +230,33 @@ class TestOddSamples:
     def test_all_zeros_are_no_sample(self, state: HealthState) -> None:
         assert self.verdict(state, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) == (False, False)
         assert self.verdict(state, (0.0, 0.0, 0.0)) == (True, True)
+
+
+class TestOddHeights:
+    @pytest.fixture
+    def state(self) -> ComplementaryState:
+        state = new_record(ComplementaryState)
+        assert not self.odd(state, 150.0)
+        state.baro_known = 1
+        return state
+
+    def odd(self, state: ComplementaryState, alt_m: float) -> bool:
+        state.time_s += 0.04
+        found = bool(is_height_odd(state, alt_m))
+        state.baro_s = state.time_s
+        return found
+
+    def test_one_far_from_the_others_is_left_out(self, state: ComplementaryState) -> None:
+        assert [self.odd(state, alt_m) for alt_m in (9000.0, -500.0, 151.0)] == [True, True, False]
+        assert state.baro_known == 1
+
+    def test_one_that_the_next_agrees_with_begins_anew(self, state: ComplementaryState) -> None:
+        assert [self.odd(state, alt_m) for alt_m in (210.0, 211.0)] == [True, False]
+        assert state.baro_known == 0
+
+    def test_a_dive_is_followed(self, state: ComplementaryState) -> None:
+        assert not any(self.odd(state, 150.0 - 4.0 * k) for k in range(30))
+        assert state.baro_known == 1
 
 
 class TestFieldThatIsTold:

@@ -160,14 +160,16 @@ def align(
 
 @compiled
 def velocity_from_position(s: ComplementaryState, pos: Vec3, past: tuple[Vec3, Vec3]) -> Vec3:
-    """Return a velocity from the position alone, for a receiver that reports none."""
+    """Return a velocity from the position alone, for a receiver that reports none.
+
+    A place that nothing flies to in the time tells no velocity.
+    """
     share = 0.0 if s.fix_s == NEVER_S else 0.5 / max(s.time_s - s.fix_s, 0.5)
     (p0, p1, p2), (v0, v1, v2) = past
-    return (
-        v0 + share * (pos[0] - p0),
-        v1 + share * (pos[1] - p1),
-        v2 + share * (pos[2] - p2),
-    )
+    way = (share * (pos[0] - p0), share * (pos[1] - p1), share * (pos[2] - p2))
+    if math.hypot(way[0], way[1]) > FASTEST_MPS:
+        return past[1]
+    return (v0 + way[0], v1 + way[1], v2 + way[2])
 
 
 @compiled

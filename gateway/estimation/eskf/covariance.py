@@ -68,7 +68,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
         decay(s.P, WANDER + k, kept, s.wander_var[k])
         s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
-    s.P[TILT + 2, TILT + 2] = min(s.P[TILT + 2, TILT + 2], MAX_TILT_VAR)
+    limit_variance(s.P, TILT + 2, MAX_TILT_VAR)
     s.pending_s = 0.0
     fill(s.pending_force_n, 0.0)
     for k in range(3):
@@ -113,6 +113,16 @@ def symmetrise(P: FloatArray) -> None:
     for i in range(STATES):
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@compiled
+def limit_variance(P: FloatArray, k: int, most: float) -> None:
+    """Scale a row and a column so that the variance is no larger: no correlation beyond one."""
+    if P[k, k] > most:
+        kept = math.sqrt(most / P[k, k])
+        for j in range(STATES):
+            P[k, j] *= kept
+            P[j, k] *= kept
 
 
 @compiled

@@ -30,6 +30,7 @@ from gateway.estimation.eskf.start import (
     start_heading_by_compass,
 )
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
+from gateway.estimation.filtering.filter_state import is_height_odd
 from gateway.estimation.filtering.sample_clock import step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -326,7 +327,7 @@ def take_baro(s: EskfState, p: EskfGains, alt_m: float) -> None:
     alt_m : float
         Pressure altitude, positive up.
     """
-    if s.started == 0 or not math.isfinite(alt_m):
+    if s.started == 0 or not math.isfinite(alt_m) or is_height_odd(s, alt_m):
         return
     s.baro_down_m = -alt_m
     if s.has_height == 0:

@@ -83,12 +83,21 @@ def follow_field(s: EskfState, dip: float, dt: float) -> None:
 
 
 @compiled
+def has_followed_compass(s: EskfState) -> bool:
+    """Return whether a compass has ever told a heading: not where the field stands upright."""
+    return bool(s.field_n[0] != 0.0 or s.field_n[1] != 0.0)
+
+
+@compiled
 def doubt_iron(s: EskfState, variance: float) -> None:
     """Add to the variance of the iron, and to that of a heading which has followed the compass."""
+    for k in range(MAG_BIAS, MAG_BIAS + 3):
+        s.P[k, k] += variance
+    if not has_followed_compass(s):
+        return
     compass_row(s, as_vec(s.field_n))
     for k in range(MAG_BIAS, MAG_BIAS + 3):
         turned = s.h[k] * variance
-        s.P[k, k] += variance
         s.P[TILT + 2, k] -= turned
         s.P[k, TILT + 2] -= turned
         s.P[TILT + 2, TILT + 2] += s.h[k] * turned

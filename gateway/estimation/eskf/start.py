@@ -22,6 +22,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
+from gateway.estimation.eskf.iron import has_followed_compass
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
@@ -115,7 +116,7 @@ def start_iron_search(s: EskfState) -> None:
     if s.iron_search_started == 1:
         return
     s.iron_search_started = 1
-    by_compass = s.field_n[0] != 0.0 or s.field_n[1] != 0.0
+    by_compass = has_followed_compass(s)
     variance = s.left_iron_ut * s.left_iron_ut
     if by_compass:
         north, east, down = as_vec(s.field_n)

@@ -1,0 +1,152 @@
+"""Sensors that tell nonsense: whatever comes, the states stay finite and within reason."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.estimation.columns import (
+    ACCEL,
+    GPS_COLUMNS,
+    GPS_LAT,
+    GPS_LON,
+    GPS_VEL,
+    GYRO,
+    MAG,
+    NAV_FLAGS,
+    NAV_QUAT,
+    NAV_VEL,
+)
+from gateway.estimation.kernel import SampleLog
+from gateway.estimation.select import EstimationSettings, make_estimator
+from tools.flights import Flight, simulated_flight
+
+ESTIMATORS = ("complementary", "eskf")
+FASTEST_MPS = 1000.0
+Nonsense = Callable[[SampleLog, np.random.Generator], None]
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return simulated_flight(2, calibrated=False)
+
+
+def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
+    """Copy a part of a flight."""
+    log = flight.log
+    imu, baro, gps = (
+        (times > begin_s * 1e6) & (times < (begin_s + length_s) * 1e6)
+        for times in (log.imu_time_us, log.baro_time_us, log.gps_time_us)
+    )
+    return SampleLog(
+        log.imu_time_us[imu],
+        log.imu[imu].copy(),
+        log.baro_time_us[baro],
+        log.baro_alt_m[baro].copy(),
+        log.gps_time_us[gps],
+        log.gps[gps].copy(),
+    )
+
+
+def check_sane(flight: Flight, name: str, log: SampleLog) -> None:
+    settings = EstimationSettings(estimator=name, reference=flight.reference)
+    out = make_estimator(settings).run(log)
+    assert np.isfinite(out[100:, NAV_QUAT : NAV_QUAT + 4]).all()
+    assert np.isfinite(out[:, NAV_FLAGS]).all()
+    vel = out[:, NAV_VEL : NAV_VEL + 3]
+    assert np.abs(vel[np.isfinite(vel)]).max(initial=0.0) < FASTEST_MPS
+
+
+def noisy_field(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[:, MAG : MAG + 3] += rng.normal(0.0, 40.0, (len(log.imu), 3))
+
+
+def upright_field(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[:, MAG : MAG + 2] = 0.0
+    log.imu[:, MAG + 2] += rng.normal(0.0, 20.0, len(log.imu))
+
+
+def swapped_field(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[:, MAG : MAG + 3] = log.imu[:, MAG + rng.permutation(3)]
+
+
+def fixes_off_africa(log: SampleLog, rng: np.random.Generator) -> None:
+    """Some receivers tell the place 0, 0 while they know none."""
+    log.gps[rng.random(len(log.gps)) < 0.05, GPS_LAT : GPS_LON + 1] = 0.0
+
+
+def fixes_with_holes(log: SampleLog, rng: np.random.Generator) -> None:
+    holes = rng.random(log.gps.shape) < 0.1
+    holes[:, 0] = False
+    log.gps[holes] = np.nan
+
+
+def fixes_without_velocity(log: SampleLog, rng: np.random.Generator) -> None:
+    log.gps[rng.random() * len(log.gps) < np.arange(len(log.gps)), GPS_VEL : GPS_VEL + 3] = np.nan
+
+
+def wild_fixes(log: SampleLog, rng: np.random.Generator) -> None:
+    wild = rng.random(len(log.gps)) < 0.1
+    log.gps[wild, 1:GPS_COLUMNS] *= rng.normal(1.0, 1.0, (wild.sum(), GPS_COLUMNS - 1))
+
+
+def samples_with_holes(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[rng.random(log.imu.shape) < 0.02] = np.nan
+
+
+def shaken(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 30.0, (len(log.imu), 3))
+    log.imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 1.0, (len(log.imu), 3))
+
+
+def swapped_rates(log: SampleLog, rng: np.random.Generator) -> None:
+    log.imu[:, GYRO : GYRO + 3] = log.imu[:, GYRO + rng.permutation(3)] * rng.choice([-1, 1], 3)
+
+
+def wild_heights(log: SampleLog, rng: np.random.Generator) -> None:
+    wild = rng.random(len(log.baro_alt_m)) < 0.1
+    log.baro_alt_m[wild] = rng.normal(0.0, 1e6, wild.sum())
+
+
+NONSENSE: tuple[Nonsense, ...] = (
+    noisy_field,
+    upright_field,
+    swapped_field,
+    fixes_off_africa,
+    fixes_with_holes,
+    fixes_without_velocity,
+    wild_fixes,
+    samples_with_holes,
+    shaken,
+    swapped_rates,
+    wild_heights,
+)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("how", NONSENSE, ids=lambda how: how.__name__)
+def test_of_one_kind(flight: Flight, name: str, how: Nonsense) -> None:
+    log = part(flight, 0.0, 60.0)
+    how(log, np.random.default_rng(1))
+    check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_of_several_kinds(flight: Flight, seed: int) -> None:
+    """From the ground or in the air."""
+    rng = np.random.default_rng(seed)
+    log = part(flight, rng.uniform(0.0, 150.0), 40.0)
+    for k in rng.permutation(len(NONSENSE))[: rng.integers(1, 5)]:
+        NONSENSE[k](log, rng)
+    for name in ESTIMATORS:
+        check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: str) -> None:
+    """All fixes come to lie there, so that they are believed in the end."""
+    log = part(flight, 30.0, 60.0)
+    log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
+    log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
+    check_sane(flight, name, replace(log))
