@@ -89,7 +89,7 @@ def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
 
 
 def requests() -> list[dict[str, Any]]:
-    """Return what a ground station asks at first."""
+    """Return what a ground station asks at first, and one that is refused with a text to all."""
     header = {"system_id": 255, "component_id": 0, "sequence": 0}
     target = {"target_system": 1, "target_component": 1}
     version = {"command": {"type": "MAV_CMD_REQUEST_MESSAGE"}, "param1": 148.0}
@@ -97,6 +97,7 @@ def requests() -> list[dict[str, Any]]:
         {**template("PARAM_REQUEST_LIST"), **target},
         {**template("MISSION_REQUEST_LIST"), **target},
         {**template("COMMAND_LONG"), **target, **version},
+        {**template("COMMAND_LONG"), **target, "command": {"type": "MAV_CMD_COMPONENT_ARM_DISARM"}},
     ]
     return [{"header": header, "message": message} for message in messages]
 
