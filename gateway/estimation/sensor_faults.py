@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, write_vec
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -158,3 +158,15 @@ def check_sensors(
     else:
         s.missing_accel_s += dt
     return good_gyro, good_accel
+
+
+@compiled
+def rate_instead(s: HealthState, bias: Vec3) -> Vec3:
+    """Return the rate for a sample without a good one: the last for a moment, then no turn."""
+    return as_vec(s.gyro_held) if s.missing_gyro_s < HOLD_S else bias
+
+
+@compiled
+def force_instead(s: HealthState, level: Vec3) -> Vec3:
+    """Return the force for a sample without a good one: the last for a moment, then gravity's."""
+    return as_vec(s.accel_held) if s.missing_accel_s < HOLD_S else level

@@ -1,7 +1,6 @@
 """Sensors that tell nonsense: whatever comes, the states stay finite and within reason."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,10 @@ from gateway.estimation.columns import (
     NAV_QUAT,
     NAV_VEL,
 )
+from gateway.estimation.complementary.complementary_state import ComplementaryState
+from gateway.estimation.complementary.intake import velocity_from_position
 from gateway.estimation.kernel import SampleLog
+from gateway.estimation.kernel_record import new_record
 from gateway.estimation.select import EstimationSettings, make_estimator
 from tools.flights import Flight, simulated_flight
 
@@ -149,4 +151,14 @@ def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: s
     log = part(flight, 30.0, 60.0)
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
-    check_sane(flight, name, replace(log))
+    check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize(("north_m", "speed_mps"), [(2.0, 5.0), (1e7, 3.0)])
+def test_only_a_way_that_can_be_flown_adds_to_the_velocity(
+    north_m: float, speed_mps: float
+) -> None:
+    state = new_record(ComplementaryState)
+    state.time_s, state.fix_s = 10.0, 9.5
+    past = ((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
+    assert velocity_from_position(state, (north_m, 0.0, 0.0), past) == (speed_mps, 0.0, 0.0)

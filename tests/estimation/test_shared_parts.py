@@ -14,7 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
     make_gains,
 )
 from gateway.estimation.complementary.intake import reported_noise
-from gateway.estimation.filtering.filter_state import is_height_odd
+from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.local_position import PlaceState, is_relocked, move_origin
 from gateway.estimation.magfield import (
@@ -236,13 +236,14 @@ class TestOddHeights:
     @pytest.fixture
     def state(self) -> ComplementaryState:
         state = new_record(ComplementaryState)
+        state.started = 1
         assert not self.odd(state, 150.0)
         state.baro_known = 1
         return state
 
     def odd(self, state: ComplementaryState, alt_m: float) -> bool:
         state.time_s += 0.04
-        found = bool(is_height_odd(state, alt_m))
+        found = not is_height_told(state, alt_m)
         state.baro_s = state.time_s
         return found
 

@@ -50,7 +50,12 @@ from gateway.estimation.kernel_record import (
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
-from gateway.estimation.sensor_faults import HOLD_S, check_sensors, is_start
+from gateway.estimation.sensor_faults import (
+    check_sensors,
+    force_instead,
+    is_start,
+    rate_instead,
+)
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.records import NAN, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -150,13 +155,13 @@ def advance(
 ) -> None:
     """Integrate one sample and correct by gravity where GPS does not do it better."""
     if not sound_gyro:
-        gyro = as_vec(s.gyro_held) if s.missing_gyro_s < HOLD_S else as_vec(s.bias_b)
+        gyro = rate_instead(s, as_vec(s.bias_b))
     strapdown(s, gyro, dt)
     refresh(s)
     note_turn(s, dt)
     if not sound_accel:
         level = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
-        accel = as_vec(s.accel_held) if s.missing_accel_s < HOLD_S else level
+        accel = force_instead(s, level)
     since_fix = s.time_s - s.fix_s
     moving = since_fix < FRESH_GPS_S and speed(s) > p.rest_speed_mps
     if sound_gyro and sound_accel:

@@ -14,7 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.filtering.filter_state import is_height_odd
+from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S
 from gateway.geometry.quaternion import rotate
@@ -147,7 +147,7 @@ def take_baro(s: ComplementaryState, p: ComplementaryGains, alt_m: float) -> Non
     alt_m : float
         Pressure altitude, positive up.
     """
-    if s.started == 0 or not math.isfinite(alt_m) or is_height_odd(s, alt_m):
+    if not is_height_told(s, alt_m):
         return
     down = -alt_m
     if s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:

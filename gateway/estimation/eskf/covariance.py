@@ -116,21 +116,24 @@ def symmetrise(P: FloatArray) -> None:
 
 
 @compiled
+def scale_state(P: FloatArray, k: int, share: float) -> None:
+    """Scale a row and a column."""
+    for j in range(STATES):
+        P[k, j] *= share
+        P[j, k] *= share
+
+
+@compiled
 def limit_variance(P: FloatArray, k: int, most: float) -> None:
     """Scale a row and a column so that the variance is no larger: no correlation beyond one."""
     if P[k, k] > most:
-        kept = math.sqrt(most / P[k, k])
-        for j in range(STATES):
-            P[k, j] *= kept
-            P[j, k] *= kept
+        scale_state(P, k, math.sqrt(most / P[k, k]))
 
 
 @compiled
 def decay(P: FloatArray, k: int, kept: float, steady: float) -> None:
     """Let one state fade towards zero while noise keeps its variance at `steady`."""
-    for j in range(STATES):
-        P[k, j] *= kept
-        P[j, k] *= kept
+    scale_state(P, k, kept)
     P[k, k] += steady * (1.0 - kept * kept)
 
 

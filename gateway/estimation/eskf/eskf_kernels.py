@@ -30,7 +30,7 @@ from gateway.estimation.eskf.start import (
     start_heading_by_compass,
 )
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
-from gateway.estimation.filtering.filter_state import is_height_odd
+from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.filtering.sample_clock import step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -52,7 +52,7 @@ from gateway.estimation.magfield import (
     take_field,
 )
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
-from gateway.estimation.sensor_faults import HOLD_S, check_sensors
+from gateway.estimation.sensor_faults import check_sensors, force_instead, rate_instead
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -125,9 +125,9 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
     if not sound_gyro:
-        gyro = as_vec(s.gyro_held if s.missing_gyro_s < HOLD_S else s.gyro_bias_b)
+        gyro = rate_instead(s, as_vec(s.gyro_bias_b))
     if not sound_accel:
-        accel = substitute_force(s)
+        accel = force_instead(s, level_force(s))
     integrate(s, gyro, accel, dt)
     return sound_gyro and sound_accel
 
@@ -155,10 +155,8 @@ def collect_roughness(
 
 
 @compiled
-def substitute_force(s: EskfState) -> Vec3:
-    """Hold the last force for a moment, then gravity's alone, where the accelerometer fails."""
-    if s.missing_accel_s < HOLD_S:
-        return as_vec(s.accel_held)
+def level_force(s: EskfState) -> Vec3:
+    """Return what the accelerometer would read if nothing accelerated."""
     f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
     b = s.accel_bias_b
     return (f[0] + b[0], f[1] + b[1], f[2] + b[2])
@@ -327,7 +325,7 @@ def take_baro(s: EskfState, p: EskfGains, alt_m: float) -> None:
     alt_m : float
         Pressure altitude, positive up.
     """
-    if s.started == 0 or not math.isfinite(alt_m) or is_height_odd(s, alt_m):
+    if not is_height_told(s, alt_m):
         return
     s.baro_down_m = -alt_m
     if s.has_height == 0:

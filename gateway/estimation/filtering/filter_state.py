@@ -1,7 +1,5 @@
 """What both filters remember and are set to, whatever their model."""
 
-from typing import Final
-
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
@@ -25,10 +23,6 @@ from gateway.estimation.magfield import (
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.estimation.rest import RestGains, RestSettings, RestState, rest_gains
 from gateway.estimation.sensor_faults import HealthState
-
-FASTEST_RISE_M: Final = 20.0
-FASTEST_CLIMB_MPS: Final = 100.0
-"""What a gust of wind on the barometer, and a dive, change at most."""
 
 
 class FilterGains(RestGains, FieldGains):
@@ -78,23 +72,6 @@ class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState,
     """1 once a fix has told the height above the sea."""
     fix_s: float
     """Arrival of the last accepted fix."""
-
-
-@compiled
-def is_height_odd(s: FilterState, alt_m: float) -> bool:
-    """Return whether a barometer's height is far from all before it, and is to be left out.
-
-    The next one that agrees with it makes it a new height to begin at: `baro_known` is 0 then.
-    """
-    since_s = min(s.time_s - s.baro_s, BARO_STALE_S)
-    most_m = FASTEST_RISE_M + FASTEST_CLIMB_MPS * since_s
-    last_m, s.baro_last_m = s.baro_last_m, alt_m
-    if s.baro_known == 1 and abs(alt_m - s.baro_held_m) > most_m:
-        if abs(alt_m - last_m) > most_m:
-            return True
-        s.baro_known = 0
-    s.baro_held_m = alt_m
-    return False
 
 
 @compiled
