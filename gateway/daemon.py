@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -12,6 +11,7 @@ from typing import Final
 import msgspec
 
 from gateway.aircraft import Action, Aircraft, AircraftSettings, SettingsChanged
+from gateway.aircraft_status import status_of
 from gateway.config import (
     ConfigError,
     GatewaySettings,
@@ -47,11 +47,10 @@ from gateway.records import (
 )
 from gateway.replay import header_for
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.status import AircraftStatus, Snapshot, Way
+from gateway.status import Snapshot
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, Request, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
-from gateway.vehicle.mark import distance_and_bearing
 from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
 
 log = logging.getLogger(__name__)
@@ -231,7 +230,7 @@ class Daemon:
             refused=self._pipeline.refused,
             forged=self._pipeline.forged,
             simulated=self._receiver is not None,
-            aircraft=tuple(_status_of(one) for _, one in aircraft),
+            aircraft=tuple(status_of(one) for _, one in aircraft),
             recorder=self._recorder.status(),
         )
 
@@ -331,19 +330,23 @@ class Daemon:
         if frames := [action for action in actions if isinstance(action, Outgoing)]:
             self._send(frames)
         for action in actions:
-            match action:
-                case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
-                    self._recorder.flight(action)
-                case ClientInterval():
-                    self._hub.set_interval(action)
-                case SaveSettings():
-                    self._save(action)
-                case SavePlaces():
-                    self._places.save(action.vehicle_id, action.places)
-                case RecordingRequest():
-                    (self._recorder.record if action.start else self._recorder.stop)()
-                case SettingsChanged():
-                    self._recorder.settings_changed(action.vehicle_id)
+            if not isinstance(action, Outgoing):
+                self._carry_out(action)
+
+    def _carry_out(self, action: Action) -> None:
+        match action:
+            case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
+                self._recorder.flight(action)
+            case ClientInterval():
+                self._hub.set_interval(action)
+            case SaveSettings():
+                self._save(action)
+            case SavePlaces():
+                self._places.save(action.vehicle_id, action.places)
+            case RecordingRequest():
+                (self._recorder.record if action.start else self._recorder.stop)()
+            case SettingsChanged():
+                self._recorder.settings_changed(action.vehicle_id)
 
     def _save(self, save: SaveSettings) -> None:
         """Write an aircraft's settings to its file, and report the outcome."""
@@ -373,28 +376,3 @@ class Daemon:
     def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
         now_us = self.now_us()
         self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))
-
-
-def _status_of(aircraft: Aircraft) -> AircraftStatus:
-    """Return the status of an aircraft besides its navigation state."""
-    vehicle, state = aircraft.vehicle, aircraft.state
-    home, here = vehicle.telemetry.home, None
-    if state is not None and math.isfinite(state.lat_deg + state.lon_deg):
-        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
-    return AircraftStatus(
-        aircraft.vehicle_id,
-        vehicle.telemetry.fix,
-        _way(here, None if home is None else home.place),
-        _way(here, vehicle.places.mark.place),
-        vehicle.health.boards.statuses,
-    )
-
-
-def _way(here: Place | None, there: Place | None) -> Way | None:
-    if there is None:
-        return None
-    place = (there.lat_deg, there.lon_deg, there.alt_amsl_m)
-    if here is None:
-        return Way(*place, None, None)
-    distance_m, bearing_rad = distance_and_bearing(here, there)
-    return Way(*place, distance_m, math.degrees(bearing_rad) % 360.0)

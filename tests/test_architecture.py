@@ -32,6 +32,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
     "replay": FOUNDATION | STAGES | JOINED,
     "status": FOUNDATION | {"routing"},
+    "aircraft_status": FOUNDATION | {"vehicle", "aircraft", "status"},
     "flights": FOUNDATION | STAGES | JOINED | {"replay", "edges", "output"},
     "edges": FOUNDATION
     | {"wire", "vehicle", "flightlog", "routing", "simulator", "status", "output"},
@@ -43,7 +44,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis", "season"},
     "fleet": FOUNDATION | STAGES | {"edges", "output"},
     "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "fleet", "output"},
-    "daemon": FOUNDATION | STAGES | JOINED | {"replay", "status", "edges", "config"},
+    "daemon": FOUNDATION
+    | STAGES
+    | JOINED
+    | {"replay", "status", "aircraft_status", "edges", "config"},
     "extensions": set(),
     "player": FOUNDATION | STAGES | JOINED | {"edges", "flights", "config"},
     "cli": FOUNDATION
@@ -54,7 +58,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
-PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"replay", "status"}
+PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"replay", "status", "aircraft_status"}
 PURE_FOLDERS = {"panel/state", "season/statistics"}
 """Pure parts of rooms that are not."""
 
