@@ -19,6 +19,7 @@ from gateway.estimation.columns import (
     NAV_POS_STD,
 )
 from gateway.estimation.eskf.eskf_state import STATES
+from gateway.estimation.flagbits import HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import LASTING_RAD, _backward, smooth
@@ -230,3 +231,10 @@ def test_real_car(data_dir) -> None:
     )
     assert smoothed < live
     assert outage_score(flight, run_smoothed, 10.0) < outage_score(flight, run_eskf, 10.0)
+    fixes_s = flight.log.gps_time_us * 1e-6
+    gap = flight.with_gps(np.abs(fixes_s - fixes_s.mean()) > 40.0)
+    live, smoothed = run_eskf(gap), run_smoothed(gap)
+    valid = [out[:, NAV_FLAGS].astype(int) & HEADING_VALID != 0 for out in (live, smoothed)]
+    assert valid[1].sum() > valid[0].sum() + 4000
+    sure = smoothed[:, NAV_ATTITUDE_STD + 2] < HEADING_VALID_RAD
+    np.testing.assert_array_equal(valid[1], sure)

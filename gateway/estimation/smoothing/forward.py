@@ -17,6 +17,7 @@ from gateway.compiled.entry_point import dispatched
 from gateway.estimation.columns import (
     CLIPPED,
     NAV_ATTITUDE_STD,
+    NAV_FLAGS,
     NAV_POS_STD,
     NAV_VEL_STD,
     imu_vectors,
@@ -39,6 +40,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.iron import standing_field_var
+from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply
@@ -129,7 +131,16 @@ def share_doubt(s: EskfState, copy: EskfState) -> None:
 
 @compiled
 def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
-    """Leave of the standard deviations told only what is no state and no lasting doubt."""
+    """Leave of the standard deviations told only what is no state and no lasting doubt.
+
+    An attitude and a heading that have begun are flagged as valid, however unsure they are.
+    """
+    flags = int(row[NAV_FLAGS])
+    if s.started == 1:
+        flags |= ATTITUDE_VALID
+    if s.heading_known == 1 and s.heading_true == 1:
+        flags |= HEADING_VALID
+    row[NAV_FLAGS] = float(flags)
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         for k in range(3):
             beyond = row[column + k] ** 2 - s.P[first + k, first + k]
@@ -186,7 +197,8 @@ def run_forward(
         See `SampleLog`.
     out : ndarray, shape (n, NAV_COLUMNS)
         Filled with what the copy tells; with what the filter tells where that began anew. Of the
-        standard deviations only what is to be added to those of the states.
+        standard deviations only what is to be added to those of the states; see
+        `keep_unmodelled`.
     P, F, foreseen : ndarray, shape (m, STATES, STATES)
         Filled: the covariance at each node, the transition to the next, the covariance foreseen.
     d : ndarray, shape (m, STATES)

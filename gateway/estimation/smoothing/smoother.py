@@ -27,6 +27,7 @@ from gateway.estimation.columns import (
     NAV_ALT,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
+    NAV_FLAGS,
     NAV_LAT,
     NAV_LON,
     NAV_POS_STD,
@@ -35,9 +36,11 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.covariance import MOVED
+from gateway.estimation.eskf.eskf_output import LEVEL_VAR
 from gateway.estimation.eskf.eskf_settings import LASTING_RAD, EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
 from gateway.estimation.eskf.unaided_velocity import FLOWN_S, WAY_S
+from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
@@ -76,7 +79,8 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
     Returns
     -------
     states : ndarray, shape (n, NAV_COLUMNS)
-        One row per IMU sample; flags and rates are the filter's.
+        One row per IMU sample. Rates and flags are the filter's, but attitude and heading are
+        valid where they are sure enough as smoothed.
     latency_s : float
         The GPS latency that the whole flight was smoothed with; see `latency_of_flight`.
     """
@@ -259,6 +263,11 @@ def _correct(
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         beyond = out[:, column : column + 3]
         beyond[:] = np.sqrt(beyond**2 + np.maximum(variance[:, first : first + 3], 0.0))
+    attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
+    flags = out[:, NAV_FLAGS].astype(np.int64)
+    flags[attitude_std[:, :2].max(axis=1) >= math.sqrt(LEVEL_VAR)] &= ~ATTITUDE_VALID
+    flags[attitude_std[:, 2] >= HEADING_VALID_RAD] &= ~HEADING_VALID
+    out[:, NAV_FLAGS] = flags
 
 
 def _turned(turn: FloatArray, q: FloatArray) -> FloatArray:
