@@ -155,8 +155,9 @@ class PlayerDaemon:
         )
 
     def _send(self, frames: Iterable[bytes]) -> None:
-        for frame in frames:
-            self._hub.send(Outgoing(self._numbering.played(frame), message_id_of(frame)))
+        self._hub.send_all(
+            Outgoing(self._numbering.played(frame), message_id_of(frame)) for frame in frames
+        )
 
     def _on_frame(self, incoming: Incoming) -> None:
         for vehicle in self._vehicles:
@@ -168,12 +169,14 @@ class PlayerDaemon:
             vehicle.forget_client(client_id)
 
     def _perform(self, actions: Iterable[RecordedAction]) -> None:
+        answers: list[Outgoing] = []
         for action in actions:
             if isinstance(action, ClientInterval):
                 self._hub.set_interval(action)
             else:
                 frame = self._numbering.inserted(action.frame)
-                self._hub.send(Outgoing(frame, action.message_id, action.client_id))
+                answers.append(Outgoing(frame, action.message_id, action.client_id))
+        self._hub.send_all(answers)
 
     def _poll(self) -> None:
         """Send the due frames of long answers, and schedule the next call."""

@@ -13,11 +13,13 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
+from gateway.edges.hub.hub import SENDS_AT_ONCE
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.opening import lay_out, open_flights
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
+from gateway.records import Outgoing
 from tests.flightlog.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
@@ -153,6 +155,20 @@ async def test_every_parameter_arrives_and_none_looks_lost(
     ]
     # What was played before ended with 27; the answers go on from there.
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(28, 28 + PARAMETERS))
+
+
+async def test_an_answer_does_not_overtake_the_batch_before_it(
+    tmp_path: Path, opened: ExitStack, station: Station
+) -> None:
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url), paused=True)
+    await daemon.start()
+    played = [record.frame for record in recording()[: PARAMETERS + 1]]
+    daemon._send(played)
+    assert daemon._hub.counters().published == SENDS_AT_ONCE < len(played)
+    daemon._perform([Outgoing(played[-1], 22, 1)])
+    await station.until(len(played) + 1)
+    daemon.close()
+    assert [frame[4] for frame in station.frames] == list(range(len(played) + 1))
 
 
 async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station: Station) -> None:

@@ -316,8 +316,7 @@ async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
     player = Player([Track(file)], clock(), speed=AS_FAST_AS_POSSIBLE)
 
     def emit(frames: Iterable[bytes]) -> None:
-        for frame in frames:
-            hub.send(Outgoing(frame, message_id_of(frame)))
+        hub.send_all(Outgoing(frame, message_id_of(frame)) for frame in frames)
 
     edge = PlayerEdge(player, emit, clock, on_end=ended.set)
     begin = time.perf_counter()

@@ -18,7 +18,7 @@ from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 
-COUNT = 3 * BATCH + 7
+COUNT = 24 * BATCH + 7
 RECORDS = make_records(COUNT)
 FRAMES = [record.frame for record in RECORDS]
 
