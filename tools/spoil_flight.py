@@ -32,6 +32,7 @@ from gateway.records import NavFlags
 from tools.flights import GPS_NAMES, IMU_NAMES, Flight, north_east_m, read_flight
 
 SILENCE_S = 4.0
+HANG_S = 1.5
 RECOVERY_S = 20.0
 """So long after the disturbance an estimator has to be back."""
 GYRO_OFF_RADPS = math.radians(1.0)
@@ -180,6 +181,14 @@ def odd_samples(flight: Flight) -> Spoilt:
     return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
 
 
+def imu_hangs(flight: Flight) -> Spoilt:
+    """Let gyroscope and accelerometer repeat one sample in the sharpest turn."""
+    imu, time_s, begin_s = flight.log.imu.copy(), flight.log.imu_time_us * 1e-6, turn_s(flight)
+    hung = np.flatnonzero((time_s > begin_s) & (time_s <= begin_s + HANG_S))
+    imu[hung, : GYRO + 3] = imu[hung[0], : GYRO + 3]
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), begin_s + HANG_S)
+
+
 def mag_hangs(flight: Flight) -> Spoilt:
     """Let the magnetometer repeat one field from the middle of the flight on."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
@@ -200,6 +209,7 @@ SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "gyro_off": gyro_off,
     "half_rate": half_rate,
     "odd_samples": odd_samples,
+    "imu_hangs": imu_hangs,
     "mag_hangs": mag_hangs,
 }
 GPS_SPOILS = ("late_gps", "no_velocity", "no_height")

@@ -15,6 +15,11 @@ HOLD_S: Final = 0.2
 GYRO_LIMIT_RADPS: Final = 40.0
 ACCEL_LIMIT_MPS2: Final = 400.0
 """No sensor of this system reads more; what does is no measurement."""
+TIMES_USUAL_HOLD: Final = 5.0
+USUAL_HOLD_S: Final = 5.0
+"""What both sensors repeat for this much longer than usual, on average over so long, is a hang."""
+UNKNOWN_HOLD_S: Final = 60.0
+"""So long they may usually repeat a sample before anything is known of them."""
 USUAL_S: Final = 0.5
 TIMES_USUAL: Final = 6.0
 """Noise and vibration change this much more at most."""
@@ -34,6 +39,12 @@ class HealthState:
     """1 while the newest sample was not usable as it came."""
     stuck_gyro_s: float
     stuck_accel_s: float
+    repeated_s: float
+    """For how long both sensors have repeated a sample."""
+    usual_hold_s: float
+    """For how long they usually do."""
+    hangs: int
+    """1 while they do so for too long."""
     missing_gyro_s: float
     missing_accel_s: float
     gyro_last: Annotated[FloatArray, (3,)]
@@ -114,6 +125,38 @@ def is_blank(gyro: Vec3, accel: Vec3) -> bool:
 
 
 @compiled
+def is_hanging(s: HealthState, gyro: Vec3, accel: Vec3, may_rest: bool, dt: float) -> bool:
+    """Return whether both sensors have repeated a sample for too long; to be asked at each one.
+
+    The bus of a sensor may hang, or a receiver repeat its last frame. A live sensor repeats no six
+    numbers for long, but a log may hold each sample until the next, and an input without noise is
+    always the same at rest, or in a motion that is written by hand.
+
+    Parameters
+    ----------
+    s : HealthState
+        Changed in place.
+    gyro, accel : tuple of 3 floats
+        Newest sample.
+    may_rest : bool
+        Whether that may be a rest.
+    dt : float
+        Time step, s.
+    """
+    if is_same(gyro, s.gyro_last) and is_same(accel, s.accel_last):
+        s.repeated_s += dt
+        most_s = max(HOLD_S, TIMES_USUAL_HOLD * s.usual_hold_s)
+        s.hangs = 1 if s.repeated_s > most_s and not may_rest else 0
+        return s.hangs == 1
+    if s.hangs == 0:
+        held_s = s.repeated_s + dt
+        kept = USUAL_HOLD_S / (USUAL_HOLD_S + held_s)
+        s.usual_hold_s = kept * s.usual_hold_s + (1.0 - kept) * held_s
+    s.repeated_s, s.hangs = 0.0, 0
+    return False
+
+
+@compiled
 def check_sensors(
     s: HealthState, gyro: Vec3, accel: Vec3, clipped: float, dt: float
 ) -> tuple[bool, bool]:
@@ -137,7 +180,7 @@ def check_sensors(
         is far from what came before, which alone is no fault.
     """
     same_gyro, same_accel = is_same(gyro, s.gyro_last), is_same(accel, s.accel_last)
-    # Both standing still is a perfectly quiet input, not a fault.
+    # Both standing still is a hang, or a perfectly quiet input: see `is_hanging`.
     s.stuck_gyro_s = s.stuck_gyro_s + dt if same_gyro and not same_accel else 0.0
     s.stuck_accel_s = s.stuck_accel_s + dt if same_accel and not same_gyro else 0.0
     odd = is_odd(s, gyro, accel, dt) or is_blank(gyro, accel)

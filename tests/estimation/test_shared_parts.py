@@ -28,7 +28,13 @@ from gateway.estimation.magfield import (
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings, watch_rest
-from gateway.estimation.sensor_faults import HealthState, check_sensors
+from gateway.estimation.sensor_faults import (
+    HOLD_S,
+    UNKNOWN_HOLD_S,
+    HealthState,
+    check_sensors,
+    is_hanging,
+)
 
 GAINS = make_gains(ComplementarySettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 LEVEL = (0.0, 0.0, -9.81)
@@ -174,6 +180,48 @@ def test_stuck_sensors() -> None:
     for _ in range(150):
         verdict = check_sensors(state, (0.3, 0.0, 0.0), LEVEL, 0.0, 0.01)
     assert tuple(verdict) == (True, True)
+
+
+class TestHang:
+    """Both sensors repeat a sample of 10 ms, as behind a bus that hangs."""
+
+    @pytest.fixture
+    def state(self) -> HealthState:
+        state = new_record(HealthState)
+        state.usual_hold_s = UNKNOWN_HOLD_S
+        return state
+
+    def feed(self, state: HealthState, seconds: float, hold: int, may_rest: bool = False) -> bool:
+        """Feed noise, each sample so many times; return whether any was taken for a hang."""
+        rng, found = np.random.default_rng(1), False
+        for _ in range(round(seconds * 100 / hold)):
+            gyro, accel = tuple(rng.normal(size=3)), tuple(rng.normal(size=3))
+            for _ in range(hold):
+                hangs = is_hanging(state, gyro, accel, may_rest, 0.01)
+                found = found or hangs
+                if not hangs:
+                    check_sensors(state, gyro, accel, 0.0, 0.01)
+        return found
+
+    def test_is_found_after_the_time_that_a_sample_may_be_held(self, state: HealthState) -> None:
+        assert not self.feed(state, 60.0, 1)
+        last = tuple(state.gyro_last), tuple(state.accel_last)
+        hangs = [is_hanging(state, *last, False, 0.01) for _ in range(150)]
+        assert hangs.index(True) == pytest.approx(100 * HOLD_S, abs=1)
+        assert all(hangs[hangs.index(True) :])
+        assert not self.feed(state, 1.0, 1)
+        assert self.feed(state, 1.0, 50)
+
+    @pytest.mark.parametrize("hold", [2, 10])
+    def test_a_log_may_hold_its_samples(self, state: HealthState, hold: int) -> None:
+        assert not self.feed(state, 60.0, hold)
+
+    def test_an_input_that_always_was_so_is_none(self, state: HealthState) -> None:
+        assert not self.feed(state, 60.0, 500)
+
+    def test_a_rest_without_noise_is_none(self, state: HealthState) -> None:
+        assert not self.feed(state, 60.0, 1)
+        assert not self.feed(state, 60.0, 3000, may_rest=True)
 
 
 class TestOddSamples:

@@ -35,7 +35,7 @@ from gateway.estimation.complementary.reorientation import (
     watch_gravity,
 )
 from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown, take_gravity
-from gateway.estimation.filtering.sample_clock import begin_clock, step_clock
+from gateway.estimation.filtering.sample_clock import begin_clock, is_silent, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
@@ -133,8 +133,9 @@ def take_imu(
         if dt < -GAP_S:
             forget_times(s)
         return
-    if dt > GAP_S:
+    if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
         bridge_gap(s, p, dt)
+        write_attitude_std(s)
         return
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
@@ -163,9 +164,8 @@ def advance(
         level = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
         accel = force_instead(s, level)
     since_fix = s.time_s - s.fix_s
-    moving = since_fix < FRESH_GPS_S and speed(s) > p.rest_speed_mps
     if sound_gyro and sound_accel:
-        rested = s.at_rest == 1
+        rested, moving = s.at_rest == 1, is_moving(s, p)
         watch_rest(s, p, gyro, accel, moving, dt)
         raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
         watch_gravity(s, p)
@@ -203,9 +203,10 @@ def is_under_way(s: ComplementaryState) -> bool:
 
 
 @compiled
-def speed(s: ComplementaryState) -> float:
-    """Horizontal speed in m/s."""
-    return math.hypot(s.vel_n[0], s.vel_n[1])
+def is_moving(s: ComplementaryState, p: ComplementaryGains) -> bool:
+    """Return whether the GPS says that the aircraft moves."""
+    speed_mps = math.hypot(s.vel_n[0], s.vel_n[1])
+    return s.time_s - s.fix_s < FRESH_GPS_S and speed_mps > p.rest_speed_mps
 
 
 KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = kernels_of(

@@ -31,7 +31,7 @@ from gateway.estimation.eskf.start import (
 )
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
 from gateway.estimation.filtering.height_intake import is_height_told
-from gateway.estimation.filtering.sample_clock import step_clock
+from gateway.estimation.filtering.sample_clock import is_silent, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
@@ -99,7 +99,7 @@ def take_imu(
             bridge_gap(s, p, 1.0)
             forget_times(s)
         return
-    if dt > GAP_S:
+    if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
         bridge_gap(s, p, dt)
         return
     sound = move(s, gyro, accel, row[CLIPPED], dt)

@@ -229,12 +229,15 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     flown = GAP_TILT_RATE if s.aided == 1 else GAP_HAND_RATE
     turned_var = silent_variance(s, GAP_REST_RATE if still else flown + turning, dt)
     turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt)
+    before_sq = s.silent_s * s.silent_s
+    s.silent_s += dt
+    silent_sq = s.silent_s * s.silent_s
     for k in range(3):
         if s.aided == 1:
             s.pos_n[k] += s.vel_n[k] * dt
         s.P[TILT + k, TILT + k] += turned_var
-        s.P[VEL + k, VEL + k] += (GAP_ACCEL_MPS2 * dt) ** 2
-        s.P[POS + k, POS + k] += (0.5 * GAP_ACCEL_MPS2 * dt * dt) ** 2
+        s.P[VEL + k, VEL + k] += GAP_ACCEL_MPS2**2 * (silent_sq - before_sq)
+        s.P[POS + k, POS + k] += (0.5 * GAP_ACCEL_MPS2) ** 2 * (silent_sq**2 - before_sq**2)
         for first in (TILT, VEL, POS):
             s.renewals[first + k] += 1.0
     s.ring_count = 0

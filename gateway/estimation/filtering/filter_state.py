@@ -56,6 +56,8 @@ class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState,
     """Time of the newest sample, and of the one that `time_s` counts from."""
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
+    silent_s: float
+    """How long a silence of the IMU has lasted since it began, or since the last fix in it."""
     silent_rad: float
     """How far the attitude may have turned in a silence of the IMU that has not ended, else 0."""
     silent_rest: int

@@ -79,4 +79,5 @@ def pair_with(s: FilterState, at_s: float, vel: Vec3, noise_mps: float) -> float
 def accept_fix(s: FilterState) -> None:
     """Note that a fix was used."""
     s.fix_s = s.time_s
+    s.silent_s = 0.0
     s.reject_s, s.reject_last[0] = 0.0, NEVER_S

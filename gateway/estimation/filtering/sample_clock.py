@@ -2,8 +2,9 @@
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
-from gateway.estimation.filtering.filter_state import FilterState
+from gateway.estimation.filtering.filter_state import FilterGains, FilterState
 from gateway.estimation.kernel_record import write_vec
+from gateway.estimation.sensor_faults import UNKNOWN_HOLD_S, is_hanging, is_sound
 from gateway.records import Vec3
 
 
@@ -19,6 +20,7 @@ def begin_clock(s: FilterState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     write_vec(s.rate_b, gyro)
     write_vec(s.gyro_held, gyro)
     write_vec(s.accel_held, accel)
+    s.usual_hold_s = UNKNOWN_HOLD_S
 
 
 @compiled
@@ -45,9 +47,33 @@ def step_clock(s: FilterState, time_us: int) -> float:
             s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
         return dt
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
-    if dt <= GAP_S:
-        s.silent_rad, s.silent_rest = 0.0, 0
     return dt
+
+
+@compiled
+def is_silent(
+    s: FilterState, p: FilterGains, gyro: Vec3, accel: Vec3, moving: bool, dt: float
+) -> bool:
+    """Return whether the IMU has told nothing new for too long; to be asked at each sample.
+
+    Parameters
+    ----------
+    s : FilterState
+        Changed in place: a silence may end.
+    p : FilterGains
+        Constants.
+    gyro, accel : tuple of 3 floats
+        Newest sample in body FRD.
+    moving : bool
+        Whether the aircraft is known to move.
+    dt : float
+        Time since the sample before, s.
+    """
+    may_rest = is_sound(gyro, p.bias_limit_radps) and not moving
+    if dt > GAP_S or is_hanging(s, gyro, accel, may_rest, dt):
+        return True
+    s.silent_s, s.silent_rad, s.silent_rest = 0.0, 0.0, 0
+    return False
 
 
 @compiled
@@ -80,7 +106,7 @@ def silent_rate(s: FilterState, bias_b: Vec3) -> Vec3:
 def silent_variance(s: FilterState, radps: float, dt: float) -> float:
     """Return what the next part of a silence adds to the attitude's variance, rad2.
 
-    Whatever turns goes on turning: the angle grows with the time, however many fixes part it.
+    Whatever turns goes on turning: the angle grows with the time, however many parts it has.
     """
     before = s.silent_rad
     s.silent_rad += radps * dt
