@@ -20,6 +20,7 @@ from serial.tools import list_ports
 
 from gateway.edges.reasons import reason_of
 from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ LONGEST_RETRY_S: Final = 4.0
 READ_SIZE: Final = 48
 """A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
 of the loop, so that clients are not kept waiting until all of it is worked off."""
+BITS_PER_BYTE: Final = 10
+"""On the line, start and stop bit included."""
 
 KNOWN_ADAPTERS: Final = {
     (0x0403, 0x6001): "FTDI FT232R",
@@ -163,6 +166,8 @@ class SerialPort:
         self._retry: asyncio.TimerHandle | None = None
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
+        self._read_us = 0
+        self._left_more = False
 
     @property
     def connected(self) -> bool:
@@ -215,16 +220,23 @@ class SerialPort:
         asyncio.get_running_loop().add_reader(file, self._read, file)
 
     def _read(self, file: int) -> None:
+        now_us, size = self._now_us(), READ_SIZE
+        if self._left_more:
+            # As much as the line brought since: where clients make turns long, the samples come
+            # late, but none is lost in the kernel.
+            line_bytes = (now_us - self._read_us) * self._settings.baud // BITS_PER_BYTE
+            size = max(READ_SIZE, line_bytes // US_PER_S)
         try:
             # pyserial's own read makes two more system calls, for every sample.
-            data = os.read(file, READ_SIZE)
+            data = os.read(file, size)
         except BlockingIOError:
             return
         except OSError as error:
             self._broke(error)
             return
+        self._read_us, self._left_more = now_us, len(data) == size
         if data:
-            self._on_bytes(data, self._now_us())
+            self._on_bytes(data, now_us)
         else:
             self._broke(OSError("the device hung up"))
 

@@ -198,3 +198,25 @@ async def test_the_adapter_is_asked_to_hold_no_bytes_back(
     assert (asked, link.connected) == ([True], True)
     assert not caplog.records, "an adapter that cannot is used as it is, without a word"
     link.close()
+
+
+def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
+    """Samples are lost where turns of the loop are long and each reads no more than one sample."""
+    now_us = 0
+    sizes: list[int] = []
+    link = SerialPort(
+        SerialSettings(baud=500_000),
+        lambda data, _: sizes.append(len(data)),
+        lambda _: None,
+        lambda _: None,
+        lambda: now_us,
+    )
+    line, end = os.pipe()
+    os.set_blocking(line, False)
+    os.write(end, bytes(3000))
+    for now_us in (0, 300, 40_300, 40_600, 60_600, 90_000):
+        link._read(line)
+    os.close(line)
+    os.close(end)
+    # 40 ms of the line are 2000 bytes; the last two reads find what is left, and nothing.
+    assert sizes == [48, 48, 2000, 48, 856]
