@@ -1,20 +1,31 @@
 """Base of all transports: identity, counters, and passing on received frames."""
 
 import asyncio
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from gateway.edges.hub.express import ClientCounters, Express
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ClientStats
 from gateway.routing.endpoint import OPEN_TO_ALL, Endpoint
 from gateway.routing.hub_settings import HubSettings
+from gateway.routing.limits.purse import Purse
 from gateway.routing.page_origin import is_loopback
 from gateway.routing.routing_table import Origin
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import SplitFault
+
+READ_BYTES: Final = 4096
+"""Read from one client at one wake-up, so that a flooding one delays the others by some
+milliseconds."""
+STRANGERS_RATE: Final = 64_000
+"""Bytes a second read from all untrusted clients together: at most 5000 frames, a tenth of a
+processor. What is beyond waits with the sender, or is lost in the kernel."""
+STRANGERS_BURST: Final = 256_000
 
 Write = Callable[[bytes], object]
 
@@ -120,6 +131,41 @@ class Client:
                 self.heard_us = now_us
                 self.context.deliver(self, event, now_us)
 
+    def pause_stranger(
+        self, sock: socket.socket, read: Callable[[socket.socket], None], size: int
+    ) -> None:
+        """Stop reading for a while from a client that is not trusted, if all such sent too much.
+
+        Parameters
+        ----------
+        sock : socket
+            What `read` is called for when bytes are there.
+        read : callable
+            Reads from it.
+        size : int
+            Bytes that were just read.
+        """
+        if self.trusted:
+            return
+        self.context.strangers.level -= size
+        if self._pause_us():
+            self.loop.remove_reader(sock)
+            self._read_later(sock, read)
+
+    def _read_later(self, sock: socket.socket, read: Callable[[socket.socket], None]) -> None:
+        if sock.fileno() < 0:
+            # Closed meanwhile.
+            return
+        if pause_us := self._pause_us():
+            self.loop.call_later(pause_us / US_PER_S, self._read_later, sock, read)
+        else:
+            self.loop.add_reader(sock, read, sock)
+
+    def _pause_us(self) -> int:
+        purse = self.context.strangers
+        purse.fill(self.context.now_us())
+        return 0 if self.trusted else purse.wait_us()
+
     def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
         """Return the client's present figures; the hub passes the systems behind it."""
         counters = self.counters
@@ -156,6 +202,10 @@ class HubContext(Protocol):
     @property
     def settings(self) -> HubSettings:
         """The present settings."""
+
+    @property
+    def strangers(self) -> Purse:
+        """What may still be read from all untrusted clients together."""
 
     @property
     def seal(self) -> Seal:

@@ -9,6 +9,7 @@ import socket
 import struct
 from typing import Any, Final
 
+from gateway.edges.hub.client import READ_BYTES
 from gateway.edges.hub.listener import RETRY_US
 from gateway.edges.hub.udp import MAX_DATAGRAM, READ_BUDGET, DatagramClient
 from gateway.routing.endpoint import EndpointKind
@@ -72,13 +73,18 @@ class GroupClient(DatagramClient):
         self.adopt(opened, lambda data: opened.sendto(data, address))
 
     def _on_group(self, sock: socket.socket) -> None:
+        size = 0
         for _ in range(READ_BUDGET):
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
             except OSError:
-                return
+                break
             if address[:2] != self._own_address:
+                size += len(data)
                 self.accept(data, self.context.now_us())
+            if size >= READ_BYTES:
+                break
+        self.pause_stranger(sock, self._on_group, size)
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:

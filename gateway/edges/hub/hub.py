@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from gateway.edges.hub.client import Client
+from gateway.edges.hub.client import STRANGERS_BURST, STRANGERS_RATE, Client
 from gateway.edges.hub.listener import Listener
 from gateway.edges.hub.router import Router
 from gateway.edges.hub.transports import CLIENTS, LISTENERS
@@ -20,6 +20,7 @@ from gateway.routing.digest import Digest
 from gateway.routing.endpoint import parse_endpoint
 from gateway.routing.fanout import Fanout
 from gateway.routing.hub_settings import HubSettings
+from gateway.routing.limits.purse import Purse
 from gateway.routing.probe import RoundTrip
 from gateway.routing.routing_table import Origin
 from gateway.routing.trouble import TroubleWatch
@@ -79,6 +80,7 @@ class Hub:
         self.recordings = recordings
         self.seal = seal
         self.now_us = now_us
+        self.strangers = Purse(STRANGERS_RATE, STRANGERS_BURST, STRANGERS_BURST)
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gateway.edges.hub.client import Client
+from gateway.edges.hub.client import READ_BYTES, Client
 from gateway.edges.hub.listener import RETRY_US, Listener, Peer
 from gateway.routing.client_table import Presence, who_leaves
 from gateway.routing.endpoint import host_and_port
@@ -18,9 +18,7 @@ from gateway.routing.outbox import Numbering, Outbox
 from gateway.wire.mavlink_splitter import MavlinkSplitter
 
 CHUNK_BYTES: Final = 4096
-"""Joined into one write while a queue drains; also read at once."""
-READ_BUDGET: Final = 16
-"""Chunks taken at one wake-up, so that one flooding peer cannot starve the others."""
+"""Joined into one write while a queue drains."""
 USER_TIMEOUT_MS: Final = 30_000
 """A peer that acknowledges nothing for so long is gone; a paused one may come back sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
@@ -32,7 +30,6 @@ ACCEPT_BACKLOG: Final = 128
 class StreamClient(Client):
     """A peer behind a byte stream."""
 
-    read_budget = READ_BUDGET
     _partial = b""
     _socket: socket.socket | None = None
 
@@ -135,19 +132,18 @@ class StreamClient(Client):
         return b"".join(frames)
 
     def _on_readable(self, sock: socket.socket) -> None:
-        for _ in range(self.read_budget):
-            try:
-                data = sock.recv(CHUNK_BYTES)
-            except BlockingIOError:
-                return
-            except OSError:
-                data = b""
-            if not data:
-                self.broke()
-                return
-            self.accept(data, self.context.now_us())
-            if self._socket is not sock:
-                return
+        try:
+            data = sock.recv(READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.broke()
+            return
+        self.accept(data, self.context.now_us())
+        if self._socket is sock:
+            self.pause_stranger(sock, self._on_readable, len(data))
 
 
 class TcpClient(StreamClient):

@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from typing import Any, Final
 
-from gateway.edges.hub.client import Client, Write, not_open
+from gateway.edges.hub.client import READ_BYTES, Client, Write, not_open
 from gateway.edges.hub.listener import RETRY_US
 from gateway.routing.endpoint import Endpoint, host_and_port
 from gateway.routing.outbox import Packer
@@ -19,9 +19,11 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_frame, split_datagram
 
 NOBODY_LISTENS: Final = "nobody listens there"
-MAX_DATAGRAM: Final = 65535
+MAX_DATAGRAM: Final = 4096
+"""Programs that join frames fill a packet of the network, at most some 2000 bytes; what is beyond
+this is cut off."""
 READ_BUDGET: Final = 64
-"""Datagrams read at one wake-up, so that one flooding peer cannot starve the others."""
+"""Datagrams read at one wake-up, if they are small."""
 ALONE_US: Final = 300
 """A datagram that arrives so long after the last wake-up is most likely the only one. A second
 read, which would raise BlockingIOError, is left out; if more is there, the loop wakes again."""
@@ -204,20 +206,25 @@ class DatagramClient(Client):
         now_us = self.context.now_us()
         budget = READ_BUDGET if now_us - self._woken_us <= ALONE_US else 1
         self._woken_us = now_us
+        size = 0
         for _ in range(budget):
             try:
                 data = sock.recv(MAX_DATAGRAM)
             except BlockingIOError:
-                return
+                break
             except ConnectionRefusedError:
                 self._note_refusal()
                 return
             except OSError as error:
                 self.become("unreachable", error)
                 return
+            size += len(data)
             self.accept(data, now_us)
             if self._socket is not sock:
                 return
+            if size >= READ_BYTES:
+                break
+        self.pause_stranger(sock, self._on_readable, size)
 
 
 class UdpClient(DatagramClient):

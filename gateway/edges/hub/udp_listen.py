@@ -10,7 +10,7 @@ import socket
 import struct
 from typing import Final
 
-from gateway.edges.hub.client import HubContext
+from gateway.edges.hub.client import READ_BYTES, HubContext
 from gateway.edges.hub.listener import RETRY_US, Listener
 from gateway.edges.hub.udp import MAX_DATAGRAM, READ_BUDGET, RECEIVE_BUFFER_BYTES, DatagramClient
 from gateway.routing.client_table import SILENT_AFTER_US, ClientTable, Presence
@@ -160,12 +160,15 @@ class UdpListener(Listener[UdpPeer]):
 
     def _return_strays(self, sock: socket.socket, peer: Address, local_host: str) -> None:
         """Process datagrams of others that came between bind and connect of a client's socket."""
+        size = 0
         for _ in range(READ_BUDGET):
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
             except OSError:
                 return
-            self._take(data, address or peer, local_host)
+            if size < READ_BYTES:
+                self._take(data, address or peer, local_host)
+            size += len(data)
 
     def _leave(self, presence: Presence) -> None:
         self.leave(self._clients[presence.client_id])

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.records import Incoming
-from gateway.units import US_PER_S
+from gateway.routing.limits.purse import Purse
 
 REQUEST_COST: Final = 200
 """Bytes: decoding a request and building its answer takes as long as sending this many."""
@@ -30,28 +30,11 @@ MAX_WAITING: Final = 64
 """Requests of a client; one that waits for its answers has one or two."""
 
 
-@dataclass(slots=True)
-class _Purse:
-    rate: int
-    burst: int
-    level: float
-    filled_us: int = 0
-
-    def fill(self, now_us: int) -> None:
-        gain = (now_us - self.filled_us) * self.rate / US_PER_S
-        self.level = min(self.burst, self.level + gain)
-        self.filled_us = now_us
-
-    def wait_us(self) -> int:
-        """Return how long until something may be taken; 0 is now."""
-        return 0 if self.level > 0 else round((1 - self.level) * US_PER_S / self.rate)
-
-
 @dataclass(slots=True, eq=False)
 class _Line:
     """One client's requests."""
 
-    purse: _Purse
+    purse: Purse
     waiting: deque[Incoming] = field(default_factory=deque)
 
 
@@ -62,7 +45,7 @@ class RequestQueue:
         self._lines: dict[int, _Line] = {}
         self._turns: dict[int, _Line] = {}
         """Those who have something waiting; who is first was served longest ago."""
-        self._strangers = _Purse(STRANGERS_RATE, STRANGERS_BURST, STRANGERS_BURST)
+        self._strangers = Purse(STRANGERS_RATE, STRANGERS_BURST, STRANGERS_BURST)
 
     def offer(self, incoming: Incoming, now_us: int) -> bool:
         """Let a request wait for its turn; return whether there was room."""
@@ -70,7 +53,7 @@ class RequestQueue:
         if line is None or (line.purse is self._strangers) == incoming.trusted:
             purse = self._strangers
             if incoming.trusted:
-                purse = _Purse(CLIENT_RATE, CLIENT_BURST, CLIENT_BURST, now_us)
+                purse = Purse(CLIENT_RATE, CLIENT_BURST, CLIENT_BURST, now_us)
             line = self._lines[incoming.client_id] = _Line(purse)
             self._turns.pop(incoming.client_id, None)
         if len(line.waiting) >= MAX_WAITING:

@@ -202,19 +202,19 @@ async def test_the_adapter_is_asked_to_hold_no_bytes_back(
 
 def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
     """Samples are lost where turns of the loop are long and each reads no more than one sample."""
-    now_us = 0
+    times_us = (0, 300, 40_300, 40_600, 60_600, 90_000)
     sizes: list[int] = []
     link = SerialPort(
         SerialSettings(baud=500_000),
         lambda data, _: sizes.append(len(data)),
         lambda _: None,
         lambda _: None,
-        lambda: now_us,
+        iter(times_us).__next__,
     )
     line, end = os.pipe()
     os.set_blocking(line, False)
     os.write(end, bytes(3000))
-    for now_us in (0, 300, 40_300, 40_600, 60_600, 90_000):
+    for _ in times_us:
         link._read(line)
     os.close(line)
     os.close(end)

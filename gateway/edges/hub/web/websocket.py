@@ -41,8 +41,6 @@ REFUSED_IN_FULL: Final = 5
 class WebStream(StreamClient):
     """A peer behind a WebSocket, with or without TLS."""
 
-    read_budget = 1
-    """A chunk holds hundreds of the smallest messages, and each costs as much as a large one."""
     _web: WsProtocol
     _tls: TlsLayer | None = None
     _is_gathering = False
