@@ -7,12 +7,14 @@ import pytest
 
 from gateway.estimation.columns import (
     ACCEL,
+    GPS_ALT,
     GPS_COLUMNS,
     GPS_LAT,
     GPS_LON,
     GPS_VEL,
     GYRO,
     MAG,
+    NAV_ALT,
     NAV_FLAGS,
     NAV_QUAT,
     NAV_VEL,
@@ -51,9 +53,13 @@ def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
     )
 
 
-def check_sane(flight: Flight, name: str, log: SampleLog) -> None:
+def run(flight: Flight, name: str, log: SampleLog) -> np.ndarray:
     settings = EstimationSettings(estimator=name, reference=flight.reference)
-    out = make_estimator(settings).run(log)
+    return make_estimator(settings).run(log)
+
+
+def check_sane(flight: Flight, name: str, log: SampleLog) -> None:
+    out = run(flight, name, log)
     assert np.isfinite(out[100:, NAV_QUAT : NAV_QUAT + 4]).all()
     assert np.isfinite(out[:, NAV_FLAGS]).all()
     vel = out[:, NAV_VEL : NAV_VEL + 3]
@@ -152,6 +158,41 @@ def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: s
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
     check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("kinds", [("baro",), ("gps",), ("baro", "gps")], ids="-".join)
+def test_a_first_height_that_is_wrong_is_undone(
+    flight: Flight, name: str, kinds: tuple[str, ...]
+) -> None:
+    """The barometer alone, GPS alone, and both."""
+    log, spoilt = part(flight, 30.0, 20.0), part(flight, 30.0, 20.0)
+    spoilt.baro_alt_m[0] += 9000.0
+    spoilt.gps[0, GPS_ALT] += 9000.0
+    expected, found = (
+        run(
+            flight,
+            name,
+            SampleLog(
+                each.imu_time_us,
+                each.imu,
+                each.baro_time_us if "baro" in kinds else each.baro_time_us[:0],
+                each.baro_alt_m if "baro" in kinds else each.baro_alt_m[:0],
+                each.gps_time_us if "gps" in kinds else each.gps_time_us[:0],
+                each.gps if "gps" in kinds else each.gps[:0],
+            ),
+        )[-1, NAV_ALT]
+        for each in (log, spoilt)
+    )
+    assert found == pytest.approx(expected, abs=2.0)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_single_heights_of_fixes_are_left_out(flight: Flight, name: str) -> None:
+    log, spoilt = part(flight, 30.0, 30.0), part(flight, 30.0, 30.0)
+    spoilt.gps[20::13, GPS_ALT] += 9000.0
+    off_m = run(flight, name, spoilt)[:, NAV_ALT] - run(flight, name, log)[:, NAV_ALT]
+    assert np.nanmax(np.abs(off_m)) < 2.0
 
 
 @pytest.mark.parametrize(("north_m", "speed_mps"), [(2.0, 5.0), (1e7, 3.0)])

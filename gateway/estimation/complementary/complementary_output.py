@@ -58,7 +58,7 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
     fill(row[NAV_ATTITUDE_STD:NAV_FLAGS], NAN)
     if s.started == 1:
         write_vec(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], as_vec(s.told_std))
-    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 else NAN
+    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_known == 1 else NAN
     row[NAV_FLAGS] = float(flags_of(s))
     if s.has_origin == 0:
         row[NAV_LAT] = row[NAV_LON] = NAN
@@ -80,7 +80,7 @@ def flags_of(s: ComplementaryState) -> int:
         flags |= ATTITUDE_VALID
     if s.heading_known == 1 and s.heading_true == 1 and heading < HEADING_VALID_RAD:
         flags |= HEADING_VALID
-    if s.has_height == 1:
+    if s.has_height == 1 or s.baro_known == 1:
         flags |= ALTITUDE_VALID
     if s.fix_s == NEVER_S:
         return flags

@@ -210,6 +210,10 @@ class ComplementaryState(FilterState):
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float
+    fix_heights: Annotated[FloatArray, (2,)]
+    """Heights of fixes above the sea, m: the newest, and the newest that was believed."""
+    fix_height_agreed: int
+    """1 once a second one has agreed with the one that the height began at."""
     fix_valid_s: float
     """When the last accepted fix was valid."""
     fix_vel: Annotated[FloatArray, (3,)]

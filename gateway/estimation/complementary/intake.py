@@ -26,6 +26,7 @@ from gateway.estimation.complementary.drift import doubt_sensors, raise_attitude
 from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
+    doubt_height,
     is_plausible,
     restart_at,
 )
@@ -114,6 +115,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
     valid_s = look_back(s, wanted_s)
     lag = s.time_s - valid_s
     pos, told = place_fix(s, row)
+    pos = doubt_height(s, pos)
     vel, at_s = velocity_of_fix(s, valid_s, pos, told)
     align(s, p, at_s, vel, velocity_noise(told))
     look_back(s, wanted_s)

@@ -14,11 +14,11 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.filtering.height_intake import is_height_told
+from gateway.estimation.filtering.height_intake import compare_height, is_height_told
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_vec
 from gateway.estimation.local_position import BARO_STALE_S
 from gateway.geometry.quaternion import rotate
-from gateway.records import Vec3
+from gateway.records import NAN, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 DRIFT_MPS2: Final = 1.0
@@ -64,13 +64,36 @@ def restart_at(s: ComplementaryState, pos: Vec3, vel: Vec3, lag: float) -> None:
     for k in range(2):
         s.pos_n[k] = pos[k] + vel[k] * lag
     down = pos[2] + vel[2] * lag
-    if not math.isfinite(down):
-        return
-    if s.has_height == 1 and s.baro_known == 1:
-        # The barometer has held the height so far; the fix gives its offset to the sea.
-        s.baro_offset_m += down - s.pos_n[2]
-    s.pos_n[2] = down
-    s.has_height = 1
+    if math.isfinite(down):
+        start_height(s, down)
+
+
+@compiled
+def start_height(s: ComplementaryState, down_m: float) -> None:
+    """Take the height from one fix alone; it tells what the barometer's is off by, too."""
+    if s.baro_known == 1:
+        s.baro_offset_m += down_m - s.pos_n[2]
+    s.pos_n[2], s.has_height = down_m, 1
+
+
+@compiled
+def doubt_height(s: ComplementaryState, pos: Vec3) -> Vec3:
+    """Return the place of a fix, without a height that is far from all before it.
+
+    A first height is given up if the next two contradict it and agree with one another.
+    """
+    if not math.isfinite(pos[2]):
+        return pos
+    told, agrees = compare_height(s.fix_heights, -pos[2], s.time_s - s.fix_s)
+    if s.has_height == 0:
+        s.fix_heights[1], s.fix_height_agreed = -pos[2], 0
+    elif not told:
+        return (pos[0], pos[1], NAN)
+    elif agrees:
+        s.fix_height_agreed = 1
+    elif s.fix_height_agreed == 0:
+        s.has_height = 0
+    return pos
 
 
 @compiled
@@ -120,7 +143,7 @@ def blend_fix(
     if not math.isfinite(pos[2]):
         return
     if s.has_height == 0:
-        s.pos_n[2], s.has_height = pos[2] + vel[2] * lag, 1
+        start_height(s, pos[2] + vel[2] * lag)
         return
     baro_fresh = s.baro_known == 1 and s.time_s - s.baro_s < BARO_STALE_S
     if baro_fresh:
@@ -152,8 +175,7 @@ def take_baro(s: ComplementaryState, p: ComplementaryGains, alt_m: float) -> Non
     down = -alt_m
     if s.baro_known == 0 or s.time_s - s.baro_s > BARO_STALE_S:
         if s.has_height == 0:
-            s.pos_n[2], s.vel_n[2], s.has_height = down, 0.0, 1
-            s.baro_offset_m = 0.0
+            s.pos_n[2], s.vel_n[2], s.baro_offset_m = down, 0.0, 0.0
         else:
             s.baro_offset_m = s.pos_n[2] - down
         s.baro_known = 1

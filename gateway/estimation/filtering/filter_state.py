@@ -1,5 +1,7 @@
 """What both filters remember and are set to, whatever their model."""
 
+from typing import Annotated
+
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
@@ -12,6 +14,7 @@ from gateway.estimation.flagbits import (
     USING_BARO,
     USING_MAG,
 )
+from gateway.estimation.kernel_record import FloatArray
 from gateway.estimation.local_position import BARO_STALE_S
 from gateway.estimation.magfield import (
     STALE_MAG_S,
@@ -67,9 +70,8 @@ class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState,
     """Dip of the Earth's field at the place; NaN before the first fix."""
     baro_known: int
     baro_s: float
-    baro_last_m: float
-    baro_held_m: float
-    """Pressure altitude: the newest, and the newest that was believed."""
+    baro_heights: Annotated[FloatArray, (2,)]
+    """Pressure altitude, m: the newest, and the newest that was believed."""
     has_height: int
     """1 once a fix has told the height above the sea."""
     fix_s: float

@@ -1,10 +1,11 @@
-"""A height of the barometer as it arrives: whether it is one."""
+"""A height of the barometer or of a fix as it arrives: whether it is one."""
 
 import math
 from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.filtering.filter_state import FilterState
+from gateway.estimation.kernel_record import FloatArray
 from gateway.estimation.local_position import BARO_STALE_S
 
 FASTEST_RISE_M: Final = 20.0
@@ -28,12 +29,38 @@ def is_height_told(s: FilterState, alt_m: float) -> bool:
     """
     if s.started == 0 or not math.isfinite(alt_m):
         return False
-    since_s = min(s.time_s - s.baro_s, BARO_STALE_S)
-    most_m = FASTEST_RISE_M + FASTEST_CLIMB_MPS * since_s
-    last_m, s.baro_last_m = s.baro_last_m, alt_m
-    if s.baro_known == 1 and abs(alt_m - s.baro_held_m) > most_m:
-        if abs(alt_m - last_m) > most_m:
-            return False
+    told, agrees = compare_height(s.baro_heights, alt_m, s.time_s - s.baro_s)
+    if s.baro_known == 0:
+        s.baro_heights[1] = alt_m
+        return True
+    if told and not agrees:
         s.baro_known = 0
-    s.baro_held_m = alt_m
-    return True
+    return told
+
+
+@compiled
+def compare_height(heights: FloatArray, alt_m: float, since_s: float) -> tuple[bool, bool]:
+    """Compare a height with those before it.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (2,)
+        The newest height, and the newest that was believed, m; changed in place.
+    alt_m : float
+        Positive up.
+    since_s : float
+        Time since the height that was believed.
+
+    Returns
+    -------
+    tuple of 2 bools
+        Whether it may be used, as the one or the other is near, and whether the one is that was
+        believed.
+    """
+    most_m = FASTEST_RISE_M + FASTEST_CLIMB_MPS * min(since_s, BARO_STALE_S)
+    agrees = abs(alt_m - heights[1]) <= most_m
+    told = agrees or abs(alt_m - heights[0]) <= most_m
+    heights[0] = alt_m
+    if told:
+        heights[1] = alt_m
+    return told, agrees
