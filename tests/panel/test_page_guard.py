@@ -70,14 +70,18 @@ async def test_own_names_are_let_in(host: str) -> None:
     assert answer.headers["x-frame-options"] == "DENY"
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", ""])
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", "", "[::1", "[x]"]
+)
 async def test_foreign_name_that_points_here_is_refused(host: str) -> None:
     async with client_of(guarded()) as client:
         answer = await client.get("/", headers={"host": host})
     assert answer.status_code == http.HTTPStatus.FORBIDDEN
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:8080", "null"])
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "http://127.0.0.1:8080", "null", "http://[::1"]
+)
 async def test_other_page_of_the_same_browser_cannot_steer(origin: str) -> None:
     async with client_of(guarded()) as client:
         answer = await client.post("/", headers={"origin": origin})
@@ -113,8 +117,10 @@ async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
         told = await client.post("/x", content=bytes(MAX_BODY + 1))
         untold = await client.post("/x", content=chunks())
         fitting = await client.post("/x", content=bytes(MAX_BODY))
+        endless = await client.post("/x", headers={"content-length": "9" * 5000})
     assert told.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
     assert untold.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert endless.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
     assert fitting.text == f"operator {MAX_BODY}"
 
 
@@ -140,6 +146,15 @@ async def test_password_tells_the_role(locked: httpx.AsyncClient, password: str,
     assert (await locked.get("/")).text.startswith(role)
     await locked.post("/logout")
     assert (await locked.get("/")).headers["location"] == "/login"
+
+
+async def test_cookies_of_other_programs_do_no_harm(locked: httpx.AsyncClient) -> None:
+    """A browser sends those of every port of the host, and their names may be odd."""
+    await locked.post("/login", data={"password": "tower"})
+    token = locked.cookies[COOKIE]
+    locked.cookies.clear()
+    answer = await locked.get("/", headers={"cookie": f"a/b=c; {{d}}=e; {COOKIE}={token}"})
+    assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
 
 
 async def test_guessing_is_slowed(locked: httpx.AsyncClient) -> None:

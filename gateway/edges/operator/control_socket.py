@@ -153,7 +153,7 @@ class ControlServer:
             result = handler(msgspec.convert(request.params, kind))
             if isinstance(result, Awaitable):
                 result = await result
-        except (ControlError, msgspec.DecodeError) as error:
+        except (ControlError, msgspec.DecodeError, UnicodeDecodeError) as error:
             return _Answer(ok=False, error=str(error))
         return _Answer(ok=True, result=result)
 

@@ -7,13 +7,12 @@ page can forge distinguish them: `Host`, which must be a name of ours (against D
 
 import asyncio
 import ipaddress
-from collections.abc import Iterable
 from http import HTTPStatus
-from http.cookies import SimpleCookie
 from typing import Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -26,6 +25,8 @@ ROLE: Final = "mavgate.role"
 MAX_BODY: Final = 1 << 20
 UPLOAD: Final = "/recordings/"
 """Paths below it accept a whole recording."""
+MAX_DIGITS: Final = 18
+"""Of a length; Python reads no number of more than some thousand."""
 WS_POLICY_VIOLATION: Final = 1008
 
 HEADERS: Final = {
@@ -95,7 +96,7 @@ class PageGuard:
         if not self._is_ours(host):
             return f"this panel is not called {host!r}; settings: panel.hosts"
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        if origin is not None and _split(origin).netloc.lower() != host.lower():
             return f"a page of {origin!r} may not use this panel"
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") not in (
             "navigate",
@@ -105,7 +106,7 @@ class PageGuard:
         return ""
 
     def _is_ours(self, host: str) -> bool:
-        name = urlsplit(f"//{host}").hostname or ""
+        name = _split(f"//{host}").hostname or ""
         if name in self._names:
             return True
         # An IP address cannot be rebound, as a name can.
@@ -119,7 +120,8 @@ class PageGuard:
         answer = PlainTextResponse(
             f"too large: at most {limit} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
         )
-        if int(Headers(scope=scope).get("content-length") or 0) > limit:
+        length = Headers(scope=scope).get("content-length", "").lstrip("0")
+        if len(length) > MAX_DIGITS or int(length or 0) > limit:
             await answer(scope, receive, send)
             return
         begun, taken = False, 0
@@ -195,14 +197,21 @@ async def _refuse(
 
 
 def _token(headers: Headers) -> str:
-    for value in _values(headers, "cookie"):
-        if (morsel := SimpleCookie(value).get(COOKIE)) is not None:
-            return morsel.value
+    # The browser sends the cookies of all programs of this host, with whatever names they have.
+    for value in headers.getlist("cookie"):
+        if (token := cookie_parser(value).get(COOKIE)) is not None:
+            return token
     return ""
 
 
-def _values(headers: Headers, name: str) -> Iterable[str]:
-    return headers.getlist(name)
+def _split(url: str) -> SplitResult:
+    """Return the parts of a URL; none if it is not valid."""
+    try:
+        parts = urlsplit(url)
+        _ = parts.hostname
+    except ValueError:
+        return urlsplit("")
+    return parts
 
 
 def _is_number(name: str) -> bool:

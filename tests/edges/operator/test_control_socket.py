@@ -76,7 +76,10 @@ async def test_what_cannot_be_granted_is_refused_with_a_reason(
         await ask(server, verb, params)
 
 
-@pytest.mark.parametrize("line", [b"\n", b"nonsense\n", b"[]\n", b'{"verb": 3}\n', b"\xff\xfe\n"])
+@pytest.mark.parametrize(
+    "line",
+    [b"\n", b"nonsense\n", b"[]\n", b'{"verb": 3}\n', b"\xff\xfe\n", b'{"verb": "\xff"}\n'],
+)
 async def test_nonsense_is_answered_too(server: ControlServer, line: bytes) -> None:
     answer = msgspec.json.decode(await server.answer(line))
     assert answer["ok"] is False
