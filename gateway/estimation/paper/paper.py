@@ -213,7 +213,7 @@ class PaperEstimator:
             if not sound:
                 return self._nav(sample.time_us, sound)
             s.time_us = sample.time_us
-            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(accel)
+            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(self._memory, accel, gyro)
         dt_us = sample.time_us - s.time_us
         if abs(dt_us) > kernels.GAP_US:
             if dt_us < 0:
@@ -225,7 +225,7 @@ class PaperEstimator:
             s.time_us = sample.time_us
             if sound:
                 self._advance(accel, gyro, dt_us / US_PER_S)
-        if sample.mag_b_ut is not None and dt_us >= 0 and is_finite(sample.mag_b_ut):
+        if sample.mag_b_ut is not None and dt_us >= 0 and kernels.is_field(sample.mag_b_ut):
             self._update_yaw(sample.mag_b_ut)
         return self._nav(s.time_us, sound)
 

@@ -15,6 +15,12 @@ from gateway.estimation import flagbits
 from gateway.estimation.history import SLOTS, recall, remember
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, write_vec
 from gateway.estimation.rest import RestGains, RestState, watch_rest
+from gateway.estimation.sensor_faults import (
+    HealthState,
+    check_sensors,
+    force_instead,
+    rate_instead,
+)
 from gateway.geometry.geodesy import offset_deg
 from gateway.geometry.quaternion import (
     from_euler,
@@ -22,6 +28,7 @@ from gateway.geometry.quaternion import (
     multiply,
     normalise,
     rotate,
+    rotate_inverse,
     to_euler,
     wrap_pi,
 )
@@ -58,7 +65,7 @@ OUT_COLUMNS: Final = 11
 """Attitude, place, velocity, flags."""
 
 
-class Memory(RestState):
+class Memory(RestState, HealthState):
     """What the inertial sensors showed recently."""
 
     bias_b: Annotated[FloatArray, (3,)]
@@ -75,6 +82,12 @@ class Memory(RestState):
 def is_finite(v: Vec3) -> bool:
     """Return whether all three are finite."""
     return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
+
+
+@compiled
+def is_field(v: Vec3) -> bool:
+    """Return whether a compass told a field: zeros are what one tells that was reset."""
+    return is_finite(v) and bool(v[0] or v[1] or v[2])
 
 
 @compiled
@@ -195,7 +208,15 @@ def step(
     now_us: int,
     dt_s: float,
 ) -> tuple[Vec3, Quat, Place, Vec3]:
-    """Advance all that the inertial sensors drive; the rate comes back without its bias."""
+    """Advance all that the inertial sensors drive; the rate comes back without its bias.
+
+    A sample that is far from all others is bridged.
+    """
+    good_gyro, good_accel = check_sensors(s, gyro, accel, 0.0, dt_s)
+    if not good_gyro:
+        gyro = rate_instead(s, as_vec(s.bias_b))
+    if not good_accel:
+        accel = force_instead(s, rotate_inverse(q_nb, (0.0, 0.0, -STANDARD_GRAVITY_MPS2)))
     gyro = unbiased(s, p, gyro, accel, fix_vel, fix_age_us, dt_s)
     q_nb = turn(q_nb, accel, gyro, dt_s, alpha_gyro)
     place, vel = advance(s, q_nb, accel, dt_s, now_us, place, vel)
@@ -237,8 +258,10 @@ def blend_fix(
 
 
 @compiled
-def level_start(accel: Vec3) -> Quat:
+def level_start(s: Memory, accel: Vec3, gyro: Vec3) -> Quat:
     """Begin with the accelerometer's tilt, facing north."""
+    write_vec(s.accel_held, accel)
+    write_vec(s.gyro_held, gyro)
     roll, pitch = tilt_of(accel)
     return from_euler(roll, pitch, 0.0)
 
@@ -345,7 +368,7 @@ def run(
         accel, gyro, mag = three(samples, i, 0), three(samples, i, 3), three(samples, i, 6)
         sound = is_sound(accel, gyro)
         if now_us == NEVER and sound:
-            now_us, q = time_us[i], level_start(accel)
+            now_us, q = time_us[i], level_start(memory, accel, gyro)
         if now_us != NEVER:
             dt_us, now_us = time_us[i] - now_us, time_us[i]
             if sound and 0 < dt_us <= GAP_US:
@@ -356,7 +379,7 @@ def run(
                 )  # fmt: skip
                 if not at_fix:
                     place, vel = blend_fix(alpha, beta, place, vel, fix_place, fix_vel)
-            if is_finite(mag):
+            if is_field(mag):
                 q = turn_to_compass(q, mag, declination_rad, now_us, mag_us, alpha_yaw)
                 mag_us = now_us
         flags = flags_of(time_us[i], now_us != NEVER, mag_us, declination_rad, last_fix_us, sound)

@@ -266,6 +266,27 @@ class TestNonsense:
         assert state.q_nb == pytest.approx((1.0, 0.0, 0.0, 0.0))
         assert metres(state) == pytest.approx((0.0, 0.0), abs=0.02)
 
+    @pytest.mark.parametrize(
+        ("gyro", "accel"),
+        [((0.0, 35.0, 0.0), (0.0, 0.0, -G)), ((0.0, 0.0, 0.0), (150.0, 0.0, 0.0))],
+        ids=["rate", "force"],
+    )
+    def test_a_sample_that_is_far_from_all_others_leaves_no_trace(
+        self, gyro: Vec3, accel: Vec3
+    ) -> None:
+        estimator = make()
+        run(estimator, [imu(t) for t in times(0.5)])
+        estimator.update_gps(fix(500_000))
+        state = run(estimator, [imu(500_000, accel, gyro), imu(510_000)])
+        assert state.q_nb == pytest.approx((1.0, 0.0, 0.0, 0.0))
+        assert metres(state) == pytest.approx((0.0, 0.0), abs=0.02)
+
+    def test_a_field_of_zeros_is_no_heading(self) -> None:
+        estimator = make()
+        east = run(estimator, [imu(t, mag=(0.0, -20.0, 40.0)) for t in times(0.5)])
+        state = run(estimator, [imu(500_000, mag=(0.0, 0.0, 0.0))])
+        assert to_euler(state.q_nb) == pytest.approx(to_euler(east.q_nb))
+
     def test_not_finite_from_the_start(self) -> None:
         state = run(make(), [imu(0, (math.nan, math.nan, math.nan))])
         assert NavFlags.ATTITUDE_VALID not in state.flags
