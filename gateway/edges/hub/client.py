@@ -20,8 +20,7 @@ from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import SplitFault
 
 READ_BYTES: Final = 4096
-"""Read from one client at one wake-up, so that a flooding one delays the others by some
-milliseconds."""
+"""The most that is read from one client at one wake-up; see `HubContext.read_bytes`."""
 STRANGERS_RATE: Final = 64_000
 """Bytes a second read from all untrusted clients together: at most 5000 frames, a tenth of a
 processor. What is beyond waits with the sender, or is lost in the kernel."""
@@ -202,6 +201,10 @@ class HubContext(Protocol):
     @property
     def settings(self) -> HubSettings:
         """The present settings."""
+
+    @property
+    def read_bytes(self) -> int:
+        """How much to read from one client at one wake-up, before others get their turn."""
 
     @property
     def strangers(self) -> Purse:

@@ -9,7 +9,6 @@ import socket
 import struct
 from typing import Any, Final
 
-from gateway.edges.hub.client import READ_BYTES
 from gateway.edges.hub.listener import RETRY_US
 from gateway.edges.hub.udp import MAX_DATAGRAM, READ_BUDGET, DatagramClient
 from gateway.routing.endpoint import EndpointKind
@@ -73,7 +72,7 @@ class GroupClient(DatagramClient):
         self.adopt(opened, lambda data: opened.sendto(data, address))
 
     def _on_group(self, sock: socket.socket) -> None:
-        size = 0
+        size, most = 0, self.context.read_bytes
         for _ in range(READ_BUDGET):
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
@@ -82,7 +81,7 @@ class GroupClient(DatagramClient):
             if address[:2] != self._own_address:
                 size += len(data)
                 self.accept(data, self.context.now_us())
-            if size >= READ_BYTES:
+            if size >= most:
                 break
         self.pause_stranger(sock, self._on_group, size)
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from gateway.edges.hub.client import STRANGERS_BURST, STRANGERS_RATE, Client
+from gateway.edges.hub.client import READ_BYTES, STRANGERS_BURST, STRANGERS_RATE, Client
 from gateway.edges.hub.listener import Listener
 from gateway.edges.hub.router import Router
 from gateway.edges.hub.transports import CLIENTS, LISTENERS
@@ -37,6 +37,11 @@ VISITS_IN_FULL: Final = 30
 """Connects and disconnects at listening ports that are logged one by one in a minute."""
 SENDS_AT_ONCE: Final = 8
 """Of a burst of our own frames, before the loop does other work: each takes some tens of µs."""
+LEAST_READ_BYTES: Final = 192
+"""Some frames: of fewer each wake-up would cost more than they do."""
+PASSED_ON_BYTES: Final = 12_288
+"""Read from one client at one wake-up, times the clients that may take it: some 250 sends, about a
+millisecond, so that a flooding client delays the others by no more."""
 MAX_WAITING: Final = 256
 """Frames of a burst that wait. More are sent at once, so a loop that is too slow reads less."""
 
@@ -267,6 +272,12 @@ class Hub:
     def listening_ports(self) -> tuple[int, ...]:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
         return tuple(listener.port for listener in self.listeners())
+
+    @property
+    def read_bytes(self) -> int:
+        """How much to read from one client at one wake-up: less where it may go to many."""
+        fair = PASSED_ON_BYTES // max(len(self._clients), 1)
+        return min(max(fair, LEAST_READ_BYTES), READ_BYTES)
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""

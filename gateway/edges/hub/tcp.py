@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gateway.edges.hub.client import READ_BYTES, Client
+from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US, Listener, Peer
 from gateway.routing.client_table import Presence, who_leaves
 from gateway.routing.endpoint import host_and_port
@@ -133,7 +133,7 @@ class StreamClient(Client):
 
     def _on_readable(self, sock: socket.socket) -> None:
         try:
-            data = sock.recv(READ_BYTES)
+            data = sock.recv(self.context.read_bytes)
         except BlockingIOError:
             return
         except OSError:

@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from typing import Any, Final
 
-from gateway.edges.hub.client import READ_BYTES, Client, Write, not_open
+from gateway.edges.hub.client import Client, Write, not_open
 from gateway.edges.hub.listener import RETRY_US
 from gateway.routing.endpoint import Endpoint, host_and_port
 from gateway.routing.outbox import Packer
@@ -206,7 +206,7 @@ class DatagramClient(Client):
         now_us = self.context.now_us()
         budget = READ_BUDGET if now_us - self._woken_us <= ALONE_US else 1
         self._woken_us = now_us
-        size = 0
+        size, most = 0, self.context.read_bytes
         for _ in range(budget):
             try:
                 data = sock.recv(MAX_DATAGRAM)
@@ -222,7 +222,7 @@ class DatagramClient(Client):
             self.accept(data, now_us)
             if self._socket is not sock:
                 return
-            if size >= READ_BYTES:
+            if size >= most:
                 break
         self.pause_stranger(sock, self._on_readable, size)
 

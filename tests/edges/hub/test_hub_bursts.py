@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from gateway.edges.hub.hub import MAX_WAITING, SENDS_AT_ONCE
+from gateway.edges.hub.client import READ_BYTES
+from gateway.edges.hub.hub import LEAST_READ_BYTES, MAX_WAITING, SENDS_AT_ONCE
 from gateway.records import Incoming
 
 pytestmark = pytest.mark.io
@@ -107,3 +108,32 @@ async def test_those_who_come_at_once_are_admitted_one_a_turn(rig: Any, kind: st
 
     await rig.until(are_all_in)
     assert all(after - before <= 1 for before, after in itertools.pairwise(seen))
+
+
+@pytest.mark.parametrize(("stations", "most"), [(1, READ_BYTES), (15, 768), (80, LEAST_READ_BYTES)])
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+async def test_a_flood_is_passed_on_over_many_turns(
+    rig: Any, kind: str, stations: int, most: int
+) -> None:
+    takers = [rig.station() for _ in range(stations)]
+    hub = rig.hub(f"{kind}-listen:127.0.0.1:0", *(f"udp:127.0.0.1:{t.port}" for t in takers))
+    await rig.until_open(hub)
+    source = socket.socket(type=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+    rig.closing.append(source.close)
+    source.connect(("127.0.0.1", hub.listening_ports()[0]))
+    vehicle = rig.sender(7)
+    source.send(vehicle.attitude())
+    await rig.until(lambda: hub.counters().forwarded == 1)
+    frames = [vehicle.attitude() for _ in range(200)]
+    for frame in frames:
+        source.send(frame)
+    passed = [1]
+
+    def are_all_through() -> bool:
+        passed.append(hub.counters().forwarded)
+        return passed[-1] == 1 + len(frames)
+
+    await rig.until(are_all_through)
+    in_a_turn = most // len(frames[0]) + 1
+    assert all(after - before <= in_a_turn for before, after in itertools.pairwise(passed))
+    assert rig.foreign[1:] == frames
