@@ -6,7 +6,8 @@ damaged but the cut tail, and no more than the last second may be missing. Then 
 is cut after each of its bytes, and every prefix must open and hold all of its whole records.
 
 A second is what the child records in one, however long a busy machine makes that last. No sync of
-its disk ever ends: a kill costs only what the kernel was not given.
+its disk ever ends: a kill costs only what the kernel was not given. Where the disk keeps even the
+kernel waiting more may be lost, so `--any-loss` judges only that what was written is there.
 
     python tools/kill_recorder.py [--kills 200] [--seed 1]
 """
@@ -16,6 +17,7 @@ import asyncio
 import mmap
 import os
 import signal
+import struct
 import sys
 import tempfile
 import threading
@@ -48,7 +50,8 @@ LONGEST_S = 3.0
 SHORTEST_S = 0.3
 MAX_LOST_S = 1.0
 CUT_BYTES = 6000
-NUMBER_BYTES = 8
+NUMBERS = struct.Struct("QQ")
+"""What a child tells: its samples, and the bytes of its larger file as the recorder knows it."""
 PATIENCE_S = 240.0
 LOOK_S = 0.001
 
@@ -91,7 +94,7 @@ async def record_for_ever(folder: Path, told: mmap.mmap) -> None:
         for frame in (2 * number, 2 * number + 1):
             recorder.frame(make_frame(mav, frame))
         number += 1
-        told[:] = number.to_bytes(NUMBER_BYTES)
+        told[:] = NUMBERS.pack(number, recorder.status().part_bytes)
         await asyncio.sleep(1 / RATE_HZ)
 
 
@@ -103,17 +106,20 @@ def kill_one(folder: Path, life_s: float) -> float:
     AssertionError
         If something is wrong with what it left.
     """
-    told = mmap.mmap(-1, NUMBER_BYTES)
+    told = mmap.mmap(-1, NUMBERS.size)
     child = os.fork()
     if child == 0:
         asyncio.run(record_for_ever(folder, told))
     end_s = time.monotonic() + PATIENCE_S
-    while int.from_bytes(told[:]) < life_s * RATE_HZ and time.monotonic() < end_s:
+    recorded = in_file = 0
+    while (recorded < life_s * RATE_HZ or not in_file) and time.monotonic() < end_s:
         time.sleep(LOOK_S)
+        recorded, in_file = NUMBERS.unpack(told[:])
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    recorded = int.from_bytes(told[:])
+    recorded, in_file = NUMBERS.unpack(told[:])
     assert recorded >= life_s * RATE_HZ, f"only {recorded} samples in {PATIENCE_S} s"
+    assert 0 < in_file <= max(path.stat().st_size for path in folder.iterdir())
     written = sum(check_tlog(path.read_bytes()) for path in folder.glob("*.tlog"))
     for path in folder.glob("*.csv"):
         check_table(path.read_bytes())
@@ -166,6 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--any-loss", action="store_true", help="however much is lost")
     args = parser.parse_args()
     lives_s = np.random.default_rng(args.seed).uniform(SHORTEST_S, LONGEST_S, args.kills)
     lost_s = []
@@ -179,7 +186,7 @@ def main() -> None:
     print(f"{args.kills} kills: every recording opens, only the cut end is damaged")
     print(f"lost: mean {np.mean(lost_s):.3f} s, most {max(lost_s):.3f} s")
     print(f"cut at every byte: {tlog_cuts} prefixes of a tlog, {table_cuts} of a table, all open")
-    if max(lost_s) > MAX_LOST_S:
+    if max(lost_s) > MAX_LOST_S and not args.any_loss:
         sys.exit(f"more than {MAX_LOST_S} s lost")
 
 
