@@ -1,7 +1,10 @@
 """The command `mavgate`: one file per group of commands."""
 
+import io
 import logging
+import os
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,7 +12,9 @@ import typer
 from gateway import __version__
 from gateway.cli.command_table import LazyGroup
 from gateway.edges.operator.log_limit import LogLimit
+from gateway.edges.reasons import reason_of
 
+log = logging.getLogger(__name__)
 app = typer.Typer(
     name="mavgate",
     cls=LazyGroup,
@@ -48,6 +53,23 @@ def _options(
     logging.basicConfig(level=level, format=form, handlers=[handler])
 
 
+def _prepare_streams() -> None:
+    """Make sure that what is printed never ends a command, and no file takes a stream's place."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # It was closed: the next file that is opened would get its number.
+            setattr(sys, name, Path(os.devnull).open("r+"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # Names of files need not be text, and not every terminal has all signs.
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Run the command line."""
-    app()
+    _prepare_streams()
+    try:
+        app()
+    except OSError as error:
+        log.debug("Ended by %r", error, exc_info=error)
+        sys.exit(f"{error.filename or 'output'}: {reason_of(error)}")

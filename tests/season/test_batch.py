@@ -164,6 +164,19 @@ def test_info_tells_every_file(season: Path, tmp_path: Path) -> None:
     assert durations == pytest.approx([40.0] * 4, abs=0.2)
 
 
+def test_names_that_are_not_utf8_stop_nothing(season: Path, tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    shutil.copy(season / FLIGHTS[0], there / os.fsdecode(b"fl\xfcg_01_v1.csv"))
+    (there / os.fsdecode(b"bad\xff.csv")).write_text("")
+    for _ in range(2):
+        code, text = run("info", there, "-o", tmp_path / "out", "--jobs", 1)
+        assert code == 1
+        assert "1 of 2 recordings failed" in text
+    places = {Path(result.place).name for result in read_results(tmp_path / "out")}
+    assert places == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
+
+
 def test_a_report_is_put_in_place_as_a_whole(season: Path, tmp_path: Path) -> None:
     code, _ = run("report", season / FLIGHTS[0], "-o", tmp_path)
     assert code == 0

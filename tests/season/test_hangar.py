@@ -139,6 +139,16 @@ def test_a_broken_file_has_a_row_that_says_why(folder: Path) -> None:
     assert "is no recording" in broken["noise.tlog"]
 
 
+def test_a_name_that_is_not_utf8_and_a_time_beyond_all(tmp_path: Path, folder: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"fl\xfcg_01_v1.csv")
+    odd.write_bytes((folder / "one_01_v1.csv").read_bytes())
+    os.utime(odd, (13_000_000_000, 13_000_000_000))
+    for read in (1, 0):
+        assert index_folder(tmp_path, OPTIONS, InThisProcess()).read == read
+    row = row_of(tmp_path, r"fl\xfcg_01_v1.csv")
+    assert (row["name"], row["vehicle"], row["error"]) == (r"fl\xfcg", 1, None)
+
+
 def test_only_what_changed_is_read_again(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.csv").write_text(f"time_us,x\n{name},1\n")

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
+from gateway.edges.reasons import reason_of
 from gateway.flightlog.moment import Moment, parse_moment
 from gateway.flightlog.table.foreign import ColumnMap
 from gateway.flights.flight_terms import FlightError, Position, SettingsChoice
@@ -95,6 +96,6 @@ def refusing() -> Iterator[None]:
         refuse(f"{error.filename}: is there already; --force overwrites it")
     except OSError as error:
         file = str(error.filename or "disk").removesuffix(".partial")
-        refuse(f"{file}: {error.strerror}")
+        refuse(f"{file}: {error.strerror or reason_of(error)}")
     except FlightError as error:
         refuse(str(error))

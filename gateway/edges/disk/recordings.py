@@ -5,6 +5,7 @@ A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog`
 
 import contextlib
 import itertools
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -49,6 +50,11 @@ def recording_name(path: Path) -> str:
     """Return the name of a file's recording; for another file its own name."""
     match = _FILE_NAME.fullmatch(path.name)
     return path.name if match is None else match["name"]
+
+
+def as_text(name: str) -> str:
+    r"""Return a file's name as it can be printed and stored: what is not UTF-8 as `\xNN`."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def parts_together(paths: Iterable[Path]) -> list[list[Path]]:

@@ -16,7 +16,7 @@ from gateway.analysis.fusion import fuse_states
 from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.contest import Axis, SweepError, Trials, base_score, grid, make_contest
-from gateway.edges.disk.recordings import recording_name
+from gateway.edges.disk.recordings import as_text, recording_name
 from gateway.flights.describing import describe
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.fused_rows import fused_lines
@@ -250,7 +250,7 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
     """
     item, stamp, key, name = known
     result = FlightResult(
-        place=item.place, digest=stamp, key=key, task=task.name, version=__version__
+        place=as_text(item.place), digest=stamp, key=key, task=task.name, version=__version__
     )
     with local_files(item) as files:
         if item.is_fetched:
@@ -264,7 +264,7 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
             text = str(error) or type(error).__name__
             for part, file in zip(item.parts, files, strict=True):
                 text = text.replace(str(file), without_user(part.place))
-            return msgspec.structs.replace(result, error=text), {}
+            return msgspec.structs.replace(result, error=as_text(text)), {}
     return (
         msgspec.structs.replace(
             result,
@@ -308,7 +308,7 @@ def without_secrets(options: ReadOptions) -> ReadOptions:
 
 def name_of(item: BatchItem) -> str:
     """Return what a recording is called in the folder of the results."""
-    name = recording_name(Path(item.place))
+    name = as_text(recording_name(Path(item.place)))
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
     return name

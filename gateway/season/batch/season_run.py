@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 
 from gateway import __version__
+from gateway.edges.disk.recordings import as_text
 from gateway.season.batch.flight_tasks import FlightResult, FlightTask, name_of, work_on
 from gateway.season.batch.result_folder import ResultFolder
 from gateway.season.batch.storage import BatchItem, stamp_of_item
@@ -58,7 +59,7 @@ def run_season(
         key = _key(task, stamp)
         kept = folder.find(key) if folder is not None else None
         if kept is not None:
-            found[number] = msgspec.structs.replace(kept, place=item.place)
+            found[number] = msgspec.structs.replace(kept, place=as_text(item.place))
         else:
             todo.append((item, stamp, key, names[number]))
             numbers.append(number)
@@ -107,7 +108,7 @@ def _failed(
     task: FlightTask, item: BatchItem, stamp: str, key: str, failure: WorkFailed
 ) -> FlightResult:
     return FlightResult(
-        place=item.place,
+        place=as_text(item.place),
         digest=stamp,
         key=key,
         task=task.name,

@@ -19,7 +19,7 @@ from gateway.edges.disk.recording_streams import (
     read_batches,
     read_chunks,
 )
-from gateway.edges.disk.recordings import recording_name
+from gateway.edges.disk.recordings import as_text, recording_name
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.flights.reading import ReadOptions, open_rows
 from gateway.season.executors import Executor, WorkFailed
@@ -30,6 +30,8 @@ ENDINGS: Final = (".tlog", ".csv")
 """Files of other endings are looked at where a format knows their first bytes."""
 CHUNK_FILES: Final = 8
 """Files that one process reads before it reports."""
+LATEST_NS: Final = 2**63 - 1
+"""The greatest number that SQLite keeps; a file's time may lie beyond it."""
 KEEP_S: Final = 1.0
 """What is read is stored so often: an interruption costs no more than that."""
 
@@ -81,11 +83,11 @@ def index_folder(
     hangar = Hangar(folder)
     try:
         known = hangar.known()
-        there = {str(path.relative_to(folder)): path for path in recordings_below(folder)}
+        there = {as_text(str(path.relative_to(folder))): path for path in recordings_below(folder)}
         gone = known.keys() - there.keys()
         hangar.forget(gone)
         wanted = [
-            (name, known[name][2] if name in known else "")
+            (str(path.relative_to(folder)), known[name][2] if name in known else "")
             for name, path in there.items()
             if name not in known or _stamp(path) != known[name][:2]
         ]
@@ -109,7 +111,7 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
     """Read one file for the catalogue; whatever is wrong with it stands in its `error`."""
     name, known_digest = wanted
     path = folder / name
-    found = CataloguedFile(name, recording_name(path), None, 0, 0, "")
+    found = CataloguedFile(as_text(name), as_text(recording_name(path)), None, 0, 0, "")
     try:
         size, modified_ns = _stamp(path)
         found = replace(found, size=size, modified_ns=modified_ns, digest=digest_of(path))
@@ -118,9 +120,9 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
         found = replace(found, kind=_kind_name(path))
         flights = tuple(_flights_in(path, options))
     except OSError as error:
-        return replace(found, error=error.strerror or str(error))
+        return replace(found, error=error.strerror or as_text(str(error)))
     except (FlightError, ValueError) as error:
-        return replace(found, error=str(error).removeprefix(f"{path}: "))
+        return replace(found, error=as_text(str(error).removeprefix(f"{path}: ")))
     return replace(found, flights=flights, error=None if flights else NO_RECORDING)
 
 
@@ -153,7 +155,7 @@ def _read_all(
                 if isinstance(outcome, WorkFailed)
                 else outcome
             )
-            known = dict(piece)
+            known = {as_text(name): digest for name, digest in piece}
             same = [file for file in files if file.digest and file.digest == known[file.path]]
             for file in same:
                 hangar.touch(file.path, file.modified_ns)
@@ -180,13 +182,15 @@ def _read_piece(folder: Path, options: ReadOptions, piece: list[Wanted]) -> list
 
 
 def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
-    size, modified_ns = _stamp(folder / name) if (folder / name).exists() else (0, 0)
-    return CataloguedFile(name, recording_name(folder / name), None, size, modified_ns, "", reason)
+    path = folder / name
+    size, modified_ns = _stamp(path) if path.exists() else (0, 0)
+    recording = as_text(recording_name(path))
+    return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", reason)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
     found = path.stat()
-    return found.st_size, found.st_mtime_ns
+    return found.st_size, min(found.st_mtime_ns, LATEST_NS)
 
 
 def _may_be_recording(path: Path) -> bool:

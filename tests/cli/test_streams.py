@@ -1,0 +1,52 @@
+"""Standard streams that are closed, full or know few signs: clear errors, and no traceback."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.io
+
+
+def run(*words: str, stdout: int | None = subprocess.PIPE, closed: int | None = None, **env: str):
+    head = [] if closed is None else ["/bin/sh", "-c", f'exec "$@" {closed}>&-', "sh"]
+    return subprocess.run(
+        [*head, sys.executable, "-m", "gateway.cli", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=240,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **env},
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("closed", [0, 1, 2])
+def test_a_closed_stream_is_none_that_a_command_needs(closed: int) -> None:
+    done = run("check-config", closed=closed)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_full_disk_behind_the_output_is_said() -> None:
+    full = os.open("/dev/full", os.O_WRONLY)
+    done = run("check-config", stdout=full)
+    os.close(full)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[0] == "output: No space left on device"
+    assert "Traceback" not in done.stderr
+
+
+def test_signs_that_the_output_lacks_are_written_as_numbers() -> None:
+    done = run("check-config", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0
+    assert r"\u" in done.stdout or r"\x" in done.stdout
+
+
+def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    name = str(tmp_path / ("x" * 300))
+    done = run("recover", name, "-o", str(tmp_path / "out.tlog"))
+    assert done.returncode == 1
+    assert done.stderr == f"{name}: File name too long\n"
