@@ -17,13 +17,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from msgspec.structs import replace
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from gateway.analysis.processes import begin_copy
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.live.run import loop_comes_first
 from gateway.cli.support.made_ahead import made_ahead
@@ -113,23 +114,28 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
     return watch
 
 
+def send_even_turns(seconds: float, to: Connection) -> None:
+    """Be the baseline."""
+    to.send(even_turns(seconds))
+
+
 def main() -> None:
     """Run, and print what was seen."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--vehicles", type=int, default=2)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(1) as pool:
+    with tempfile.TemporaryDirectory() as name:
         # Its own control socket: a gateway that runs on this machine keeps its.
         os.environ["XDG_RUNTIME_DIR"] = name
-        baseline = pool.submit(even_turns, 60.0 * options.minutes)
+        baseline = begin_copy(send_even_turns, 60.0 * options.minutes)
         begin_s = time.monotonic()
         watch = run(options, Path(name))
         print(f"{(time.monotonic() - begin_s) / 60:.1f} min, {options.vehicles} aircraft")
         longest_ms = watch.longest_us() / 1e3
         print(f"longest pause by the program: {longest_ms:.2f} ms (goal {GOAL_MS:.0f} ms)")
         print(watch.report())
-        own_us, wall_us, long_turns, turns = baseline.result()
+        own_us, wall_us, long_turns, turns = baseline.recv()
         print(f"baseline, a loop of even turns: {own_us / 1e3:.2f} of {wall_us / 1e3:.2f} ms")
         print(f"  {long_turns} of {turns} turns took more than {GOAL_MS:.0f} ms")
 

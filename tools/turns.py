@@ -151,14 +151,14 @@ def _name(callback: object) -> str:
     return getattr(callback, "__qualname__", type(callback).__name__)
 
 
-async def _add_up() -> None:
-    while True:
+async def _add_up(parent: int) -> None:
+    while os.getppid() == parent:
         await asyncio.sleep(PAUSE_S)
         sum(range(COUNT))
 
 
 def even_turns(seconds: float) -> tuple[float, float, int, int]:
-    """Watch a loop that does the same computing in every turn.
+    """Watch a loop that does the same computing in every turn, or until its parent process ends.
 
     Returns
     -------
@@ -172,5 +172,5 @@ def even_turns(seconds: float) -> tuple[float, float, int, int]:
         contextlib.suppress(TimeoutError),
         asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner,
     ):
-        runner.run(asyncio.wait_for(_add_up(), seconds))
+        runner.run(asyncio.wait_for(_add_up(os.getppid()), seconds))
     return watch.longest_us(), watch.longest_wall_us, watch.long_turns, watch.turns
