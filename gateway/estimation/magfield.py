@@ -30,6 +30,14 @@ DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
 """How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
 STUCK_TURN_RAD: Final = 0.2
 """A field that is the same to the last digit after so much of a turn is none: a sensor hangs."""
+TURN_SHARE: Final = 0.2
+"""A turn that changes the field by this share of its strength is compared with the gyroscope's."""
+TURNS_KEPT: Final = 0.99
+"""What was compared is forgotten after so many hundred turns more."""
+WRONG_SHARE: Final = 0.75
+RIGHT_SHARE: Final = 0.5
+"""Of the field's changes, that the gyroscope leaves unexplained: a compass with an axis reversed or
+in the place of another leaves most, or more than there are, one with strong iron some 0.4."""
 LIKE_NORM_SHARE: Final = 0.04
 LIKE_DIP_RAD: Final = 0.035
 """A field this much stronger or steeper than usual counts half."""
@@ -81,6 +89,15 @@ class FieldState:
     mag_last: Annotated[FloatArray, (3,)]
     mag_turned: Annotated[FloatArray, (3,)]
     """Turn in body FRD since the field was another, rad."""
+    mag_begin: Annotated[FloatArray, (3,)]
+    """Where a turn began, uT; zeros before the first."""
+    mag_carried: Annotated[FloatArray, (3,)]
+    """What it should be by now, by the gyroscope."""
+    mag_changed_ut2: float
+    mag_unexplained_ut2: float
+    """By how much it was another after the last turns, and other than it should be: squares."""
+    mag_misplaced: int
+    """1 while the field turns otherwise than the aircraft: axes are swapped or reversed."""
 
 
 @compiled
@@ -99,8 +116,10 @@ def is_field_told(s: FieldState, mag_b: Vec3, dt: float) -> bool:
     Returns
     -------
     bool
-        False where it is not new, all zeros, or that of a compass that hangs.
+        False where it is not new, all zeros, or that of a compass that hangs or turns otherwise
+        than the aircraft.
     """
+    carry_field(s, dt)
     turned = s.mag_turned
     for k in range(3):
         turned[k] += s.rate_b[k] * dt
@@ -110,10 +129,52 @@ def is_field_told(s: FieldState, mag_b: Vec3, dt: float) -> bool:
     last = s.mag_last
     if mag_b[0] == last[0] and mag_b[1] == last[1] and mag_b[2] == last[2]:
         turned_sq = turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]
-        return bool(turned_sq < STUCK_TURN_RAD * STUCK_TURN_RAD)
+        return bool(s.mag_misplaced == 0 and turned_sq < STUCK_TURN_RAD * STUCK_TURN_RAD)
     write_vec(last, mag_b)
     write_vec(turned, (0.0, 0.0, 0.0))
-    return True
+    compare_turn(s, mag_b)
+    return s.mag_misplaced == 0
+
+
+@compiled
+def carry_field(s: FieldState, dt: float) -> None:
+    """Turn the field of the turn's begin back, as the aircraft turns."""
+    x, y, z = s.mag_carried[0], s.mag_carried[1], s.mag_carried[2]
+    p, q, r = s.rate_b[0] * dt, s.rate_b[1] * dt, s.rate_b[2] * dt
+    s.mag_carried[0] += y * r - z * q
+    s.mag_carried[1] += z * p - x * r
+    s.mag_carried[2] += x * q - y * p
+
+
+@compiled
+def begin_turn(s: FieldState, mag_b: Vec3) -> None:
+    """Begin a turn at a field; at zeros where the next tells one."""
+    write_vec(s.mag_begin, mag_b)
+    write_vec(s.mag_carried, mag_b)
+
+
+@compiled
+def compare_turn(s: FieldState, mag_b: Vec3) -> None:
+    """Compare how the field turns in the body with the gyroscope: this needs no attitude."""
+    norm_sq = expected_sq = changed_sq = off_sq = 0.0
+    for k in range(3):
+        begin, carried = s.mag_begin[k], s.mag_carried[k]
+        norm_sq += begin * begin
+        expected_sq += (carried - begin) ** 2
+        changed_sq += (mag_b[k] - begin) ** 2
+        off_sq += (mag_b[k] - carried) ** 2
+    if expected_sq < TURN_SHARE**2 * norm_sq:
+        return
+    begin_turn(s, mag_b)
+    if norm_sq == 0.0:
+        return
+    if s.mag_changed_ut2 == 0.0:
+        # Until turns of a radian or so have shown otherwise, it is a compass.
+        s.mag_changed_ut2 = norm_sq
+    s.mag_changed_ut2 = TURNS_KEPT * s.mag_changed_ut2 + changed_sq
+    s.mag_unexplained_ut2 = TURNS_KEPT * s.mag_unexplained_ut2 + off_sq
+    most = RIGHT_SHARE if s.mag_misplaced == 1 else WRONG_SHARE
+    s.mag_misplaced = 1 if s.mag_unexplained_ut2 > most * s.mag_changed_ut2 else 0
 
 
 @compiled

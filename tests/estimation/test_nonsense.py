@@ -1,6 +1,7 @@
 """Sensors that tell nonsense: whatever comes, the states stay finite and within reason."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +25,9 @@ from gateway.estimation.complementary.intake import velocity_from_position
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.records import NavFlags
 from tools.flights import Flight, simulated_flight
+from tools.score_estimators import attitude_scores
 
 ESTIMATORS = ("complementary", "eskf")
 FASTEST_MPS = 1000.0
@@ -149,6 +152,26 @@ def test_of_several_kinds(flight: Flight, seed: int) -> None:
         NONSENSE[k](log, rng)
     for name in ESTIMATORS:
         check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("how", ["x", "y", "swapped"])
+def test_a_compass_that_is_mounted_wrongly_is_done_without(
+    flight: Flight, name: str, how: str
+) -> None:
+    log = part(flight, -1.0, 300.0)
+    if how == "swapped":
+        log.imu[:, MAG : MAG + 2] = log.imu[:, [MAG + 1, MAG]]
+    else:
+        log.imu[:, MAG + "xy".index(how)] *= -1.0
+    late = replace(flight, counts=log.imu_time_us > 120_000_000)
+    out = run(flight, name, log)
+    flags = out[late.counts, NAV_FLAGS].astype(int)
+    assert (flags & int(NavFlags.MAG_DISTURBED)).all()
+    assert (flags & int(NavFlags.HEADING_VALID)).all()
+    scores = attitude_scores(late, out[:, :4])
+    assert scores["heading"] < 4.0
+    assert scores["inclination"] < 3.0
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import GPS_COLUMNS, GPS_SPEED_ACC
 from gateway.estimation.complementary.compass_error import compass_variance, note_strength
@@ -315,6 +316,34 @@ class TestFieldThatIsTold:
         state = new_record(ComplementaryState)
         for field in ((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)):
             assert not is_field_told(state, field, 0.01)
+
+    @pytest.mark.parametrize(
+        ("mounting", "told"),
+        [
+            (np.eye(3), True),
+            (np.diag([-1.0, 1.0, 1.0]), False),
+            (np.diag([1.0, 1.0, -1.0]), False),
+            (np.eye(3)[[1, 0, 2]], False),
+            (np.eye(3)[[1, 2, 0]], False),
+        ],
+        ids=["right", "x reversed", "z reversed", "x and y swapped", "turned"],
+    )
+    @pytest.mark.parametrize("iron_ut", [0.0, 15.0])
+    def test_one_that_turns_otherwise_than_the_aircraft_is_not_believed(
+        self, mounting: np.ndarray, told: bool, iron_ut: float
+    ) -> None:
+        state, rng = new_record(ComplementaryState), np.random.default_rng(1)
+        field, found = np.array(self.FIELD), []
+        for k in range(6000):
+            if k % 100 == 0:
+                rate = rng.normal(0.0, 0.7, 3)
+                state.rate_b[:] = rate
+            field = Rotation.from_rotvec(-0.01 * rate).apply(field)
+            measured = mounting @ field + rng.normal(0.0, 0.5, 3) + (iron_ut, 0.0, 0.0)
+            # Each field comes twice.
+            found += [is_field_told(state, tuple(measured), dt) for dt in (0.01, 0.0)]
+        assert found[0]
+        assert set(found[6000:]) == {told}
 
     def test_one_that_stands_still_while_the_aircraft_turns_is_not_believed(self) -> None:
         state = new_record(ComplementaryState)

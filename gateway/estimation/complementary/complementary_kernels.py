@@ -19,6 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.drift import (
     DOUBT,
     begin_drift,
+    doubt_sensors,
     end_level,
     note_turn,
     raise_bias_variance,
@@ -139,8 +140,12 @@ def take_imu(
         return
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
+    misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
         take_mag(s, p, mag)
+    elif s.mag_misplaced > misplaced:
+        doubt_sensors(s, p)
+        lose_attitude(s, p)
     refresh(s)
 
 

@@ -19,7 +19,12 @@ from gateway.estimation.eskf.measure import (
     update_by_rest,
     update_by_velocity,
 )
-from gateway.estimation.eskf.recovery import check_rest, raise_bias_variance, watch_gravity
+from gateway.estimation.eskf.recovery import (
+    check_rest,
+    lose_attitude,
+    raise_bias_variance,
+    watch_gravity,
+)
 from gateway.estimation.eskf.start import (
     begin,
     bridge_gap,
@@ -51,7 +56,7 @@ from gateway.estimation.magfield import (
     is_field_told,
     take_field,
 )
-from gateway.estimation.rest import doubt_rest_bias, watch_rest
+from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import check_sensors, force_instead, rate_instead
 from gateway.geometry.quaternion import (
     from_rotation_vector,
@@ -113,8 +118,12 @@ def take_imu(
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
     take_substitutes(s, p)
+    misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
         take_mag(s, p, mag)
+    elif s.mag_misplaced > misplaced:
+        raise_bias_variance(s, BIAS_CHANGE_RADPS)
+        lose_attitude(s, p)
 
 
 @compiled

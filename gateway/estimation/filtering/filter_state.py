@@ -84,6 +84,8 @@ def sensor_flags(s: FilterState) -> int:
     flags = AT_REST if s.at_rest == 1 else 0
     if s.time_s - s.mag_s < STALE_MAG_S:
         flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+    if s.mag_misplaced == 1:
+        flags |= MAG_DISTURBED | DEGRADED
     if s.time_s - s.baro_s < BARO_STALE_S:
         flags |= USING_BARO
     if s.fault == 1:

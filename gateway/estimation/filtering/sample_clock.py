@@ -4,6 +4,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState
 from gateway.estimation.kernel_record import write_vec
+from gateway.estimation.magfield import begin_turn
 from gateway.estimation.sensor_faults import UNKNOWN_HOLD_S, is_hanging, is_sound
 from gateway.records import Vec3
 
@@ -71,6 +72,7 @@ def is_silent(
     """
     may_rest = is_sound(gyro, p.bias_limit_radps) and not moving
     if dt > GAP_S or is_hanging(s, gyro, accel, may_rest, dt):
+        begin_turn(s, (0.0, 0.0, 0.0))
         return True
     s.silent_s, s.silent_rad, s.silent_rest = 0.0, 0.0, 0
     return False
