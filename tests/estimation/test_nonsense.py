@@ -47,11 +47,11 @@ def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
         for times in (log.imu_time_us, log.baro_time_us, log.gps_time_us)
     )
     return SampleLog(
-        log.imu_time_us[imu],
+        log.imu_time_us[imu].copy(),
         log.imu[imu].copy(),
-        log.baro_time_us[baro],
+        log.baro_time_us[baro].copy(),
         log.baro_alt_m[baro].copy(),
-        log.gps_time_us[gps],
+        log.gps_time_us[gps].copy(),
         log.gps[gps].copy(),
     )
 
@@ -172,6 +172,23 @@ def test_a_compass_that_is_mounted_wrongly_is_done_without(
     scores = attitude_scores(late, out[:, :4])
     assert scores["heading"] < 4.0
     assert scores["inclination"] < 3.0
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("leap_s", [100, 86_400])
+@pytest.mark.parametrize("since_s", [4.0, 60.0], ids=["at rest", "in flight"])
+def test_a_clock_that_leaps_ahead_is_a_silence(
+    flight: Flight, name: str, leap_s: int, since_s: float
+) -> None:
+    """Its end may find the aircraft anywhere, but the filter sane."""
+    log = part(flight, -1.0, 300.0)
+    for times_us in (log.imu_time_us, log.baro_time_us, log.gps_time_us):
+        times_us[times_us > since_s * 1e6] += leap_s * 1_000_000
+    late = replace(flight, counts=flight.log.imu_time_us > 120_000_000)
+    out = run(flight, name, log)
+    scores = attitude_scores(late, out[:, :4])
+    assert max(scores["heading"], scores["inclination"]) < 3.0
+    assert np.nanmax(np.abs(out[:, NAV_VEL : NAV_VEL + 3])) < 100.0
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

@@ -47,6 +47,7 @@ from gateway.estimation.filtering.fix_intake import (
     wanted_time_s,
 )
 from gateway.estimation.filtering.sample_clock import (
+    LONGEST_SILENCE_S,
     is_rest_silent,
     silence_before,
     silent_rate,
@@ -70,6 +71,7 @@ SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)
 @compiled
 def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
+    dt = min(dt, LONGEST_SILENCE_S)
     s.fault = 1
     still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.bias_b))

@@ -26,6 +26,7 @@ from gateway.estimation.eskf.iron import has_followed_compass
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
+    LONGEST_SILENCE_S,
     begin_clock,
     is_rest_silent,
     silent_rate,
@@ -221,6 +222,7 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
 @compiled
 def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
+    dt = min(dt, LONGEST_SILENCE_S)
     propagate(s, p)
     s.fault = 1
     still = is_rest_silent(s)

@@ -1,5 +1,7 @@
 """The clock of a filter: its begin, its step from sample to sample, and silences."""
 
+from typing import Final
+
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState
@@ -7,6 +9,9 @@ from gateway.estimation.kernel_record import write_vec
 from gateway.estimation.magfield import begin_turn
 from gateway.estimation.sensor_faults import UNKNOWN_HOLD_S, is_hanging, is_sound
 from gateway.records import Vec3
+
+LONGEST_SILENCE_S: Final = 60.0
+"""What moved and turned for longer may be anywhere: more tells no more, but breaks a covariance."""
 
 
 @compiled
