@@ -18,6 +18,7 @@ from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, table_of
 from gateway.edges.operator.control_socket import ControlError, request
+from gateway.edges.operator.detached_output import detached_output
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.session import NEWEST
 from gateway.routing.endpoint import SITE_NAME
@@ -154,10 +155,11 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
         refuse(HOW_TO_ADD)
     except (ValueError, ControlError) as error:
         refuse(str(error))
-    try:
-        await stopped.wait()
-    finally:
-        server.close()
+    with detached_output():
+        try:
+            await stopped.wait()
+        finally:
+            server.close()
 
 
 @recordings_group.callback()

@@ -24,6 +24,7 @@ from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
+from gateway.edges.operator.detached_output import detached_output
 from gateway.edges.operator.keyboard import Keyboard
 from gateway.edges.operator.log_line import summary_line
 
@@ -142,7 +143,7 @@ def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
-        with nothing_compiled():
+        with nothing_compiled(), detached_output():
             start()
             # All that exists by now is there to stay, as the library of the metrics that the start
             # has loaded: a full garbage collection of it would stop telemetry for 0.1 s.

@@ -43,6 +43,7 @@ from gateway.config import GatewaySettings
 from gateway.edges.disk.player_edge import PlayerStatus
 from gateway.edges.operator.attachment import on_parent_gone
 from gateway.edges.operator.control_socket import ControlError
+from gateway.edges.operator.detached_output import detached_output
 from gateway.edges.operator.keyboard import Keyboard
 from gateway.flightlog.playback import (
     AS_FAST_AS_POSSIBLE,
@@ -215,11 +216,12 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> No
         on_parent_gone(daemon.ended.set)
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
-    try:
-        await daemon.start()
-        await _watch(daemon)
-    finally:
-        daemon.close()
+    with detached_output():
+        try:
+            await daemon.start()
+            await _watch(daemon)
+        finally:
+            daemon.close()
 
 
 def steer(daemon: PlayerDaemon, key: str) -> None:

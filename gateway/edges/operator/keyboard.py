@@ -82,7 +82,7 @@ class Keyboard:
         asyncio.get_running_loop().remove_reader(self._descriptor)
         # The window may have been closed.
         with contextlib.suppress(termios.error):
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
         self._before = None
 
     def _read(self, fd: int) -> None:
