@@ -6,8 +6,10 @@ a record that was written partly is removed again.
 
 import contextlib
 import errno
+import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,10 +19,12 @@ from gateway.edges.disk.recordings import (
     check_free,
     free_name,
     list_recordings,
-    rename_recording,
+    move_recording,
 )
 from gateway.flightlog.session import part_stem
 from gateway.output import sync_folder
+
+log = logging.getLogger(__name__)
 
 RIGHTS: Final = 0o644
 
@@ -112,7 +116,7 @@ class PartFiles:
         return partial(_sync, tuple(self._files.values()), folder)
 
     def rename(self, to_name: str) -> None:
-        """Rename the recording between two writes, also before the first.
+        """Rename the recording between two writes, also before the first; the folder is not synced.
 
         Raises
         ------
@@ -120,7 +124,7 @@ class PartFiles:
             If the name is taken or invalid.
         """
         if self.session in {recording.name for recording in list_recordings(self._folder)}:
-            rename_recording(self._folder, self.session, to_name)
+            move_recording(self._folder, self.session, to_name)
         else:
             check_free(self._folder, to_name)
         self.session = to_name
@@ -168,6 +172,21 @@ class PartFiles:
                 os.ftruncate(file, size)
             raise
         self._sizes[ending] = size + len(data)
+
+
+def close_behind(
+    files: PartFiles, written: Future[DiskState], syncing: Future[None] | None
+) -> None:
+    """Close a part once its end is written and its last sync has ended; log what fails."""
+    try:
+        try:
+            written.result()
+        finally:
+            files.close({})
+        if syncing is not None:
+            syncing.result()
+    except OSError as error:
+        log.warning("Recording: the end of %s is lost: %s", files.session, reason_of(error))
 
 
 def _sync(files: Iterable[int], folder: Path | None) -> None:

@@ -10,8 +10,7 @@ gateway; every `sync_s` the other has the kernel write them to the disk, which s
 loss, and it closes, renames and copies what is finished. So no write waits for a slow sync, and
 the next sync begins once the last has ended. By default both times are half a second, so that
 either costs less than a second on a disk that syncs as fast; a card that is worn by this may be
-synced less often. Only between two parts of a recording, once in hours, the buffer waits until the
-first is closed.
+synced less often.
 """
 
 import asyncio
@@ -23,7 +22,13 @@ from pathlib import Path
 
 import msgspec
 
-from gateway.edges.disk.part_files import DiskState, PartFiles, free_bytes_near, reason_of
+from gateway.edges.disk.part_files import (
+    DiskState,
+    PartFiles,
+    close_behind,
+    free_bytes_near,
+    reason_of,
+)
 from gateway.edges.disk.recordings import RecordingError, part_of, rename_recording
 from gateway.edges.disk.restamp import Restamper, clear_copies
 from gateway.edges.disk.worker import begin_worker, done_by
@@ -40,6 +45,7 @@ from gateway.flightlog.session import (
 from gateway.flightlog.table.part import PENDING_LIMIT, Part
 from gateway.flightlog.table.table import REMARK, TableHeader, TableMark
 from gateway.flightlog.tlog.stamps import CivilClock
+from gateway.output import sync_folder
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
@@ -177,6 +183,9 @@ class Recorder:
         self._session.name = name
         if self._part is not None:
             self._part.session = name
+        if files is not None:
+            # Not by the thread that writes.
+            await done_by(self._syncer, sync_folder, self.folder)
 
     def status(self) -> RecorderStatus:
         """Return the present state."""
@@ -312,7 +321,7 @@ class Recorder:
         for action in actions:
             match action:
                 case ClosePart():
-                    await self._close_part(closing)
+                    await self._close_part(closing, is_last=opening is None)
                 case Rename():
                     await self._rename(action)
                 case OpenPart():
@@ -356,17 +365,16 @@ class Recorder:
             self._part.session = files.session
         return self._session.opened(self._clock())
 
-    async def _close_part(self, part: Part | None) -> None:
+    async def _close_part(self, part: Part | None, *, is_last: bool) -> None:
+        """Write the end of a part and close it behind its syncs; only for the last one wait."""
         files, self._files = self._files, None
         syncing, self._syncing = self._syncing, None
         if part is None or files is None:
             return
-        try:
-            await done_by(self._syncer, files.close, part.take())
-            if syncing is not None:
-                syncing.result()
-        except OSError as error:
-            log.warning("Recording: the end of %s is lost: %s", files.session, reason_of(error))
+        written = self._writer.submit(files.write, part.take())
+        closing = self._syncer.submit(close_behind, files, written, syncing)
+        if is_last:
+            await asyncio.shield(asyncio.wrap_future(closing))
 
     async def _rename(self, action: Rename) -> None:
         """Rename a session after its true time, and queue its finished parts to be shifted."""

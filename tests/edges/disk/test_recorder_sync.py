@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway.edges.disk.part_files import PartFiles
-from gateway.flightlog.session import RETRY_US
+from gateway.flightlog.session import RETRY_US, ClosePart, OpenPart
 from tests.conftest import ManualClock
 from tests.edges.disk.test_recorder import FRAMES, NAME, Bench, frames_of
 
@@ -145,7 +145,7 @@ async def test_a_last_sync_that_fails_is_reported(
     disk.may_end.set()
     with caplog.at_level(logging.WARNING):
         if by == "stop":
-            await bench.recorder._close_part(bench.recorder._part)
+            await bench.recorder._close_part(bench.recorder._part, is_last=True)
         else:
             bench.recorder.close()
     assert "disk fails" in caplog.text
@@ -167,3 +167,36 @@ async def test_a_recorder_that_ends_while_a_part_is_closed_closes_it(
     bench.recorder.close()
     assert files._files == {}
     assert frames_of(bench.recorder.folder) == FRAMES
+
+
+async def test_the_next_part_waits_for_no_sync_of_the_one_before(
+    bench: Bench, disk: SlowDisk
+) -> None:
+    part = bench.recorder._part
+    assert part is not None
+    bench.send(FRAMES[5:7])
+    await asyncio.wait_for(
+        bench.recorder._perform([ClosePart(), OpenPart(part.session, part.number + 1)]), FAR_S
+    )
+    for frame in FRAMES[7:]:
+        bench.send([frame])
+        await asyncio.wait_for(bench.turn(), FAR_S)
+    assert frames_of(bench.recorder.folder) == FRAMES
+    assert len(list(bench.recorder.folder.glob("*.tlog"))) == 2
+    disk.may_end.set()
+    bench.recorder.close()
+    assert disk.most == 1
+
+
+async def test_a_recording_is_saved_under_a_name_while_it_is_written(
+    bench: Bench, disk: SlowDisk
+) -> None:
+    saving = asyncio.create_task(bench.recorder.save("first flight"))
+    for frame in FRAMES[5:]:
+        bench.send([frame])
+        await asyncio.wait_for(bench.turn(), FAR_S)
+    assert frames_of(bench.recorder.folder) == FRAMES
+    assert {path.name for path in bench.recorder.folder.glob("*.tlog")} == {"first flight_01.tlog"}
+    assert not saving.done()
+    disk.may_end.set()
+    await saving
