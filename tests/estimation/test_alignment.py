@@ -7,11 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.alignment.gps_velocity import WayState, velocity_of_fix
+from gateway.estimation.alignment.heading_evidence import heading_evidence
+from gateway.estimation.alignment.review import turned
 from gateway.estimation.alignment.wahba import (
     AlignmentState,
     align_by_gravity,
     align_by_velocity,
-    alignment_std,
+    alignment_level_std,
     heading_difference,
     level_difference,
     misfit,
@@ -31,10 +33,11 @@ def feed(
     pull_mps2: float = 3.0,
     lasts_s: float = 0.0,
     fixes: int = 50,
+    drift_radps: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """Ten seconds of accelerations, seen in a frame that lies in NED by `attitude`.
 
-    Each lasts for 0.2 s, or is correlated over `lasts_s`.
+    Each lasts for 0.2 s, or is correlated over `lasts_s`. The frame drifts about north and east.
     """
     rng = np.random.default_rng(seed)
     state.pair_s = -1e9
@@ -47,7 +50,18 @@ def feed(
         accel = kept * accel + rng.normal(0.0, pull_mps2, 3) * math.sqrt(1.0 - kept * kept)
         vel = vel + 0.2 * accel
         force_n = accel - [0.0, 0.0, STANDARD_GRAVITY_MPS2]
-        force_i = force_i + 0.2 * attitude.inv().apply(force_n)
+        tilted = Rotation.from_rotvec([0.2 * k * drift_radps[0], 0.2 * k * drift_radps[1], 0.0])
+        force_i = force_i + 0.2 * attitude.inv().apply(tilted.apply(force_n))
+
+
+def heading_off(
+    state: AlignmentState, attitude: Rotation, bias_radps: float = 0.0
+) -> tuple[float, float]:
+    """Tell the error of the heading that the pairs tell, and its standard deviation, rad."""
+    q = solve_alignment(state)
+    turn_rad, std_rad = heading_evidence(state, q, bias_radps)
+    true = tuple(attitude.as_quat(scalar_first=True))
+    return heading_difference(turned(q, turn_rad), true), std_rad
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -67,11 +81,12 @@ def test_the_standard_deviations_are_honest() -> None:
         state = new_record(AlignmentState)
         feed(state, attitude, seed, 0.2)
         q = solve_alignment(state)
-        stds = alignment_std(state, misfit(state, q), 0.0)
+        level_std = alignment_level_std(state, misfit(state, q))
         true = tuple(attitude.as_quat(scalar_first=True))
         # The same vector in the body stands for the vertical of both.
-        level.append(level_difference(q, true) / stds[0])
-        heading.append(heading_difference(q, true) / stds[1])
+        level.append(level_difference(q, true) / level_std)
+        off_rad, std_rad = heading_off(state, attitude)
+        heading.append(off_rad / std_rad)
     assert 0.2 < np.sqrt(np.mean(np.square(level))) < 1.2
     assert 0.2 < np.sqrt(np.mean(np.square(heading))) < 1.2
 
@@ -87,23 +102,57 @@ def test_a_level_from_a_pull_of_any_direction_is_as_unsure_as_the_pull_is_large(
         state = new_record(AlignmentState)
         feed(state, attitude, seed, 0.2, pull_mps2=1.5, lasts_s=2.0, fixes=fixes)
         q = solve_alignment(state)
-        level_std, _ = alignment_std(state, misfit(state, q), 0.0)
+        level_std = alignment_level_std(state, misfit(state, q))
         true = tuple(attitude.as_quat(scalar_first=True))
         off.append(level_difference(q, true) / level_std)
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.3
 
 
-def test_a_doubtful_bias_makes_the_heading_doubtful_and_the_more_the_less_pulls() -> None:
-    """A frame that drifts off level lets gravity pass for a pull."""
-    found = []
-    for pull_mps2 in (3.0, 0.3):
+@pytest.mark.parametrize("noise_mps", [0.05, 0.2, 0.8])
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_alone_tells_no_heading(noise_mps: float, seed: int) -> None:
+    """The force does not share it, however long it adds up."""
+    state = new_record(AlignmentState)
+    feed(state, Rotation.identity(), seed, noise_mps, pull_mps2=0.02, fixes=300)
+    assert heading_off(state, Rotation.identity())[1] > 0.6
+
+
+@pytest.mark.parametrize("noise_mps", [0.1, 0.4, 0.8])
+def test_a_heading_told_by_little_is_as_unsure_as_the_noise_makes_it(noise_mps: float) -> None:
+    """Also that of a receiver which is worse than the weights of the pairs say."""
+    ratios = []
+    for seed in range(80):
+        attitude = Rotation.from_rotvec([0.0, 0.0, 0.1 * seed])
         state = new_record(AlignmentState)
-        feed(state, Rotation.identity(), 1, pull_mps2=pull_mps2)
-        known, doubtful = (alignment_std(state, 1.0, math.radians(b))[1] for b in (0.0, 0.6))
-        found.append(math.sqrt(doubtful**2 - known**2))
-    # Half a degree a second for ten seconds is a tilt of 1.7 deg rms, which is 0.3 m/s2.
-    assert math.radians(2.0) < found[0] < math.radians(10.0)
-    assert found[1] > 5.0 * found[0]
+        feed(state, attitude, seed, noise_mps, 4.0 * noise_mps, lasts_s=1.0, fixes=60)
+        off_rad, std_rad = heading_off(state, attitude)
+        ratios.append(off_rad / std_rad)
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.1
+    assert np.mean(np.abs(ratios) < 2.0) >= 0.93
+
+
+@pytest.mark.parametrize("pull_mps2", [0.0, 0.5])
+def test_the_noise_of_a_receiver_is_learned(pull_mps2: float) -> None:
+    """Of 0.8 m/s where 0.2 is taken for granted, standing or not."""
+    state = new_record(AlignmentState)
+    feed(state, Rotation.identity(), 1, 0.8, pull_mps2, fixes=200)
+    heading_off(state, Rotation.identity())
+    assert 0.2**2 * state.noise_excess == pytest.approx(0.8**2, rel=0.35)
+
+
+def test_a_drift_within_what_the_bias_may_be_is_no_pull() -> None:
+    """A frame that drifts off level lets gravity pass for a pull."""
+    bias_radps, ratios, naive, aware = math.radians(1.0), [], [], []
+    for seed in range(40):
+        drift = tuple(np.random.default_rng(100 + seed).normal(0.0, bias_radps, 2))
+        state = new_record(AlignmentState)
+        feed(state, Rotation.identity(), seed, 0.05, 0.5, 2.0, drift_radps=drift)
+        naive.append(heading_off(state, Rotation.identity())[0])
+        off_rad, std_rad = heading_off(state, Rotation.identity(), bias_radps)
+        aware.append(off_rad)
+        ratios.append(off_rad / std_rad)
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+    assert np.std(aware) < 0.7 * np.std(naive)
 
 
 def test_gravity_tells_the_level_alone() -> None:
@@ -113,11 +162,10 @@ def test_gravity_tells_the_level_alone() -> None:
     force = attitude.inv().apply([0.0, 0.0, -STANDARD_GRAVITY_MPS2])
     for k in range(30):
         align_by_gravity(state, 0.1 * k, tuple(force * 0.1 * k), 0.1)
-    level_std, heading_std = alignment_std(state, 1.0, 0.0)
+    level_std = alignment_level_std(state, 1.0)
     found = Rotation.from_quat(solve_alignment(state), scalar_first=True)
     np.testing.assert_allclose(found.apply(force), [0.0, 0.0, -STANDARD_GRAVITY_MPS2], atol=1e-6)
     assert level_std < 0.05
-    assert heading_std > 1.0
 
 
 @pytest.mark.parametrize(("swing_hz", "pulled"), [(1.0, False), (0.0, True)])
@@ -147,9 +195,9 @@ def test_gravity_is_found_through_any_shaking_that_gets_nowhere() -> None:
         force = vel[k] - [0.0, 0.0, STANDARD_GRAVITY_MPS2 * 0.1 * k]
         align_by_gravity(state, 0.1 * k, tuple(force), 0.09)
     q = solve_alignment(state)
-    known, _ = alignment_std(state, misfit(state, q), 0.0)
+    known = alignment_level_std(state, misfit(state, q))
     state.by_gps = 1
-    fitted, _ = alignment_std(state, misfit(state, q), 0.0)
+    fitted = alignment_level_std(state, misfit(state, q))
     off = level_difference(q, (1.0, 0.0, 0.0, 0.0))
     assert off < 2.0 * known
     assert known < 0.8 * fitted

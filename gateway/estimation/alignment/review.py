@@ -4,10 +4,12 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.heading_evidence import heading_evidence
+from gateway.estimation.alignment.pair_sums import clear_pairs
 from gateway.estimation.alignment.wahba import (
+    UNKNOWN_RAD,
     AlignmentState,
-    alignment_std,
-    clear_alignment,
+    alignment_level_std,
     heading_difference,
     level_difference,
     misfit,
@@ -20,7 +22,7 @@ from gateway.records import Quat
 
 FOUND_LEVEL_RAD: Final = 0.08
 FOUND_HEADING_RAD: Final = 0.2
-"""Up to these standard deviations an alignment is taken for the attitude."""
+"""Up to these standard deviations an alignment is taken for the attitude, or contradicts it."""
 PATIENCE_S: Final = 8.0
 """What pulls for longer is taken for gravity, where nothing else is told."""
 PULLED_MPS2: Final = 1.0
@@ -32,8 +34,6 @@ DOUBT_GRAVITY_RAD: Final = 0.6
 DOUBT_GRAVITY_S: Final = 5.0
 """The same where there is gravity alone, which manoeuvres hide."""
 DOUBT_SIGMA: Final = 4.0
-SURE_RAD: Final = 0.12
-"""An alignment's heading that is less sure than this contradicts nothing."""
 GRAVITY_PAIR_S: Final = 0.1
 GAP_S: Final = 0.5
 """A longer silence of the IMU is not integrated over."""
@@ -67,7 +67,7 @@ def lose(s: ReviewState) -> None:
     """Note that the attitude is not known; the alignment begins anew."""
     s.lost, s.lost_s, s.doubt_s = 1, 0.0, 0.0
     s.heading_known = 0
-    clear_alignment(s)
+    clear_pairs(s)
     s.pair_s = NEVER_S
 
 
@@ -94,8 +94,14 @@ def find(s: ReviewState, q_nb: Quat, enough_rad: float = FOUND_HEADING_RAD) -> Q
     s.heading_known = 1 if s.by_gps == 1 and s.heading_std < enough_rad else 0
     if s.heading_known == 1:
         return found
-    half = 0.5 * heading_difference(q_nb, found)
-    return normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found))
+    return turned(found, heading_difference(q_nb, found))
+
+
+@compiled
+def turned(q: Quat, turn_rad: float) -> Quat:
+    """Turn an attitude about down."""
+    half = 0.5 * turn_rad
+    return normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), q))
 
 
 @compiled
@@ -135,7 +141,10 @@ def is_to_be_taken(
         Whether the alignment's attitude is to take its place: see `find`.
     """
     q_ni = solve_alignment(s)
-    s.level_std, s.heading_std = alignment_std(s, misfit(s, q_ni), bias_radps)
+    s.level_std, s.heading_std = alignment_level_std(s, misfit(s, q_ni)), UNKNOWN_RAD
+    if s.by_gps == 1:
+        turn_rad, s.heading_std = heading_evidence(s, q_ni, bias_radps)
+        q_ni = turned(q_ni, turn_rad)
     write_quat(s.found_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
     if s.lost == 1:
         s.lost_s += dt
@@ -162,4 +171,4 @@ def is_contradicted(s: ReviewState, q_nb: Quat, level_told: float, heading_told:
         return False
     allowed = DOUBT_SIGMA * math.hypot(s.heading_std, heading_told)
     turned = abs(heading_difference(found, q_nb))
-    return bool(s.heading_std < SURE_RAD and turned > max(DOUBT_HEADING_RAD, allowed))
+    return bool(s.heading_std < FOUND_HEADING_RAD and turned > max(DOUBT_HEADING_RAD, allowed))

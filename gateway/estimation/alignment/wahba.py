@@ -17,6 +17,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.pair_sums import PairSums, clear_pairs, take_pair
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise, rotate_inverse
 from gateway.records import Quat, Vec3
@@ -27,16 +28,12 @@ PAIR_S: Final = 0.45
 PAIR_WINDOW_S: Final = 1.0
 """Differences of successive velocities share their noise; over this time it averages out."""
 MAX_PAIR_S: Final = 2.5
-MEMORY_S: Final = 20.0
-"""Older pairs fade: the gyroscope's frame drifts."""
 JITTER_S: Final = 0.065
 """How much the latency of a fix varies: in manoeuvres the larger part of the error."""
 GRAVITY_NOISE_MPS2: Final = 1.0
 """Acceleration that goes unseen where gravity alone is the reference."""
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 """What the gyroscope's bias may be off."""
-RAMP_SHARE: Final = 1.0 / math.sqrt(12.0)
-"""Of what a steady drift comes to, its deviation from the mean."""
 PULL_TAU_S: Final = 3.0
 SWING_TAU_S: Final = 1.8
 """Of either of two low-passes, where a hand's swings are to average out."""
@@ -57,8 +54,8 @@ ANY_HEADING_VAR: Final = 2.0
 """Mean square of the chord by which a heading that may be any turns what lies level, rad2."""
 
 
-class AlignmentState:
-    """The gyroscope's own frame, and the sums of the pairs."""
+class AlignmentState(PairSums):
+    """The gyroscope's own frame, and the pairs taken in it."""
 
     q_ib: Annotated[FloatArray, (4,)]
     """Body to the frame of the gyroscope alone."""
@@ -68,16 +65,6 @@ class AlignmentState:
     pair_force: Annotated[FloatArray, (3,)]
     by_gps: int
     """1 while the pairs are of GPS velocities, 0 of gravity alone."""
-    outer: Annotated[FloatArray, (3, 3)]
-    """Sum of the weighted products of reference in NED and force in the gyroscope's frame."""
-    information: Annotated[FloatArray, (3, 3)]
-    """Of the turn about north, east and down, 1/rad2."""
-    squares: float
-    """Half the sum of the weighted squares of both."""
-    pairs: float
-    """How many pairs the sums are made of."""
-    gathered_s: float
-    """Over which time, what has faded left out."""
     force_first_i: Annotated[FloatArray, (3,)]
     force_mean_i: Annotated[FloatArray, (3,)]
     """Low-pass of the specific force in the gyroscope's frame, and a second one of that."""
@@ -90,35 +77,10 @@ class AlignmentState:
 
 
 @compiled
-def clear_alignment(s: AlignmentState) -> None:
-    """Forget the pairs."""
-    for i in range(3):
-        for j in range(3):
-            s.outer[i, j] = s.information[i, j] = 0.0
-    s.squares = s.pairs = s.gathered_s = 0.0
-
-
-@compiled
 def carry_frame(s: AlignmentState, rate: Vec3, dt: float) -> None:
     """Turn the gyroscope's frame by one sample, rad/s without bias."""
     turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
-
-
-@compiled
-def take_pair(s: AlignmentState, force: Vec3, reference: Vec3, weight: float, dt: float) -> None:
-    """Add the mean force of an interval in the gyroscope's frame and in NED, m/s2."""
-    kept = math.exp(-dt / MEMORY_S)
-    r_sq = reference[0] ** 2 + reference[1] ** 2 + reference[2] ** 2
-    f_sq = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
-    for i in range(3):
-        for j in range(3):
-            s.outer[i, j] = kept * s.outer[i, j] + weight * reference[i] * force[j]
-            told = (r_sq if i == j else 0.0) - reference[i] * reference[j]
-            s.information[i, j] = kept * s.information[i, j] + weight * told
-    s.squares = kept * s.squares + 0.5 * weight * (r_sq + f_sq)
-    s.pairs = kept * s.pairs + 1.0
-    s.gathered_s = kept * s.gathered_s + dt
 
 
 @compiled
@@ -162,7 +124,7 @@ def align_by_velocity(
     """
     dt = valid_s - s.pair_s
     if s.by_gps == 0 or dt > MAX_PAIR_S or dt < 0.0:
-        clear_alignment(s)
+        clear_pairs(s)
         s.by_gps = 1
         begin_pair(s, valid_s, vel, force_i)
         return 0.0
@@ -208,7 +170,7 @@ def align_by_gravity(
     """
     dt = now_s - s.pair_s
     if (s.by_gps == 1 and dt > MAX_PAIR_S) or dt < 0.0 or dt > 10.0:
-        clear_alignment(s)
+        clear_pairs(s)
         s.by_gps = 0
         begin_pair(s, now_s, (0.0, 0.0, 0.0), force_i)
         return 0.0
@@ -294,50 +256,24 @@ def misfit(s: AlignmentState, q_ni: Quat) -> float:
 
 
 @compiled
-def alignment_std(s: AlignmentState, excess: float, bias_radps: float) -> tuple[float, float]:
-    """Return how well the pairs say the level and the heading.
-
-    Parameters
-    ----------
-    s : AlignmentState
-        Unchanged.
-    excess : float
-        See `misfit`.
-    bias_radps : float
-        Standard deviation of the gyroscope's bias.
-
-    Returns
-    -------
-    tuple of 2 floats
-        Standard deviations in rad.
-    """
+def alignment_level_std(s: AlignmentState, excess: float) -> float:
+    """Return how well the pairs say the level, rad; `excess` is the `misfit`."""
     J = s.information
     a, b, c = J[0, 0], J[1, 1], J[2, 2]
     d, e, f = J[0, 1], J[0, 2], J[1, 2]
-    drift = (DRIFT_RADPS * 0.5 * s.gathered_s) ** 2
     level = a * b - d * d
     if level < 1.0:
-        return (UNKNOWN_RAD, UNKNOWN_RAD)
+        return UNKNOWN_RAD
     determinant = c * level - a * f * f - b * e * e + 2.0 * d * e * f
     # What pulls one way, with no heading to say which, may be tilt: the level is as unsure as that.
     known = determinant + level / ANY_HEADING_VAR
     told = c + 1.0 / ANY_HEADING_VAR
-    level_var = ((a + b) * told - e * e - f * f) / known
-    heading_var = UNKNOWN_RAD * UNKNOWN_RAD
-    if determinant > 0.1 * level:
-        # Where the frame drifts off level, gravity seems to pull: the less there was of real pull,
-        # the further that turns the heading.
-        off_level = bias_radps * RAMP_SHARE * s.gathered_s
-        pulled = math.sqrt(level) * off_level * off_level
-        heading_var = (excess + pulled) * level / determinant + drift
-    level_var *= excess
+    variance = ((a + b) * told - e * e - f * f) / known * excess
     if s.by_gps == 0:
         # However it is shaken: over the time, the mean force is gravity but for the speed gained.
-        level_var = min(level_var, (HAND_MPS / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
-    return (
-        math.sqrt(min(level_var + drift, UNKNOWN_RAD * UNKNOWN_RAD)),
-        math.sqrt(min(heading_var, UNKNOWN_RAD * UNKNOWN_RAD)),
-    )
+        variance = min(variance, (HAND_MPS / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
+    drift = (DRIFT_RADPS * 0.5 * s.gathered_s) ** 2
+    return math.sqrt(min(variance + drift, UNKNOWN_RAD * UNKNOWN_RAD))
 
 
 @compiled

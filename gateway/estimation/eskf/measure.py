@@ -11,6 +11,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.alignment.gps_velocity import TOLD_NOISE_MPS
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
 from gateway.estimation.eskf.covariance import (
     clear,
@@ -33,6 +34,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
+from gateway.estimation.magfield import STALE_MAG_S
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -142,6 +144,20 @@ def set_wander_variance(s: EskfState, p: EskfGains, row: FloatArray) -> None:
 
 
 @compiled
+def velocity_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int) -> float:
+    """Return the noise of one component of a fix's velocity, m2/s2.
+
+    A heading that rests on nothing but these velocities turns with their errors: it counts them as
+    large as they have shown themselves. Beside a compass, which shows them too, they are as set.
+    """
+    usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
+    variance = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARE[k])
+    if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
+        variance = max(variance, TOLD_NOISE_MPS * TOLD_NOISE_MPS * s.noise_excess)
+    return variance
+
+
+@compiled
 def delay_variances(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
     """Compute the variances that the jitter of the latency adds to position and velocity."""
     v, j = s.vel_n, p.gps_jitter_sq
@@ -207,11 +223,7 @@ def update_by_fix(
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
-            noise = p.gps_velocity_var if k < 2 else p.gps_climb_var
-            noise = (
-                repeated * reported_variance(noise, row[GPS_SPEED_ACC], SPEED_SHARE[k])
-                + late_vel[k]
-            )
+            noise = repeated * velocity_variance(s, p, row, k) + late_vel[k]
             update_scalar(s, off_vel[k], noise, VELOCITY_GATE_SQ)
         if not math.isfinite(off_pos[k]):
             continue

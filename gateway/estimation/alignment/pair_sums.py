@@ -1,0 +1,80 @@
+"""What is remembered of the pairs of the alignment: weighted sums of products, which fade.
+
+A pair is the mean acceleration of an interval, gravity in, as a reference tells it in NED and as
+the accelerometer felt it in the gyroscope's own frame.
+"""
+
+import math
+from typing import Annotated, Final
+
+from gateway.compiled import compiled
+from gateway.estimation.kernel_record import FloatArray, fill
+from gateway.records import Vec3
+
+MEMORY_S: Final = 20.0
+"""Older pairs fade: the gyroscope's frame drifts."""
+
+
+class PairSums:
+    """Sums over the pairs, weighted by the inverse of their noise; times are counted from now."""
+
+    outer: Annotated[FloatArray, (3, 3)]
+    """Of the products of reference in NED and force in the gyroscope's frame."""
+    information: Annotated[FloatArray, (3, 3)]
+    """Of the turn about north, east and down, 1/rad2."""
+    squares: float
+    """Half the sum of the weighted squares of both."""
+    pairs: float
+    """How many pairs the sums are made of."""
+    gathered_s: float
+    """Over which time, what has faded left out."""
+    weight_sums: Annotated[FloatArray, (3,)]
+    """Of the weight alone, by the time, and by its square."""
+    reference_sums: Annotated[FloatArray, (4,)]
+    """Of the level reference in NED, alone and by the time."""
+    force_sums: Annotated[FloatArray, (6,)]
+    """Of the force in the gyroscope's frame, alone and by the time."""
+    force_squares: Annotated[FloatArray, (3, 3)]
+    """Of the products of the force with itself."""
+    noise_excess: float
+    """Variance of the level noise of GPS velocities over that of the weights, 1 or more; 0 while
+    nothing is known of it. Not forgotten with the pairs: it is the receiver's."""
+
+
+@compiled
+def clear_pairs(s: PairSums) -> None:
+    """Forget the pairs."""
+    for i in range(3):
+        for j in range(3):
+            s.outer[i, j] = s.information[i, j] = s.force_squares[i, j] = 0.0
+    s.squares = s.pairs = s.gathered_s = 0.0
+    fill(s.weight_sums, 0.0)
+    fill(s.reference_sums, 0.0)
+    fill(s.force_sums, 0.0)
+
+
+@compiled
+def take_pair(s: PairSums, force: Vec3, reference: Vec3, weight: float, dt: float) -> None:
+    """Add the mean force of an interval in the gyroscope's frame and in NED, m/s2."""
+    kept = math.exp(-dt / MEMORY_S)
+    r_sq = reference[0] ** 2 + reference[1] ** 2 + reference[2] ** 2
+    f_sq = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
+    for i in range(3):
+        for j in range(3):
+            s.outer[i, j] = kept * s.outer[i, j] + weight * reference[i] * force[j]
+            told = (r_sq if i == j else 0.0) - reference[i] * reference[j]
+            s.information[i, j] = kept * s.information[i, j] + weight * told
+            s.force_squares[i, j] = kept * s.force_squares[i, j] + weight * force[i] * force[j]
+    s.squares = kept * s.squares + 0.5 * weight * (r_sq + f_sq)
+    s.pairs = kept * s.pairs + 1.0
+    s.gathered_s = kept * s.gathered_s + dt
+    W, R, F = s.weight_sums, s.reference_sums, s.force_sums
+    W[2] = kept * (W[2] - 2.0 * dt * W[1] + dt * dt * W[0])
+    W[1] = kept * (W[1] - dt * W[0])
+    W[0] = kept * W[0] + weight
+    for i in range(2):
+        R[2 + i] = kept * (R[2 + i] - dt * R[i])
+        R[i] = kept * R[i] + weight * reference[i]
+    for i in range(3):
+        F[3 + i] = kept * (F[3 + i] - dt * F[i])
+        F[i] = kept * F[i] + weight * force[i]
