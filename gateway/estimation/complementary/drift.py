@@ -20,6 +20,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import (
@@ -165,13 +166,13 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         for j in range(n):
             P[j, k] -= turn[axis, 0] * P[j, 0] + turn[axis, 1] * P[j, 1] + turn[axis, 2] * P[j, 2]
         P[k, k] += walked
-    limit_variance(s, HEADING, UNKNOWN_VAR)
+    limit_variance(s.drift_cov, HEADING, UNKNOWN_VAR)
     carry_compass(s, p)
     for k in range(3):
         P[k, k] += BIAS_WALK_RAD2PS3 * s.carried_s
         P[FORCE + k, FORCE + k] += FORCE_WALK_M2PS5 * s.carried_s
-        limit_variance(s, k, p.bias_initial_radps**2)
-        limit_variance(s, FORCE + k, FORCE_BIAS_MPS2**2)
+        limit_variance(s.drift_cov, k, p.bias_initial_radps**2)
+        limit_variance(s.drift_cov, FORCE + k, FORCE_BIAS_MPS2**2)
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
     s.carried_s = s.carried_rad = 0.0
 
@@ -184,7 +185,7 @@ def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
     still = variance - iron
     faded = (s.carried_s / p.tau_heading_s * still + s.carried_rad * iron) / variance
     kept = math.exp(-faded)
-    scale_state(s, COMPASS, kept)
+    scale_state(s.drift_cov, COMPASS, kept)
     s.drift_cov[COMPASS, COMPASS] += (1.0 - kept * kept) * variance
     s.compass_rad *= kept
 
@@ -203,22 +204,6 @@ def widen_compass(s: ComplementaryState, variance: float) -> None:
         if excess < 0.0:
             reduce_covariance(s, excess)
     s.compass_var = variance
-
-
-@compiled
-def scale_state(s: ComplementaryState, k: int, share: float) -> None:
-    """Scale a row and a column of the covariance."""
-    for j in range(STATES):
-        s.drift_cov[k, j] *= share
-        s.drift_cov[j, k] *= share
-
-
-@compiled
-def limit_variance(s: ComplementaryState, k: int, most: float) -> None:
-    """Scale a row and a column so that the variance is no larger."""
-    variance = s.drift_cov[k, k]
-    if variance > most:
-        scale_state(s, k, math.sqrt(most / variance))
 
 
 @compiled

@@ -27,6 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
+from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
@@ -113,21 +114,6 @@ def symmetrise(P: FloatArray) -> None:
     for i in range(STATES):
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
-
-
-@compiled
-def scale_state(P: FloatArray, k: int, share: float) -> None:
-    """Scale a row and a column."""
-    for j in range(STATES):
-        P[k, j] *= share
-        P[j, k] *= share
-
-
-@compiled
-def limit_variance(P: FloatArray, k: int, most: float) -> None:
-    """Scale a row and a column so that the variance is no larger: no correlation beyond one."""
-    if P[k, k] > most:
-        scale_state(P, k, math.sqrt(most / P[k, k]))
 
 
 @compiled
