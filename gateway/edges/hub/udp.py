@@ -204,10 +204,10 @@ class DatagramClient(Client):
 
     def _on_readable(self, sock: socket.socket) -> None:
         now_us = self.context.now_us()
-        budget = READ_BUDGET if now_us - self._woken_us <= ALONE_US else 1
+        is_alone = now_us - self._woken_us > ALONE_US
         self._woken_us = now_us
-        size, most = 0, self.context.read_bytes
-        for _ in range(budget):
+        size, most = 0, 0 if is_alone else self.context.read_bytes
+        for _ in range(READ_BUDGET):
             try:
                 data = sock.recv(MAX_DATAGRAM)
             except BlockingIOError:
