@@ -245,7 +245,7 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
         raise ConfigError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # Also endless numbers, and endless brackets.
         raise ConfigError(f"{path}: is not valid TOML: {error}") from error
     errors = [f"{path}: {error}" for error in _check(table, kind, "")]
     if errors:
@@ -281,9 +281,9 @@ def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Itera
     fields = {field.name: field for field in fields_of(kind)}
     sound = {}
     for key, value in table.items():
-        errors = list(_check_key(key, value, fields, prefix))
-        yield from errors
-        if not errors:
+        if errors := list(_check_key(key, value, fields, prefix)):
+            yield from errors
+        else:
             sound[key] = value
     # Each of these is valid by itself; the remaining rules are between them and within texts.
     try:
@@ -294,8 +294,7 @@ def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Itera
 
 
 def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -> Iterator[str]:
-    path = f"{prefix}{key}"
-    field = fields.get(key)
+    path, field = f"{prefix}{key}", fields.get(key)
     if field is None:
         yield _unknown_key(path, key, fields)
     elif field.section and isinstance(value, dict):
@@ -306,12 +305,14 @@ def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -
         except msgspec.ValidationError as error:
             yield _wrong_value(path, value, field, error)
         else:
-            yield from _check_home(path, value, field)
+            yield from _check_path(path, value, field)
 
 
-def _check_home(path: str, value: Any, field: Field) -> Iterator[str]:
-    """Check that `~` or `~user` at the start of a path is a home folder."""
-    if field.is_path:
+def _check_path(path: str, value: Any, field: Field) -> Iterator[str]:
+    """Check that a path may exist, and `~` or `~user` at its start is a home folder."""
+    if field.is_path and "\0" in value:
+        yield f"{path} = {value!r}: no path has a zero byte"
+    elif field.is_path:
         try:
             Path(value).expanduser()
         except RuntimeError:
@@ -327,8 +328,7 @@ def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
 
 def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationError) -> str:
     text = f"{path} = {tomlkit.item(value).as_string()}: {_uncapital(str(error))}"
-    hints = [_choice_hint(value, field), _uncapital(field.meaning)]
-    hint = "; ".join(filter(None, hints))
+    hint = "; ".join(filter(None, (_choice_hint(value, field), _uncapital(field.meaning))))
     return f"{text} ({hint})" if hint else text
 
 

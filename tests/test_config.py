@@ -85,6 +85,9 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
         ('[vehicle]\ntype = "ufo"', 'vehicle.type = "ufo": invalid enum value'),
         ('[hub]\nendpoints = ["udp:"]', "hub: endpoint 'udp:'"),
         ("[serial\n", "is not valid TOML"),
+        (f"[serial]\nbaud = {'9' * 5000}", "is not valid TOML: Exceeds the limit"),
+        (f"[serial]\nbaud = {'[' * 5000}", "is not valid TOML: maximum recursion depth"),
+        (r'aircraft_folder = "/tmp/\u0000"', r"aircraft_folder = '/tmp/\x00': no path"),
     ],
 )
 def test_refusals_name_file_key_value_and_what_is_allowed(
