@@ -15,7 +15,6 @@ from gateway.estimation.eskf.covariance import (
     propagate,
     update_scalar,
 )
-from gateway.estimation.eskf.eskf_kernels import collect_roughness
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -30,6 +29,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
+from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings

@@ -36,6 +36,7 @@ from gateway.estimation.eskf.start import (
 )
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
 from gateway.estimation.filtering.height_intake import is_height_told
+from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.filtering.sample_clock import is_silent, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -74,8 +75,6 @@ PSEUDO_S: Final = 0.1
 """Between measurements that stand in for a sensor."""
 COMPASS_S: Final = 0.045
 """Between compass measurements; its slow error makes more of them useless."""
-ROUGH_LIMIT: Final = 1e4
-"""A larger change is a fault, and NaN compares false."""
 PUSH_MPS2: Final = 0.3
 """A steady level force beyond this, and beyond three standard deviations of tilt, is no rest."""
 PUSHED_MPS: Final = 40.0
@@ -139,28 +138,6 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
         accel = force_instead(s, level_force(s))
     integrate(s, gyro, accel, dt)
     return sound_gyro and sound_accel
-
-
-@compiled
-def collect_roughness(
-    s: EskfState, gyro: Vec3, accel: Vec3, gyro_before: Vec3, accel_before: Vec3, dt: float
-) -> None:
-    """Measure the noise by how the changes from sample to sample change: motion goes on, noise not.
-
-    What the sum over a steady change is late by, the next change takes back: that is no noise.
-    """
-    turn, pull = 0.0, 0.0
-    for k in range(3):
-        turned, pulled = gyro[k] - gyro_before[k], accel[k] - accel_before[k]
-        turn += (turned - s.gyro_change[k]) ** 2
-        pull += (pulled - s.accel_change[k]) ** 2
-        s.gyro_change[k] = turned if abs(turned) < ROUGH_LIMIT else 0.0
-        s.accel_change[k] = pulled if abs(pulled) < ROUGH_LIMIT else 0.0
-    # The noise of three samples, the middle one twice, of three axes.
-    share = dt * dt / 18.0
-    if turn < ROUGH_LIMIT and pull < ROUGH_LIMIT:
-        s.rough_gyro += share * turn
-        s.rough_accel += share * pull
 
 
 @compiled

@@ -47,14 +47,6 @@ class EskfState(FilterState):
     pending_force_n: Annotated[FloatArray, (3,)]
     pending_rad: float
     """How far the aircraft turned in that time."""
-    gyro_change: Annotated[FloatArray, (3,)]
-    """How the newest angular rate differs from the one before, rad/s."""
-    accel_change: Annotated[FloatArray, (3,)]
-    """The same of the specific force, m/s2."""
-    rough_gyro: float
-    """Variance of the angle over that time if what is uneven in the rate were white noise."""
-    rough_accel: float
-    """The same of the velocity."""
     pending_accel_sq: float
     """Integral of the squared acceleration over that time."""
     pending_turn: Annotated[FloatArray, (3, 3)]

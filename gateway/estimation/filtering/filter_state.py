@@ -6,6 +6,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
+from gateway.estimation.filtering.roughness import RoughnessState
 from gateway.estimation.flagbits import (
     AT_REST,
     DEGRADED,
@@ -50,7 +51,9 @@ def filter_gains(
     }
 
 
-class FilterState(HealthState, RestState, FieldState, LatencyState, ReviewState, WayState):
+class FilterState(
+    HealthState, RoughnessState, RestState, FieldState, LatencyState, ReviewState, WayState
+):
     """The part of a filter's state that says nothing of its model."""
 
     started: int
