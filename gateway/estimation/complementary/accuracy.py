@@ -61,10 +61,12 @@ def watch_accuracy(s: ComplementaryState, p: ComplementaryGains) -> None:
         kept = math.exp(-dt / REST_DECAY_S)
         s.fix_speed_mps *= kept
         s.pushed_speed_mps *= kept
+        s.pushed_rough_sq *= kept * kept
     else:
         s.pushed_speed_mps += acceleration_std(s, dt) * dt
+        s.pushed_rough_sq += s.force_density * dt
     write_vec(s.accuracy_force_i, as_vec(s.integrals))
-    s.pushed_place_m += s.pushed_speed_mps * dt
+    s.pushed_place_m += pushed_speed(s) * dt
     tell_place(s)
 
 
@@ -73,7 +75,13 @@ def tell_place(s: ComplementaryState) -> None:
     """Put the accuracy of place and speed together."""
     gone_m = s.fix_speed_mps * (s.time_s - s.fix_s)
     s.told_place_m = math.sqrt(s.fix_place_m**2 + gone_m**2 + s.pushed_place_m**2)
-    s.told_speed_mps = math.hypot(s.fix_speed_mps, s.pushed_speed_mps)
+    s.told_speed_mps = math.hypot(s.fix_speed_mps, pushed_speed(s))
+
+
+@compiled
+def pushed_speed(s: ComplementaryState) -> float:
+    """Return the error of the speed since the last fix, by errors that last and by noise, m/s."""
+    return math.sqrt(s.pushed_speed_mps**2 + s.pushed_rough_sq)
 
 
 @compiled
@@ -130,5 +138,5 @@ def settle_place(
     late_m = JITTER_S * math.hypot(s.vel_n[0], s.vel_n[1])
     s.fix_place_m = s.told_place_m + share * (math.hypot(fix_m, late_m) - s.told_place_m)
     s.fix_speed_mps = math.hypot((1.0 - share) * s.told_speed_mps, share * noise_mps)
-    s.pushed_place_m = s.pushed_speed_mps = 0.0
+    s.pushed_place_m = s.pushed_speed_mps = s.pushed_rough_sq = 0.0
     s.told_place_m, s.told_speed_mps = s.fix_place_m, s.fix_speed_mps

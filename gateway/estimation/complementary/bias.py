@@ -14,6 +14,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.drift import (
     BIAS_WALK_RAD2PS3,
+    SCALE,
     UNCLIPPED,
     carry_drift,
     cleared_row,
@@ -108,4 +109,4 @@ def correct_bias(
     expected = row[0] * s.bias_b[0] + row[1] * s.bias_b[1] + row[2] * s.bias_b[2]
     innovation = max(-CLIP_RADPS, min(CLIP_RADPS, measured - expected))
     write_vec(cleared_row(s), row)
-    correct_drift(s, p, innovation, variance, UNCLIPPED)
+    correct_drift(s, p, innovation, variance, UNCLIPPED, SCALE)

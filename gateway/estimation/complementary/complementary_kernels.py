@@ -36,6 +36,7 @@ from gateway.estimation.complementary.reorientation import (
     watch_gravity,
 )
 from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown, take_gravity
+from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.filtering.sample_clock import begin_clock, is_silent, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -138,7 +139,10 @@ def take_imu(
         bridge_gap(s, p, dt)
         write_attitude_std(s)
         return
+    gyro_before, accel_before = as_vec(s.gyro_held), as_vec(s.accel_held)
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
+    if sound_gyro and sound_accel:
+        collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
     misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):

@@ -10,7 +10,7 @@ from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
-STATES: Final = 10
+STATES: Final = 13
 """Of the Kalman filter in `drift`."""
 
 
@@ -146,6 +146,8 @@ class ComplementaryState(FilterState):
     """All that the complementary estimator remembers."""
 
     bias_b: Annotated[FloatArray, (3,)]
+    scale_b: Annotated[FloatArray, (3,)]
+    """Share by which each axis of the gyroscope reads too much."""
     q_ei: Annotated[FloatArray, (4,)]
     """The gyroscope's frame to a level frame of free heading."""
     q_eb: Annotated[FloatArray, (4,)]
@@ -204,9 +206,15 @@ class ComplementaryState(FilterState):
     """Scratch."""
     carried_turn_eb: Annotated[FloatArray, (3, 3)]
     """Integral of `R_eb` since the covariance was carried on, s."""
+    carried_scaled_eb: Annotated[FloatArray, (3, 3)]
+    """The same of `R_eb diag(rate_b)`, rad."""
     carried_s: float
     carried_rad: float
     """Time since, and angle that the aircraft has turned by."""
+    rate_density: float
+    """Density of the noise of the angular rate, as rough as it was of late, rad2/s."""
+    force_density: float
+    """The same of the specific force, m2/s3."""
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float
@@ -229,6 +237,8 @@ class ComplementaryState(FilterState):
     pushed_place_m: float
     pushed_speed_mps: float
     """What the error of the acceleration has added since."""
+    pushed_rough_sq: float
+    """Square of the speed that the noise of the specific force has added since, m2/s2."""
     accuracy_s: float
     """When all that was carried on last."""
     accuracy_force_i: Annotated[FloatArray, (3,)]

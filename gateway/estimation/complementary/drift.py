@@ -1,13 +1,17 @@
-"""Errors of attitude and sensors: a Kalman filter of ten states.
+"""Errors of attitude and sensors: a Kalman filter of thirteen states.
 
 The gyroscope bias in body FRD, the heading, the slow error of the compass (iron, and the place),
-the tilt of the level frame, and the accelerometer bias in body FRD. The compass is wrong by some
-degrees, but that error changes slowly: a heading that drifts away from the compass reveals the
-gyroscope bias long before the compass corrects the heading, and a heading from GPS reveals the
-error of the compass.
+the tilt of the level frame, the accelerometer bias in body FRD, and the scale of each axis of the
+gyroscope. The compass is wrong by some degrees, but that error changes slowly: a heading that
+drifts away from the compass reveals the gyroscope bias long before the compass corrects the
+heading, and a heading from GPS reveals the error of the compass.
 
-While the low-pass of gravity levels the attitude, neither the tilt nor the accelerometer bias is
-estimated; `bias` then corrects the gyroscope bias by what the low-pass corrects.
+Only GPS reveals the scale: iron turns the compass in step with each turn, as a wrong scale would.
+To all other measurements it is only considered, the Schmidt-Kalman update: its gain is zero, its
+uncertainty still counts.
+
+While the low-pass of gravity levels the attitude, neither the tilt nor the accelerometer bias nor
+the scale is estimated; `bias` then corrects the gyroscope bias by what the low-pass corrects.
 """
 
 import math
@@ -39,17 +43,27 @@ TILT: Final = 5
 """Turn of the level frame about its own first two axes."""
 FORCE: Final = 7
 """The accelerometer's bias."""
+SCALE: Final = 10
+"""The gyroscope's; the last, so that it can be left out."""
 
 BIAS_WALK_RAD2PS3: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
 """A drift of 0.1 deg/s in 100 s."""
 ATTITUDE_WALK_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2
 """Of the gyroscope's noise."""
 TURN_WALK_RAD: Final = 1e-5
-"""Variance of the attitude after a turn of 1 rad, by scale and axes of the gyroscope."""
+"""Variance of the attitude after a turn of 1 rad, by the axes of the gyroscope."""
+SCALE_SHARE: Final = 0.01
+SCALE_LIMIT: Final = 0.1
+"""The scale of a gyroscope is off by this to begin with, a third of an MPU6050's tolerance, and at
+most."""
 FORCE_BIAS_MPS2: Final = 0.1
 FORCE_BIAS_LIMIT_MPS2: Final = 0.5
 FORCE_WALK_M2PS5: Final = 0.002**2
 """Bias of the accelerometer at the start, at most, and its random walk."""
+ROUGH_SHARE: Final = 0.5
+"""Of what is uneven in the angular rate: an engine's shaking to and fro adds up less than noise."""
+ROUGH_TAU_S: Final = 2.0
+"""The roughness of the sensors is averaged over this time."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
 UNKNOWN_VAR: Final = 10.0
@@ -64,6 +78,7 @@ def begin_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
     for k in range(3):
         s.drift_cov[k, k] = p.bias_initial_radps**2
         s.drift_cov[FORCE + k, FORCE + k] = FORCE_BIAS_MPS2**2
+    forget_scale(s)
     forget_heading(s, p)
     forget_compass(s, p)
 
@@ -91,10 +106,19 @@ def forget_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 
 @compiled
+def forget_scale(s: ComplementaryState) -> None:
+    """Know nothing of the gyroscope's scale."""
+    for k in range(3):
+        s.scale_b[k] = 0.0
+        begin_state(s, SCALE + k, SCALE_SHARE**2)
+
+
+@compiled
 def doubt_sensors(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Doubt what gyroscope and compass have shown by an attitude that was wrong."""
     carry_drift(s, p)
     raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
+    forget_scale(s)
     forget_compass(s, p)
 
 
@@ -128,22 +152,25 @@ def end_level(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 @compiled
 def states_in_use(s: ComplementaryState) -> int:
-    """Return how many states there are: without GPS, neither tilt nor accelerometer."""
+    """Return how many states there are: without GPS, neither tilt nor accelerometer nor scale."""
     return STATES if s.level_by_gps == 1 else TILT
 
 
 @compiled
 def note_turn(s: ComplementaryState, dt: float) -> None:
     """Note how a bias turns the attitude in one sample, and how far the aircraft turned."""
-    q, turn = as_quat(s.q_eb), s.carried_turn_eb
+    q, turn, scaled = as_quat(s.q_eb), s.carried_turn_eb, s.carried_scaled_eb
     down = rotate_inverse(q, (0.0, 0.0, dt))
     for k in range(3):
         turn[2, k] += down[k]
+        scaled[2, k] += down[k] * s.rate_b[k]
     if s.level_by_gps == 1:
         first, second = rotate_inverse(q, (dt, 0.0, 0.0)), rotate_inverse(q, (0.0, dt, 0.0))
         for k in range(3):
             turn[0, k] += first[k]
             turn[1, k] += second[k]
+            scaled[0, k] += first[k] * s.rate_b[k]
+            scaled[1, k] += second[k] * s.rate_b[k]
     wx, wy, wz = s.rate_b[0], s.rate_b[1], s.rate_b[2]
     s.carried_s += dt
     s.carried_rad += math.sqrt(wx * wx + wy * wy + wz * wz) * dt
@@ -154,17 +181,21 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Carry the covariance on to now."""
     if s.carried_s == 0.0:
         return
-    P, turn = s.drift_cov, s.carried_turn_eb
+    P, turn, scaled = s.drift_cov, s.carried_turn_eb, s.carried_scaled_eb
     first, n = 0 if s.level_by_gps == 1 else 2, states_in_use(s)
     walked = ATTITUDE_WALK_RAD2PS * s.carried_s + TURN_WALK_RAD * s.carried_rad
+    walked += ROUGH_SHARE * s.rough_gyro
+    note_roughness(s)
     for axis in range(first, 3):
         k = HEADING if axis == 2 else TILT + axis
-        for j in range(n):
-            P[k, j] -= turn[axis, 0] * P[0, j] + turn[axis, 1] * P[1, j] + turn[axis, 2] * P[2, j]
+        for i in range(3):
+            for j in range(n):
+                P[k, j] -= turn[axis, i] * P[i, j] + scaled[axis, i] * P[SCALE + i, j]
     for axis in range(first, 3):
         k = HEADING if axis == 2 else TILT + axis
-        for j in range(n):
-            P[j, k] -= turn[axis, 0] * P[j, 0] + turn[axis, 1] * P[j, 1] + turn[axis, 2] * P[j, 2]
+        for i in range(3):
+            for j in range(n):
+                P[j, k] -= turn[axis, i] * P[j, i] + scaled[axis, i] * P[j, SCALE + i]
         P[k, k] += walked
     limit_variance(s.drift_cov, HEADING, UNKNOWN_VAR)
     carry_compass(s, p)
@@ -174,7 +205,17 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         limit_variance(s.drift_cov, k, p.bias_initial_radps**2)
         limit_variance(s.drift_cov, FORCE + k, FORCE_BIAS_MPS2**2)
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
+        scaled[0, k] = scaled[1, k] = scaled[2, k] = 0.0
     s.carried_s = s.carried_rad = 0.0
+
+
+@compiled
+def note_roughness(s: ComplementaryState) -> None:
+    """Average the noise of the sensors, of which the covariance has been told."""
+    share = min(s.carried_s / ROUGH_TAU_S, 1.0)
+    s.rate_density += share * (ROUGH_SHARE * s.rough_gyro / s.carried_s - s.rate_density)
+    s.force_density += share * (s.rough_accel / s.carried_s - s.force_density)
+    s.rough_gyro = s.rough_accel = 0.0
 
 
 @compiled
@@ -202,7 +243,7 @@ def widen_compass(s: ComplementaryState, variance: float) -> None:
         expected_variance(s)
         excess = s.drift_cov[COMPASS, COMPASS] - 1.0 / (1.0 / s.compass_var - 1.0 / variance)
         if excess < 0.0:
-            reduce_covariance(s, excess)
+            reduce_covariance(s, excess, SCALE)
     s.compass_var = variance
 
 
@@ -221,6 +262,7 @@ def correct_drift(
     innovation: float,
     variance: float,
     clip: float,
+    count: int,
 ) -> None:
     """Update the states by one scalar measurement.
 
@@ -237,13 +279,15 @@ def correct_drift(
         Of the measurement.
     clip : float
         An innovation counts up to so many of its standard deviations.
+    count : int
+        The first so many states are corrected, `SCALE` or `STATES`; what follows is considered.
     """
     if not math.isfinite(innovation):
         return
     spread = variance + expected_variance(s)
-    reduce_covariance(s, spread)
+    reduce_covariance(s, spread, count)
     most = clip * math.sqrt(spread)
-    apply_gain(s, p, max(-most, min(most, innovation)) / spread)
+    apply_gain(s, p, max(-most, min(most, innovation)) / spread, count)
 
 
 @compiled
@@ -263,20 +307,23 @@ def expected_variance(s: ComplementaryState) -> float:
 
 
 @compiled
-def reduce_covariance(s: ComplementaryState, spread: float) -> None:
-    """Reduce the covariance after a measurement whose innovation has the variance `spread`."""
+def reduce_covariance(s: ComplementaryState, spread: float, count: int) -> None:
+    """Reduce the covariance after a measurement whose innovation has the variance `spread`.
+
+    That of the states from `count` on with one another stays.
+    """
     P, gain, n = s.drift_cov, s.drift_gain, states_in_use(s)
     for k in range(n):
         share = gain[k] / spread
-        for j in range(k + 1):
+        for j in range(min(k + 1, count)):
             P[k, j] -= share * gain[j]
             P[j, k] = P[k, j]
         P[k, k] = max(P[k, k], 0.0)
 
 
 @compiled
-def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float) -> None:
-    """Correct the states by a multiple of `drift_gain`."""
+def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float, count: int) -> None:
+    """Correct the first `count` states by a multiple of `drift_gain`."""
     gain, limit = s.drift_gain, p.bias_limit_radps
     for k in range(3):
         s.bias_b[k] = max(-limit, min(limit, s.bias_b[k] + gain[k] * share))
@@ -287,6 +334,9 @@ def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float) -> No
     for k in range(3):
         force = s.accel_bias_b[k] + gain[FORCE + k] * share
         s.accel_bias_b[k] = max(-FORCE_BIAS_LIMIT_MPS2, min(FORCE_BIAS_LIMIT_MPS2, force))
+        if count == STATES:
+            scale = s.scale_b[k] + gain[SCALE + k] * share
+            s.scale_b[k] = max(-SCALE_LIMIT, min(SCALE_LIMIT, scale))
     turn = from_rotation_vector((gain[TILT] * share, gain[TILT + 1] * share, 0.0))
     write_quat(s.q_ei, normalise(multiply(turn, as_quat(s.q_ei))))
 

@@ -18,6 +18,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.drift import (
     COMPASS,
     HEADING,
+    SCALE,
     UNCLIPPED,
     carry_drift,
     cleared_row,
@@ -87,4 +88,4 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
-    correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED)
+    correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED, SCALE)

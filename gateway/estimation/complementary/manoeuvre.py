@@ -13,6 +13,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.wahba import PAIR_WINDOW_S
 from gateway.estimation.complementary.complementary_state import (
+    STATES,
     ComplementaryGains,
     ComplementaryState,
 )
@@ -111,7 +112,7 @@ def match_variance(s: ComplementaryState, force_e: Vec3, noise_mps: float) -> fl
 
     In a manoeuvre it includes the jitter of the latency.
     """
-    steady = FORCE_NOISE_MPS2 * FORCE_NOISE_MPS2
+    steady = FORCE_NOISE_MPS2 * FORCE_NOISE_MPS2 + s.force_density
     if s.level_by_gps == 0:
         steady += (LEVEL_STD_RAD * STANDARD_GRAVITY_MPS2) ** 2
     if s.at_rest == 1:
@@ -151,7 +152,7 @@ def match_force(
     accel_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel_n)
     gravity = STANDARD_GRAVITY_MPS2 if axis == 2 else 0.0
     write_force_row(s, axis, f)
-    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA)
+    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA, STATES)
 
 
 @compiled

@@ -64,7 +64,12 @@ def cutoff_radps(tau_s: float) -> float:
 @compiled
 def strapdown(s: ComplementaryState, gyro: Vec3, dt: float) -> None:
     """Integrate the angular rate: eq. 13 with a rotation vector."""
-    rate = (gyro[0] - s.bias_b[0], gyro[1] - s.bias_b[1], gyro[2] - s.bias_b[2])
+    b, e = s.bias_b, s.scale_b
+    rate = (
+        (1.0 - e[0]) * (gyro[0] - b[0]),
+        (1.0 - e[1]) * (gyro[1] - b[1]),
+        (1.0 - e[2]) * (gyro[2] - b[2]),
+    )
     write_vec(s.rate_b, rate)
     turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))

@@ -66,7 +66,8 @@ def level_drift_sq(s: ComplementaryState) -> float:
     """Return the variance by which gravity's low-pass falls behind, about one axis, rad2."""
     tau = s.gravity_tau_s
     lag = bias_std(s) * tau
-    return lag * lag + (ATTITUDE_WALK_RAD2PS + TURN_WALK_RAD * s.unaided_radps) * tau
+    walk = ATTITUDE_WALK_RAD2PS + TURN_WALK_RAD * s.unaided_radps + s.rate_density
+    return lag * lag + walk * tau
 
 
 @compiled
@@ -87,5 +88,7 @@ def unaided_pull_sq(s: ComplementaryState, drift_sq: float, dt: float) -> float:
 @compiled
 def unaided_level_std(s: ComplementaryState) -> float:
     """Return how far the low-pass of gravity is off upright, about one axis, rad."""
-    force_sq = s.drift_cov[FORCE, FORCE] / STANDARD_GRAVITY_MPS2**2
+    # A Butterworth low-pass lets white noise through as `exp(-t / tau)` does.
+    rough_sq = 0.5 * s.force_density / s.gravity_tau_s
+    force_sq = (s.drift_cov[FORCE, FORCE] + rough_sq) / STANDARD_GRAVITY_MPS2**2
     return math.sqrt(force_sq + level_drift_sq(s) + s.unaided_level_sq)
