@@ -8,6 +8,7 @@ import pytest
 
 from gateway.estimation.columns import (
     ACCEL,
+    CLIPPED,
     GPS_ALT,
     GPS_COLUMNS,
     GPS_LAT,
@@ -17,6 +18,8 @@ from gateway.estimation.columns import (
     MAG,
     NAV_ALT,
     NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
     NAV_QUAT,
     NAV_VEL,
 )
@@ -26,7 +29,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
-from tools.flights import Flight, simulated_flight
+from tools.flights import Flight, north_east_m, simulated_flight
 from tools.score_estimators import attitude_scores
 
 ESTIMATORS = ("complementary", "eskf")
@@ -189,6 +192,25 @@ def test_a_clock_that_leaps_ahead_is_a_silence(
     scores = attitude_scores(late, out[:, :4])
     assert max(scores["heading"], scores["inclination"]) < 3.0
     assert np.nanmax(np.abs(out[:, NAV_VEL : NAV_VEL + 3])) < 100.0
+
+
+@pytest.mark.parametrize(("name", "place_m"), [("complementary", 25.0), ("eskf", 10.0)])
+def test_blows_beyond_the_range_of_the_accelerometer_are_got_over(
+    flight: Flight, name: str, place_m: float
+) -> None:
+    """Some 40 ms long each, in either direction of each axis: what it reads is not what it was."""
+    log, rng = part(flight, -1.0, 300.0), np.random.default_rng(11)
+    for begin in np.flatnonzero(rng.random(len(log.imu)) < 0.003):
+        blow = slice(begin, begin + 4)
+        shape = log.imu[blow, ACCEL : ACCEL + 3].shape
+        log.imu[blow, ACCEL : ACCEL + 3] = rng.choice([-156.9, 156.9], shape)
+        log.imu[blow, CLIPPED] = 1.0
+    out = run(flight, name, log)
+    off_m = north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON]) - flight.pos_ne_m
+    late = log.imu_time_us > 60_000_000
+    assert np.percentile(np.linalg.norm(off_m[late], axis=1), 95) < place_m
+    scores = attitude_scores(replace(flight, counts=late), out[:, :4])
+    assert max(scores["heading"], scores["inclination"]) < 3.0
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

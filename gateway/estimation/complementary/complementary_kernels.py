@@ -22,6 +22,7 @@ from gateway.estimation.complementary.drift import (
     doubt_sensors,
     end_level,
     note_turn,
+    raise_attitude_variance,
     raise_bias_variance,
 )
 from gateway.estimation.complementary.heading import is_heading_good, take_mag
@@ -143,6 +144,8 @@ def take_imu(
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
+    if row[CLIPPED] != 0.0:
+        doubt_clipped(s, dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
     misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
@@ -195,6 +198,16 @@ def advance(
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
     watch_accuracy(s, p)
+
+
+@compiled
+def doubt_clipped(s: ComplementaryState, dt: float) -> None:
+    """Doubt attitude and velocity where a sensor is at its end: beyond may be as much again."""
+    gyro, accel = as_vec(s.gyro_held), as_vec(s.accel_held)
+    turned = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2])
+    pulled = math.sqrt(accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2])
+    raise_attitude_variance(s, turned * dt)
+    s.clipped_mps += pulled * dt
 
 
 @compiled

@@ -129,6 +129,7 @@ def take_gps(s: ComplementaryState, p: ComplementaryGains, time_us: int, row: Fl
         return
     settle_place(s, p, row, noise_mps)
     accept_fix(s)
+    s.clipped_mps = 0.0
     if is_sound(vel, FASTEST_MPS) and s.lost == 0:
         at_s = look_back(s, at_s)
         interval = take_fix_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)

@@ -103,10 +103,10 @@ def is_plausible(
     """Judge a fix by its distance from dead reckoning, the wider the longer that has run."""
     age = min(s.time_s - s.fix_s, 120.0)
     h_acc = row[GPS_H_ACC]
-    allowed_m = p.gps_gate_m + 0.5 * DRIFT_MPS2 * age * age
+    allowed_m = p.gps_gate_m + (0.5 * DRIFT_MPS2 * age + s.clipped_mps) * age
     if math.isfinite(h_acc):
         allowed_m += 3.0 * min(h_acc, BLUNDER_H_ACC_M)
-    return off_m < allowed_m and off_mps < p.gps_gate_mps + DRIFT_MPS2 * age
+    return off_m < allowed_m and off_mps < p.gps_gate_mps + DRIFT_MPS2 * age + s.clipped_mps
 
 
 @compiled

@@ -107,6 +107,8 @@ def take_imu(
         bridge_gap(s, p, dt)
         return
     sound = move(s, gyro, accel, row[CLIPPED], dt)
+    if row[CLIPPED] != 0.0:
+        doubt_clipped(s, dt)
     if sound:
         check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
@@ -138,6 +140,16 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
         accel = force_instead(s, level_force(s))
     integrate(s, gyro, accel, dt)
     return sound_gyro and sound_accel
+
+
+@compiled
+def doubt_clipped(s: EskfState, dt: float) -> None:
+    """Add noise where a sensor was at the end of its range: beyond it may be as much again."""
+    gyro, accel = as_vec(s.gyro_held), as_vec(s.accel_held)
+    turned_sq = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
+    pulled_sq = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
+    s.clipped_rad2 += dt * dt * turned_sq
+    s.clipped_m2ps2 += dt * dt * pulled_sq
 
 
 @compiled
