@@ -204,6 +204,22 @@ def check_sensors(
 
 
 @compiled
+def clipped_squares(s: HealthState) -> tuple[float, float]:
+    """Return squares of what a sensor at the end of its range may leave out: as much as it tells.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Of the angular rate, (rad/s)2, and of the specific force, (m/s2)2.
+    """
+    gyro, accel = s.gyro_held, s.accel_held
+    return (
+        gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2],
+        accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2],
+    )
+
+
+@compiled
 def rate_instead(s: HealthState, bias: Vec3) -> Vec3:
     """Return the rate for a sample without a good one: the last for a moment, then no turn."""
     return as_vec(s.gyro_held) if s.missing_gyro_s < HOLD_S else bias

@@ -55,6 +55,7 @@ from gateway.estimation.magfield import is_field_told
 from gateway.estimation.rest import doubt_rest_bias, watch_rest
 from gateway.estimation.sensor_faults import (
     check_sensors,
+    clipped_squares,
     force_instead,
     is_start,
     rate_instead,
@@ -202,12 +203,10 @@ def advance(
 
 @compiled
 def doubt_clipped(s: ComplementaryState, dt: float) -> None:
-    """Doubt attitude and velocity where a sensor is at its end: beyond may be as much again."""
-    gyro, accel = as_vec(s.gyro_held), as_vec(s.accel_held)
-    turned = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2])
-    pulled = math.sqrt(accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2])
-    raise_attitude_variance(s, turned * dt)
-    s.clipped_mps += pulled * dt
+    """Doubt attitude and velocity where a sensor was at the end of its range."""
+    turned_sq, pulled_sq = clipped_squares(s)
+    raise_attitude_variance(s, math.sqrt(turned_sq) * dt)
+    s.clipped_mps += math.sqrt(pulled_sq) * dt
 
 
 @compiled

@@ -58,7 +58,12 @@ from gateway.estimation.magfield import (
     take_field,
 )
 from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, watch_rest
-from gateway.estimation.sensor_faults import check_sensors, force_instead, rate_instead
+from gateway.estimation.sensor_faults import (
+    check_sensors,
+    clipped_squares,
+    force_instead,
+    rate_instead,
+)
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
@@ -144,10 +149,8 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
 
 @compiled
 def doubt_clipped(s: EskfState, dt: float) -> None:
-    """Add noise where a sensor was at the end of its range: beyond it may be as much again."""
-    gyro, accel = as_vec(s.gyro_held), as_vec(s.accel_held)
-    turned_sq = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
-    pulled_sq = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
+    """Add noise where a sensor was at the end of its range."""
+    turned_sq, pulled_sq = clipped_squares(s)
     s.clipped_rad2 += dt * dt * turned_sq
     s.clipped_m2ps2 += dt * dt * pulled_sq
 
