@@ -1,7 +1,8 @@
 """The only writer of output files: whole or not at all.
 
 No file is replaced without permission, none that is not a regular file, and none that is being
-read. A file is written beside the target and renamed, so that it survives a power loss.
+read. A file is written beside the target and gets its name once it is whole, so nobody finds half
+of it or nothing under that name: not after a power loss, and not after it was killed.
 """
 
 import contextlib
@@ -95,11 +96,6 @@ def write_new(
         As `check_output`, or if the disk fails.
     """
     check_output(path, inputs, overwrite=overwrite)
-    claimed = not overwrite
-    if claimed:
-        # So that no other program takes the name. What may be replaced needs no such thing, and
-        # whoever looks, or starts after a power loss, finds it whole or not at all.
-        path.touch(exist_ok=False)
     if rights is None:
         rights = stat.S_IMODE(path.stat().st_mode) if path.exists() else READABLE & ~_mask()
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
@@ -111,14 +107,26 @@ def write_new(
             file.flush()
             os.fchmod(file.fileno(), rights)
             os.fsync(file.fileno())
-        fresh.replace(path)
-    except BaseException:
+        if overwrite:
+            fresh.replace(path)
+        else:
+            _put_where_none_is(fresh, path)
+    finally:
         fresh.unlink(missing_ok=True)
-        if claimed:
-            path.unlink(missing_ok=True)
-        raise
     sync_folder(path.parent)
     return size
+
+
+def _put_where_none_is(fresh: Path, path: Path) -> None:
+    """Give a whole file its name; raises FileExistsError if another program has taken it."""
+    try:
+        os.link(fresh, path)
+    except FileExistsError as error:
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
+    except OSError:
+        # FAT has no links.
+        path.touch(exist_ok=False)
+        fresh.replace(path)
 
 
 def sync_folder(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """One writer: nothing that exists is lost by mistake, and nothing half written stays."""
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -86,25 +87,36 @@ def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, old: bytes | None
     assert [path.read_bytes() for path in tmp_path.iterdir()] == ([] if old is None else [old])
 
 
-def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(tmp_path: Path) -> None:
+def no_links(*_: object) -> None:
+    raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+
+@pytest.mark.parametrize("on_fat", [False, True])
+def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_fat: bool
+) -> None:
     def slow() -> Iterator[bytes]:
-        with pytest.raises(FileExistsError):
-            write_new(tmp_path / "a", [b"other"])
         yield b"first"
+        write_new(tmp_path / "a", [b"other"])
 
-    write_new(tmp_path / "a", slow())
-    assert (tmp_path / "a").read_bytes() == b"first"
+    if on_fat:
+        monkeypatch.setattr(os, "link", no_links)
+    with pytest.raises(FileExistsError) as refused:
+        write_new(tmp_path / "a", slow())
+    assert refused.value.filename == str(tmp_path / "a")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"other"}
 
 
-def test_what_may_be_replaced_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path, overwrite: bool) -> None:
     """A gateway that is killed while it writes a mission must not find it empty afterwards."""
 
     def looking() -> Iterator[bytes]:
         assert not (tmp_path / "a").exists()
         yield b"1"
 
-    write_new(tmp_path / "a", looking(), overwrite=True)
-    assert (tmp_path / "a").read_bytes() == b"1"
+    write_new(tmp_path / "a", looking(), overwrite=overwrite)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"1")]
 
 
 def test_a_file_of_the_user_beside_it_is_left_alone(tmp_path: Path) -> None:

@@ -138,11 +138,24 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert folder.find("k") is None
     assert not (tmp_path / "reports" / "a").exists()
     again = ResultFolder(tmp_path)
-    assert not (tmp_path / ".partial").exists()
+    with again.held():
+        assert not (tmp_path / ".partial").exists()
     again.keep(result, {"reports/a/index.html": b"page"})
     assert again.find("k") == result
     (tmp_path / RESULTS / "k.json").write_bytes(b"")
     assert again.find("k") is None
+
+
+def test_two_batches_do_not_write_into_one_folder(season: Path, tmp_path: Path) -> None:
+    staged = tmp_path / ".partial" / "k"
+    with ResultFolder(tmp_path).held():
+        staged.mkdir(parents=True)
+        code, text = run("info", season / FLIGHTS[0], "-o", tmp_path)
+        assert code == 2
+        assert "another mavgate batch writes its results here" in text.replace("\n", " ")
+        assert staged.exists()
+    assert run("info", season / FLIGHTS[0], "-o", tmp_path)[0] == 0
+    assert not staged.exists()
 
 
 def test_results_of_one_tick_of_the_clock_stand_by_name(tmp_path: Path) -> None:

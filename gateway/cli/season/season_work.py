@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -114,7 +114,7 @@ class SeasonWork:
         with self.executor() as executor, Progress(
             *columns, console=console, transient=True, auto_refresh=False,
             disable=not console.is_terminal,
-        ) as progress, refusing():  # fmt: skip
+        ) as progress, refusing(), folder.held() if folder else nullcontext():  # fmt: skip
             bar = progress.add_task(task.name, total=len(items))
 
             def report(what: str, done: int, total: int) -> None:

@@ -3,6 +3,8 @@
 import codecs
 import errno
 import gzip
+import os
+import stat
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -70,8 +72,33 @@ def other_format(path: Path) -> str:
 
 
 def _head(path: Path) -> bytes:
-    with readable(path), _open(path) as file:
+    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
         return file.read(SNIFF).removeprefix(codecs.BOM_UTF8)
+
+
+def open_recording(path: Path) -> BinaryIO:
+    """Open a file to read it to its end; raises OSError as `open_descriptor`."""
+    return os.fdopen(open_descriptor(path), "rb")
+
+
+def open_descriptor(path: Path) -> int:
+    """Open a file to read it, if it has an end.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is a pipe or a device: they may have no end, and give their bytes
+        only once.
+    """
+    # A pipe that nobody writes to would wait here.
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "is a pipe or a device; save its bytes as a file", str(path))
 
 
 @contextmanager
@@ -90,7 +117,7 @@ def readable(path: Path) -> Iterator[None]:
 def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:
     """Read a file, gzipped or not, piece by piece; progress counts bytes on the disk."""
     done = 0
-    with readable(path), path.open("rb") as raw, _unpacked(path, raw) as file:
+    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
         while data := file.read(CHUNK):
             yield data
             if progress is not None:
@@ -109,7 +136,7 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
         The last lines, the first of them whole.
     """
     head = tail = b""
-    with readable(path), _open(path) as file:
+    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
         while line := file.readline(MAX_LINE):
             head += line
             if not line.startswith(b"#") or len(head) > MAX_HEAD:
@@ -121,10 +148,6 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
             file.seek(max(len(head), path.stat().st_size - TAIL))
             tail = file.read()
     return head, tail[-TAIL:].partition(b"\n")[2]
-
-
-def _open(path: Path) -> BinaryIO:
-    return cast(BinaryIO, gzip.open(path)) if path.suffix == GZIP else path.open("rb")
 
 
 def _unpacked(path: Path, raw: BinaryIO) -> BinaryIO:

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.disk.recording_streams import Progress
+from gateway.edges.disk.recording_streams import Progress, open_descriptor
 from gateway.flightlog.answers import LogAnswers
 from gateway.flightlog.tlog.tlog import TlogIndex, TlogScanner
 
@@ -36,7 +36,7 @@ class TlogFile:
         self, path: Path, progress: Progress | None = None, answers: LogAnswers | None = None
     ) -> None:
         self.path = path
-        self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._file = open_descriptor(path)
         self.index = TlogIndex()
         scanner = TlogScanner()
         offset = 0

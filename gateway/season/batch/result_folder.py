@@ -1,7 +1,11 @@
 """The folder of a batch's results: what is done is kept there whole, or is not there at all."""
 
+import errno
+import fcntl
+import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +25,7 @@ class ResultFolder:
     Parameters
     ----------
     folder : Path
-        Made if it is not there; what an interrupted run left half written is removed.
+        Made if it is not there.
 
     Raises
     ------
@@ -32,7 +36,26 @@ class ResultFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         (folder / RESULTS).mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out, and remove what an interrupted one left half written.
+
+        Raises
+        ------
+        OSError
+            If another run is at work in it.
+        """
+        descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            _lock(descriptor, self.folder)
+            shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
+            yield
+        finally:
+            # Processes that were forked meanwhile have it open, too.
+            with suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+            os.close(descriptor)
 
     def find(self, key: str) -> FlightResult | None:
         """Return a result that is kept with all its files; None if it is to be made."""
@@ -60,6 +83,18 @@ class ResultFolder:
 
     def _path(self, key: str) -> Path:
         return self.folder / RESULTS / f"{key}.json"
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    """Lock a folder as long as it is open; the lock ends with the process, however that ends."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        text = "another mavgate batch writes its results here; wait, or name another folder"
+        raise OSError(errno.EBUSY, text, str(folder)) from error
+    except OSError:
+        # Some network disks have no locks.
+        return
 
 
 def read_results(folder: Path) -> Iterator[FlightResult]:

@@ -15,6 +15,7 @@ from gateway.edges.disk.recording_streams import (
     OTHER_FORMATS,
     FileKind,
     kind_of,
+    open_recording,
     other_format,
     read_batches,
     read_chunks,
@@ -129,7 +130,7 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes; raises OSError."""
     digest = sha256()
-    with path.open("rb") as file:
+    with open_recording(path) as file:
         while data := file.read(CHUNK):
             digest.update(data)
     return digest.hexdigest()

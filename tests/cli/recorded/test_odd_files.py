@@ -1,6 +1,7 @@
 """Odd input to the commands: what is wrong is said with the file, the line and what to do."""
 
 import gzip
+import os
 import struct
 import tracemalloc
 from pathlib import Path
@@ -96,6 +97,20 @@ def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
     path.write_bytes(text + path.read_bytes())
     told = run("fuse", path, "-o", tmp_path / "out.csv", code=0 if "fused" in words else 2)
     assert words in told
+
+
+@pytest.mark.parametrize("command", ["info", "fuse", "recover", "play"])
+@pytest.mark.parametrize("kind", ["pipe", "zeros", "link"])
+def test_what_has_no_end_is_not_read(tmp_path: Path, command: str, kind: str) -> None:
+    path = Path("/dev/zero") if kind == "zeros" else tmp_path / "log.csv"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to("/dev/zero")
+    words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "recover") else []
+    told = run(command, path, *words, code=2)
+    assert f"{path}: is a pipe or a device; save its bytes as a file" in told
+    assert not (tmp_path / "out.csv").exists()
 
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover"])
