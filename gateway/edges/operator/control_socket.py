@@ -38,6 +38,8 @@ GROUP: Final = "mavgate"
 MOST_GATEWAYS: Final = 9
 """Gateways of one user: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
+ACCEPT_AGAIN_S: Final = 1.0
+"""After which a connection is accepted that came while there were no file descriptors left."""
 STARTERS: Final = {
     "run": "`mavgate run` or `mavgate demo`",
     "play": "`mavgate play`",
@@ -85,8 +87,11 @@ class ControlServer:
         self.path = path
         self._for_group = "RUNTIME_DIRECTORY" in os.environ
         self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
-        self._server: asyncio.Server | None = None
+        self._socket: socket.socket | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
+        self._is_short = False
+        """Whether there were no file descriptors for the last connection."""
         self._writers: set[asyncio.StreamWriter] = set()
         self.register("verbs", NoParams, lambda _: sorted(self._verbs))
 
@@ -118,26 +123,25 @@ class ControlServer:
         ControlError
             If the socket cannot be created, or `MOST_GATEWAYS` run already.
         """
-        # Imported here: clients do not need it, and it is half of a command's start-up time.
-        import asyncio
-
         check_length(self.path)
         try:
             self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)
             self.path = _first_free(self.path)
-            self._server = await asyncio.start_unix_server(
-                self._serve, str(self.path), limit=MAX_LINE
-            )
-            self.path.chmod(SERVICE_SOCKET_RIGHTS if self._for_group else SOCKET_RIGHTS)
+            self._socket = self._bound()
         except OSError as error:
             raise ControlError(f"control socket {self.path}: {error.strerror}") from error
+        self._watch(self._socket)
 
     def close(self) -> None:
         """Stop listening and end all connections."""
-        if self._server is None:
+        if self._socket is None:
             return
-        self._server.close()
-        self._server, self._is_closed = None, True
+        # Imported here and below: clients do not need it, and it is half of a command's start-up.
+        import asyncio
+
+        asyncio.get_running_loop().remove_reader(self._socket)
+        self._socket.close()
+        self._socket, self._is_closed = None, True
         for writer in self._writers:
             writer.close()
         self.path.unlink(missing_ok=True)
@@ -155,6 +159,8 @@ class ControlServer:
                 result = await result
         except (ControlError, msgspec.DecodeError, UnicodeDecodeError) as error:
             return _Answer(ok=False, error=str(error))
+        except RecursionError:
+            return _Answer(ok=False, error="the request is nested too deeply")
         return _Answer(ok=True, result=result)
 
     def _find(self, verb: str) -> tuple[type[msgspec.Struct], Handler]:
@@ -162,6 +168,51 @@ class ControlServer:
             known = ", ".join(sorted(self._verbs))
             raise ControlError(f"no such verb: {verb}; there are {known}")
         return self._verbs[verb]
+
+    def _bound(self) -> socket.socket:
+        sock = socket.socket(socket.AF_UNIX)
+        try:
+            sock.setblocking(False)
+            sock.bind(str(self.path))
+            self.path.chmod(SERVICE_SOCKET_RIGHTS if self._for_group else SOCKET_RIGHTS)
+            sock.listen(MAX_CONNECTIONS)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+
+    def _watch(self, sock: socket.socket) -> None:
+        import asyncio
+
+        if sock.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(sock, self._on_readable, sock)
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        import asyncio
+
+        loop = asyncio.get_running_loop()
+        try:
+            connection, _ = sock.accept()
+        except BlockingIOError:
+            return
+        except OSError as error:
+            # Out of descriptors: the waiting connection would wake us for ever.
+            if not self._is_short:
+                log.warning("control socket: %s; it is tried again", error.strerror)
+            self._is_short = True
+            loop.remove_reader(sock)
+            loop.call_later(ACCEPT_AGAIN_S, self._watch, sock)
+            return
+        self._is_short = False
+        connection.setblocking(False)
+        task = loop.create_task(self._admit(connection))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _admit(self, connection: socket.socket) -> None:
+        import asyncio
+
+        await self._serve(*await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE))
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # One that was accepted just before the end is served only after it.
