@@ -13,6 +13,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     Outlets,
     Reader,
     end_session,
+    frames_of,
     open_session,
     session_config,
 )
@@ -212,7 +213,7 @@ class FleetSession:
             self._keys[key] = None
             off_loop(_declare_key, self._session, key, self._keys)
         is_own = mark is not None and mark.to_bytes() == OWN
-        self._events.frames(site_of(key), sample.payload.to_bytes(), is_own)
+        self._events.frames(site_of(key), frames_of(sample), is_own)
 
     def _note_token(self, news: tuple[str, bool]) -> None:
         key, is_here = news

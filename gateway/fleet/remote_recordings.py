@@ -80,7 +80,7 @@ class RemoteRecordings:
             for site, data in answers.items():
                 try:
                     found[site] = msgspec.json.decode(data, type=list[RemoteRecording])
-                except msgspec.DecodeError as error:
+                except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
                     log.warning("site %s answers for its recordings with no list: %s", site, error)
         return found
 

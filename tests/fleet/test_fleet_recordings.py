@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, MagicMock
 
 import numpy as np
 import pytest
@@ -17,8 +18,13 @@ from gateway.cli.app import app
 from gateway.cli.support import fetching
 from gateway.cli.support.fetching import FetchError, PiecePace, RecordingFetch
 from gateway.edges.hub.fleet_link.query_answers import RefusedQueryError
-from gateway.edges.hub.fleet_link.recording_answers import MAX_PIECE, RecordingAnswers
+from gateway.edges.hub.fleet_link.recording_answers import (
+    MAX_PIECE,
+    RecordingAnswers,
+    RemoteRecording,
+)
 from gateway.edges.operator.control_socket import ControlError, request
+from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
 from tests.edges.hub.conftest import LIMIT_S
 from tests.fleet.conftest import World
 
@@ -156,6 +162,18 @@ class TestOverTheSession:
         assert await spoken_for(world, asyncio.create_task(work)) == {}
 
 
+async def test_a_site_that_answers_with_no_list_hides_no_others() -> None:
+    sound = b'[{"name":"one","files":[],"modified_s":1.5}]'
+    answers = {
+        "no_text": b'[{"name":"\xff"}]',
+        "deep": b'[{"name":"a","files":[],"modified_s":1,"x":' + b"[" * 100_000,
+        "sound": sound,
+    }
+    session = MagicMock(patterns=["*"], query=AsyncMock(return_value=answers))
+    found = await RemoteRecordings(session)._list(SitePattern())
+    assert found == {"sound": [RemoteRecording("one", [], 1.5)]}
+
+
 class TestAnswers:
     @pytest.mark.parametrize(
         "file", ["../secret_01.tlog", "notes.txt", "link_01.tlog", "/etc/passwd", "a\0_01.tlog"]
@@ -170,6 +188,7 @@ class TestAnswers:
         [
             b"garbage",
             b'{"file": 1}',
+            b'{"file": "\xff\xfe"}',
             b'{"file": "flight_01.tlog", "size": 0}',
             b'{"file": "flight_01.tlog", "size": 1e99}',
             b'{"file": "flight_01.tlog", "size": 1, "offset": -1}',

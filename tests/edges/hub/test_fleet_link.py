@@ -10,13 +10,21 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import zenoh
 
-from gateway.edges.hub.fleet_link import zenoh_session
+from gateway.edges.hub.fleet_link import zenoh_client, zenoh_session
 from gateway.edges.hub.fleet_link.site_keys import OWN
-from gateway.edges.hub.fleet_link.zenoh_session import AT_ONCE, MAX_WAITING, Inlet, Reader
+from gateway.edges.hub.fleet_link.zenoh_session import (
+    AT_ONCE,
+    BYTES_AT_ONCE,
+    MAX_MESSAGE,
+    MAX_WAITING,
+    Inlet,
+    Reader,
+)
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.edges.hub.conftest import LIMIT_S, Rig
 from tests.ports import free_port
@@ -330,8 +338,54 @@ class TestInlet:
         await asyncio.sleep(0)
         assert len(taken) == MAX_WAITING
 
+    async def test_what_costs_more_is_taken_in_more_turns(self) -> None:
+        taken: list[int] = []
+        inlet = Inlet(taken.append, lambda _: 0.5)
+        for n in range(8):
+            inlet.put(n)
+        for turn in range(1, 5):
+            await asyncio.sleep(0)
+            assert taken == list(range(2 * turn))
+
+    async def test_in_a_pause_nothing_is_taken_and_nothing_is_lost(self) -> None:
+        pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
+        inlet = Inlet(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
+        inlet.put(0)
+        async with asyncio.timeout(LIMIT_S):
+            await done.wait()
+        assert not pauses_s
+
+
+class TestFlood:
+    """A site takes no more from its fleet at a time than from any other client."""
+
+    @pytest.mark.parametrize("trusted", ["yes", "no"])
+    async def test_of_one_message_only_the_beginning_is_taken(self, rig: Rig, trusted: str) -> None:
+        hub = rig.hub(f"zenoh:tcp/127.0.0.1:1?site=field&trusted={trusted}")
+        client = hub._clients[1]
+        beat = rig.sender(255, 190).heartbeat()
+        sample = MagicMock(payload=zenoh.ZBytes(beat * 1000))
+        before = hub.strangers.level
+        client._take(zenoh_session.frames_of(sample))
+        assert client.counters.received == MAX_MESSAGE // len(beat)
+        assert client.counters.bytes_garbage == MAX_MESSAGE % len(beat)
+        assert before - hub.strangers.level == (MAX_MESSAGE if trusted == "no" else 0)
+
+    def test_large_messages_are_taken_one_a_turn(self) -> None:
+        assert zenoh_client._cost(bytes(MAX_MESSAGE)) >= 1.0
+        assert zenoh_client._cost(b"") == 1 / AT_ONCE
+
 
 class TestReader:
+    async def test_large_messages_are_taken_a_few_a_turn(self) -> None:
+        waiting = [MagicMock(payload=bytes(1_000_000)) for _ in range(100)]
+        subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
+        subscriber.__iter__.return_value = iter(())
+        session = MagicMock(declare_subscriber=lambda *_: subscriber)
+        taken: list[Any] = []
+        Reader(session, "flood", taken.append)._drain()
+        assert len(taken) == BYTES_AT_ONCE // MAX_MESSAGE
+
     async def test_a_flood_is_taken_in_turns_and_loses_the_oldest_telemetry_of_all_alike(
         self, router: Router, visit: Callable[..., Far], monkeypatch: pytest.MonkeyPatch
     ) -> None:

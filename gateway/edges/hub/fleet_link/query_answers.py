@@ -54,11 +54,17 @@ class QueryAnswers:
 
     def _serve(self) -> None:
         for query in self._queryable:
-            with query:
-                asked = b"" if query.payload is None else query.payload.to_bytes()
-                try:
-                    query.reply(self._key, self._answer(asked))
-                except RefusedQueryError as error:
-                    query.reply_err(str(error).encode())
-                except self._failure as error:
-                    log.debug("not answered: %s", error)
+            try:
+                with query:
+                    self._reply(query)
+            except self._failure as error:
+                log.debug("not answered: %s", error)
+
+    def _reply(self, query: "zenoh.Query") -> None:
+        asked = b"" if query.payload is None else query.payload.to_bytes()
+        try:
+            answer = self._answer(asked)
+        except RefusedQueryError as error:
+            query.reply_err(str(error).encode())
+        else:
+            query.reply(self._key, answer)

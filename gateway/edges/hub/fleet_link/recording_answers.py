@@ -74,7 +74,7 @@ class RecordingAnswers:
             if not query.file:
                 return msgspec.json.encode(self._list())
             return self._digest(query) if query.digest else self._piece(query)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise RefusedQueryError(f"no query for recordings: {error}") from error
         except OSError as error:
             raise RefusedQueryError(f"{query.file}: {error.strerror}") from error

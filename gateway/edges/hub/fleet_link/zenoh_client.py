@@ -8,7 +8,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from gateway.edges.hub.client import Client
+from gateway.edges.hub.client import READ_BYTES, Client
 from gateway.edges.hub.fleet_link.query_answers import QueryAnswers
 from gateway.edges.hub.fleet_link.recording_answers import RecordingAnswers
 from gateway.edges.hub.fleet_link.site_keys import (
@@ -21,11 +21,13 @@ from gateway.edges.hub.fleet_link.site_keys import (
     recordings_key,
 )
 from gateway.edges.hub.fleet_link.zenoh_session import (
+    AT_ONCE,
     HOW_TO_ADD,
     PATIENT_IDS,
     Inlet,
     Outlets,
     end_session,
+    frames_of,
     open_session,
     session_config,
 )
@@ -33,6 +35,7 @@ from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
 from gateway.edges.hub.listener import RETRY_US
 from gateway.routing.endpoint import RAW_KEYS, Endpoint
 from gateway.routing.outbox import Packer
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
 
 if TYPE_CHECKING:
@@ -151,13 +154,13 @@ class ZenohClient(Client):
         """Declare to the router what we take, and that we are here."""
         import zenoh
 
-        inlet: Inlet[bytes] = Inlet(self._take)
+        inlet: Inlet[bytes] = Inlet(self._take, _cost, lambda: self._pause_us() / US_PER_S)
         presence: Inlet[tuple[bool, str]] = Inlet(self._note_session)
         self._inlets = [inlet, presence]
         self._namesakes.clear()
         wanted = RAW_IN if self._is_raw else in_key(self.endpoint.site, ALL_SYSTEMS)
         self._declared = [
-            session.declare_subscriber(wanted, lambda sample: inlet.put(sample.payload.to_bytes()))
+            session.declare_subscriber(wanted, lambda sample: inlet.put(frames_of(sample)))
         ]
         if self._is_raw:
             return
@@ -177,6 +180,8 @@ class ZenohClient(Client):
             self._declared.append(QueryAnswers(session, recordings_key(site), answers))
 
     def _take(self, data: bytes) -> None:
+        if not self.trusted:
+            self.context.strangers.level -= len(data)
         self.receive(split_datagram(data), len(data), self.context.now_us())
 
     def _note_session(self, news: tuple[bool, str]) -> None:
@@ -220,3 +225,8 @@ class ZenohClient(Client):
             self.counters.bytes_sent += len(data)
         else:
             self.counters.dropped += len(frames)
+
+
+def _cost(data: bytes) -> float:
+    """Return which part of a turn a message takes: no more is read from any client at a time."""
+    return max(1 / AT_ONCE, len(data) / READ_BYTES)

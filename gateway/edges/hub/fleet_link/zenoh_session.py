@@ -31,6 +31,10 @@ MAX_WAITING: Final = 4096
 """What has come and was not taken yet: a third of a second of two hundred aircraft."""
 AT_ONCE: Final = 64
 """Taken in one turn of the loop, so that a flood cannot starve the others."""
+BYTES_AT_ONCE: Final = 4 * 4096
+"""Taken in one turn by a fleet, which has no samples that would have to wait meanwhile."""
+MAX_MESSAGE: Final = 4096
+"""Bytes of one message with frames, as of a datagram; ours have at most 1100."""
 MAX_PATIENT: Final = 1024
 """What waits for a congested link and must not be lost: a whole parameter list."""
 BATCHES: Final = 4
@@ -117,6 +121,11 @@ def end_session(session: "zenoh.Session", outlets: "Outlets | None", declared: l
         session.close()  # type: ignore[no-untyped-call]
 
 
+def frames_of(sample: "zenoh.Sample") -> bytes:
+    """Return the bytes of a message with frames; what is beyond `MAX_MESSAGE` is cut off."""
+    return sample.payload.to_bytes()[:MAX_MESSAGE]
+
+
 class Inlet(Generic[Item]):
     """Hands items from a thread to the loop, in order; when too many wait the oldest go.
 
@@ -124,10 +133,21 @@ class Inlet(Generic[Item]):
     ----------
     take : callable
         Called on the loop with each item.
+    cost : callable, optional
+        Returns which part of a turn an item takes.
+    pause_s : callable, optional
+        Returns how long nothing is to be taken; 0 for now.
     """
 
-    def __init__(self, take: Callable[[Item], None]) -> None:
+    def __init__(
+        self,
+        take: Callable[[Item], None],
+        cost: Callable[[Item], float] = lambda _: 1 / AT_ONCE,
+        pause_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:
         self._take = take
+        self._cost = cost
+        self._pause_s = pause_s
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[Item] = deque(maxlen=MAX_WAITING)
         self._is_due = False
@@ -154,12 +174,16 @@ class Inlet(Generic[Item]):
         self._waiting.clear()
 
     def _drain(self) -> None:
+        if pause_s := self._pause_s():
+            self._loop.call_later(pause_s, self._drain)
+            return
         # Before the queue is looked at: what comes from now on wakes us again.
         self._is_due = False
-        for _ in range(AT_ONCE):
-            if not self._waiting:
-                return
-            self._take(self._waiting.popleft())
+        spent = 0.0
+        while self._waiting and spent < 1.0:
+            item = self._waiting.popleft()
+            spent += self._cost(item)
+            self._take(item)
         if self._waiting and not self._is_due:
             self._is_due = True
             self._loop.call_soon(self._drain)
@@ -233,8 +257,11 @@ class Reader:
             else:
                 # Commands, parameters, missions, texts: none of them comes again.
                 self._take(oldest)
-        for _ in range(min(AT_ONCE, len(waiting))):
-            self._take(waiting.popleft())
+        spent = 0.0
+        while waiting and spent < 1.0:
+            sample = waiting.popleft()
+            spent += max(1 / AT_ONCE, min(len(sample.payload), MAX_MESSAGE) / BYTES_AT_ONCE)
+            self._take(sample)
         if waiting:
             self._loop.call_soon(self._drain)
         else:
