@@ -75,6 +75,9 @@ class NavFlags(IntFlag):
     """A sensor is stuck, saturated or not finite, and was left out."""
     DEGRADED = 1 << 13
     """At least one output is worse than the estimator's normal working."""
+    MAG_MISPLACED = 1 << 14
+    """The field turns otherwise than the aircraft, since axes of the compass are swapped or
+    reversed; it is not used."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """As in `ImuFlags`."""

@@ -19,6 +19,7 @@ GPS_REJECTED: Final = int(NavFlags.GPS_REJECTED)
 DEAD_RECKONING: Final = int(NavFlags.DEAD_RECKONING)
 SENSOR_FAULT: Final = int(NavFlags.SENSOR_FAULT)
 DEGRADED: Final = int(NavFlags.DEGRADED)
+MAG_MISPLACED: Final = int(NavFlags.MAG_MISPLACED)
 
 HEADING_VALID_RAD: Final = 0.26
 """A heading is valid up to this standard deviation."""

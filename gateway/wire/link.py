@@ -37,6 +37,9 @@ SLOWED: Final = 64
 MOST_AHEAD_US: Final = 50_000
 """Of where the clock's estimate puts a sample: more is no small correction."""
 RATE_SPAN_US: Final = US_PER_S
+FIRST_YEAR: Final = 2024
+"""Before it nobody spoke this protocol: the receiver has lost count of the weeks, which start anew
+every 1024, or tells the date of its firmware until the satellites have told theirs."""
 MAX_ARRIVALS: Final = 2048
 """Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
 
@@ -106,6 +109,7 @@ class _Node:
     last_stamp_us: int | None = None
     """On its own clock; None before the first payload after a start of it."""
     quality: payloads.GpsQualityPayload | None = None
+    wrong_dates: int = 0
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
 
 
@@ -183,10 +187,14 @@ class Link:
             bytes_received=self._bytes_received,
             frames=self._frames,
             frames_lost=self._frames_lost,
-            faults=tuple(sorted(self._faults.items())),
+            faults=tuple(sorted(self._all_faults().items())),
             nodes=tuple(_node_link(node_id, n, now_us) for node_id, n in self._nodes.items()),
             receiver=self._receiver_status,
         )
+
+    def _all_faults(self) -> Counter[str]:
+        wrong_dates = sum(node.wrong_dates for node in self._nodes.values())
+        return self._faults + Counter(gps_date=wrong_dates)
 
     def _hear(
         self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
@@ -272,6 +280,7 @@ def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) 
             return _gps_fix(header, payload, node)
         case payloads.GpsQualityPayload():
             node.quality = payload
+            node.wrong_dates += payload.utc is not None and payload.utc.year < FIRST_YEAR
             return None
         case payloads.NodeStatusPayload():
             return _node_status(header, payload, node.last_time_us)
@@ -301,7 +310,9 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
     # The accuracy of another epoch does not belong to this fix; the geoid stays.
     if quality is None or quality.itow_ms != fix.itow_ms:
         quality = payloads.GpsQualityPayload(fix.itow_ms, *(UINT16_MAX,) * 5, 0, None)
-    utc_us = None if quality.utc is None else round(quality.utc.timestamp() * US_PER_S)
+    utc_us = None
+    if quality.utc is not None and quality.utc.year >= FIRST_YEAR:
+        utc_us = round(quality.utc.timestamp() * US_PER_S)
     return GpsFix(
         time_us=node.last_time_us,
         node=header.node,

@@ -32,7 +32,11 @@ MAX_BUCKETS: Final = 120
 MIN_SKEW_SPAN_US: Final = 2_000_000
 """Below this span, a burst of retries would look like drift."""
 MAX_SKEW: Final = 0.01
-"""Ceramic resonators drift by up to 0.5 %; twice that is not a clock."""
+"""Ceramic resonators drift by up to 0.5 %; what seems to be more may be a queue that grows."""
+MAX_RC_SKEW: Final = 0.1
+"""A processor that runs on its internal RC oscillator, since its fuses are wrong."""
+LONGEST_QUEUE_US: Final = 500_000
+"""What a clock has moved beyond this is no queue."""
 RESTART_JUMP_US: Final = 1_500_000
 """More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
 AHEAD_US: Final = 50_000
@@ -137,7 +141,9 @@ class ClockTracker:
         right = next(i for i in range(1, len(hull)) if hull[i].remote_us >= middle_us)
         a, b = hull[right - 1], hull[right]
         skew = (b.delta_us - a.delta_us) / (b.remote_us - a.remote_us)
-        self._skew = max(-MAX_SKEW, min(MAX_SKEW, skew))
+        moved_us = abs(last.delta_us - first.delta_us)
+        most = MAX_RC_SKEW if moved_us > LONGEST_QUEUE_US else MAX_SKEW
+        self._skew = max(-most, min(most, skew))
         self._line = a
 
     def _to_local(self, remote_us: int) -> int:

@@ -171,7 +171,8 @@ def test_a_compass_that_is_mounted_wrongly_is_done_without(
     late = replace(flight, counts=log.imu_time_us > 120_000_000)
     out = run(flight, name, log)
     flags = out[late.counts, NAV_FLAGS].astype(int)
-    assert (flags & int(NavFlags.MAG_DISTURBED)).all()
+    told = NavFlags.MAG_DISTURBED | NavFlags.MAG_MISPLACED
+    assert ((flags & int(told)) == int(told)).all()
     assert (flags & int(NavFlags.HEADING_VALID)).all()
     scores = attitude_scores(late, out[:, :4])
     assert scores["heading"] < 4.0

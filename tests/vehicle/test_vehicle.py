@@ -219,6 +219,32 @@ def test_a_node_that_restarts_is_reported() -> None:
     assert texts(vehicle.on_link(report(link(restarts=4)), ONE_S)) == ["Node 0 restarted"]
 
 
+def test_a_node_that_keeps_restarting_is_reported_once() -> None:
+    """As with two trackers of one id, whose stamps disagree with each sample."""
+    vehicle, told = make(), []
+    for second in range(60):
+        restarts = 100 * min(second, 20)
+        now_us = (second + 1) * ONE_S
+        alive = link(restarts=restarts, last_time_us=now_us)
+        told += texts(vehicle.on_link(report(alive), now_us))
+    assert told == [
+        "Receiver connected: /dev/ttyUSB0",
+        "Node 0 keeps restarting, or two have its id",
+        "Node 0 no longer restarts",
+    ]
+
+
+def test_a_compass_with_wrong_axes_is_reported_once_with_what_to_do() -> None:
+    vehicle, told = make(), []
+    for time_us in range(0, 20 * ONE_S, ONE_S // 10):
+        state = state_at(time_us, flags=NavFlags.MAG_MISPLACED | NavFlags.MAG_DISTURBED)
+        told += texts(vehicle.on_state(state, sample_at(time_us), time_us))
+    assert told == [
+        "Compass axes wrong, not used: check CAL_MAG_MNT",
+        "Magnetic field disturbed",
+    ]
+
+
 def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
     vehicle = make()
     told = texts(fly(vehicle, 0, 2))

@@ -1,5 +1,6 @@
 """One receiver's line: records on the gateway clock, and an account that adds up."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
@@ -202,6 +203,21 @@ def test_samples_of_a_long_queue_still_come_in_order() -> None:
     assert len(times_us) == len(stamps_us)
     assert np.diff(times_us).min() >= 1
     assert times_us.max() <= 2_000_000 + 51_000
+
+
+@pytest.mark.parametrize(("year", "counted"), [(2006, 1), (2023, 1), (2024, 0), (2026, 0)])
+def test_a_date_before_the_protocol_is_no_time_of_a_fix(year: int, counted: int) -> None:
+    line, link = Line(node_id=1), Link()
+    quality = replace(QUALITY, utc=UTC_TIME.replace(year=year))
+    records = []
+    for number, payload in enumerate((IMU, IMU, quality, FIX)):
+        records += link.feed(line.frame(number * 10_000, payload), number * 10_000)
+    fix = records[-1]
+    assert isinstance(fix, GpsFix)
+    assert (fix.utc_us is None) == bool(counted)
+    assert fix.h_acc_m == 1.5
+    faults = dict(link.report(0, connected=True, port="").faults)
+    assert faults == ({"gps_date": counted} if counted else {})
 
 
 def test_receiver_restart_is_no_serial_loss() -> None:

@@ -23,7 +23,7 @@ def packets(
     return remote_us.astype(np.int64) % WRAP_US, true_us + offset_us + 300.0, arrival_us.astype(int)
 
 
-@pytest.mark.parametrize("skew_ppm", [-5000.0, -80.0, 0.0, 35.0, 5000.0])
+@pytest.mark.parametrize("skew_ppm", [-50_000.0, -5000.0, -80.0, 0.0, 35.0, 5000.0, 50_000.0])
 @pytest.mark.parametrize("start_us", [0, WRAP_US - 20_000_000])
 @pytest.mark.parametrize("seed", range(2))
 def test_offset_and_drift(skew_ppm: float, start_us: int, seed: int) -> None:

@@ -50,6 +50,7 @@ FLAG_WORDS: Final = (
     (NavFlags.DEAD_RECKONING, "dead reckoning", "yellow"),
     (NavFlags.GPS_REJECTED, "GPS rejected", "yellow"),
     (NavFlags.MAG_DISTURBED, "magnetic disturbance", "yellow"),
+    (NavFlags.MAG_MISPLACED, "compass axes wrong", "red"),
     (NavFlags.SENSOR_FAULT, "sensor fault", "red"),
     (NavFlags.DEGRADED, "degraded", "red"),
 )

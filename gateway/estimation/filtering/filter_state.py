@@ -11,6 +11,7 @@ from gateway.estimation.flagbits import (
     AT_REST,
     DEGRADED,
     MAG_DISTURBED,
+    MAG_MISPLACED,
     SENSOR_FAULT,
     USING_BARO,
     USING_MAG,
@@ -88,7 +89,7 @@ def sensor_flags(s: FilterState) -> int:
     if s.time_s - s.mag_s < STALE_MAG_S:
         flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
     if s.mag_misplaced == 1:
-        flags |= MAG_DISTURBED | DEGRADED
+        flags |= MAG_DISTURBED | MAG_MISPLACED | DEGRADED
     if s.time_s - s.baro_s < BARO_STALE_S:
         flags |= USING_BARO
     if s.fault == 1:

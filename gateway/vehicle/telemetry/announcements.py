@@ -1,5 +1,6 @@
 """The events of one aircraft, as texts: link, nodes, GPS and the estimator's flags."""
 
+from collections import deque
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -37,6 +38,11 @@ FLAG_TEXTS: Final = (
         StatusText(INFO, "GPS accepted again"),
     ),
     (
+        NavFlags.MAG_MISPLACED,
+        StatusText(WARNING, "Compass axes wrong, not used: check CAL_MAG_MNT"),
+        StatusText(INFO, "Compass axes right again"),
+    ),
+    (
         NavFlags.MAG_DISTURBED,
         StatusText(WARNING, "Magnetic field disturbed"),
         StatusText(INFO, "Magnetic field normal again"),
@@ -55,6 +61,11 @@ FLAG_TEXTS: Final = (
 """A flag of the estimator, the text when it rises, and the text when it falls."""
 
 
+RESTART_REPORTS: Final = 10
+"""Reports of the link, one a second, in which restarts of a node are counted."""
+MANY_RESTARTS: Final = 3
+
+
 class Announcements:
     """The announcements of one aircraft."""
 
@@ -62,7 +73,8 @@ class Announcements:
         self._health = health
         self._announcer = Announcer()
         self._flags = NavFlags(0)
-        self._restarts: dict[int, int] = {}
+        self._restarts: dict[int, deque[int]] = {}
+        """How often each node had restarted in the last reports."""
         self._latency_s: float | None = None
 
     def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
@@ -136,11 +148,19 @@ class Announcements:
         return self._announcer.next_due_us()
 
     def _on_restarts(self, now_us: int) -> list[Any]:
+        """Announce restarts one by one; many at once only as a state: no board starts so fast."""
         found = []
         for node, restarts in sorted(self._health.restarts().items()):
-            if restarts > self._restarts.get(node, restarts):
-                found += self.say(
-                    StatusText(WARNING, f"{self._health.node_name(node)} restarted"), now_us
-                )
-            self._restarts[node] = restarts
+            known = self._restarts.setdefault(node, deque([restarts], RESTART_REPORTS))
+            is_new, is_often = restarts > known[-1], restarts - known[0] >= MANY_RESTARTS
+            known.append(restarts)
+            name = self._health.node_name(node)
+            text = StatusText(INFO, f"{name} no longer restarts")
+            if is_often:
+                text = StatusText(CRITICAL, f"{name} keeps restarting, or two have its id")
+            found += self._announcer.track(
+                f"restarts {node}", is_often, text, now_us, initially=False
+            )
+            if is_new and not is_often:
+                found += self.say(StatusText(WARNING, f"{name} restarted"), now_us)
         return found
