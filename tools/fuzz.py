@@ -9,6 +9,7 @@ shrunk, shown and kept in `.hypothesis`, so that the next run begins with it.
 """
 
 import argparse
+import contextlib
 import gzip
 import itertools
 import math
@@ -32,6 +33,10 @@ from gateway.aircraft import AircraftSettings
 from gateway.config import ConfigError, GatewaySettings, load
 from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams
 from gateway.edges.operator.control_verbs import AircraftVerbs, Named, Text, To
+from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
+from gateway.flightlog.autopilots.dataflash import DataflashReader
+from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
+from gateway.flightlog.autopilots.ulog import UlogReader
 from gateway.flightlog.moment import parse_moment
 from gateway.flightlog.table.row import COLUMNS, TableRow
 from gateway.flightlog.table.table import TableHeader, TableReader, encode_head, encode_line
@@ -52,6 +57,7 @@ NUMBERS: Final = (
 )
 MESSAGES: Final = tuple(mavlink.mavlink_map.values())
 HEAD: Final = encode_head(TableHeader(vehicle_id=1, unix_us_at_zero=1_780_000_000_000_000))
+ULOG_HEAD: Final = b"ULog\x01\x12\x35\x01" + bytes(8)
 FOREIGN: Final = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
 
 Property = Callable[[], None]
@@ -295,6 +301,71 @@ def tlog(data: bytes, cuts: list[int], strict: bool) -> None:
     assert all(encode_record(record.time_us, record.frame) in data for record in found)
 
 
+TOPIC_FIELDS: Final = (
+    *("uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2", "float[4] q"),
+    *("float[3] magnetometer_ga", "int32_t lat", "double latitude_deg", "uint8_t fix_type"),
+    *("uint64_t time_utc_usec", "sensor_combined x", "float[65535] y", "uint8_t[5] _padding0"),
+)
+TIMES: Final = st.integers(0, 2**64 - 1) | st.integers(10**6, 10**6 + 10**5)
+
+
+@st.composite
+def ulog_messages(draw: st.DrawFn) -> bytes:
+    """Make a format, a subscription, a row, or any other message of a ULog."""
+    name = draw(st.sampled_from(TOPICS)).encode()
+    number = struct.pack("<H", draw(st.integers(0, 3)))
+    time_us = struct.pack("<Q", draw(TIMES))
+    fields = ";".join(draw(st.lists(st.sampled_from(TOPIC_FIELDS), max_size=6)))
+    kind, content = draw(
+        st.sampled_from(
+            [(b"F", name + b":" + fields.encode() + b";"), (b"A", b"\0" + number + name)]
+        )
+        | st.tuples(st.just(b"D"), st.binary(max_size=40).map(lambda row: number + time_us + row))
+        | st.tuples(st.sampled_from([b"B", b"P", b"I", b"O", b"S", b"\0"]), st.binary(max_size=50))
+    )
+    return struct.pack("<Hc", len(content), kind) + content
+
+
+@st.composite
+def dataflash_messages(draw: st.DrawFn) -> bytes:
+    """Make a format, or a message of any type, of a DataFlash log."""
+    number = draw(st.integers(126, 132))
+    if draw(st.booleans()):
+        return b"\xa3\x95" + bytes([number]) + draw(st.binary(max_size=60))
+    name = draw(st.sampled_from([b"IMU", b"GPS", b"BARO", b"MAG", b"ATT", b"FMT", b"X"]))
+    letters = draw(st.text("QBfIeLcNZ?", max_size=8)).encode()
+    names = draw(st.lists(st.sampled_from(["TimeUS", "I", "GyrX", "Lat"]), max_size=8))
+    size = draw(st.integers(0, 255))
+    columns = ",".join(names).encode()
+    layout = struct.pack("<BB4s16s64s", number, size, name, letters, columns)
+    return b"\xa3\x95\x80" + layout
+
+
+@given(damaged(ulog_messages()), CUTS)
+def ulog(data: bytes, cuts: list[int]) -> None:
+    """Any ULog: an end, records in the order of time, and no byte counted twice."""
+    log = UlogReader(TOPICS)
+    for chunk in chunks_of(ULOG_HEAD + data, cuts):
+        log.feed(chunk)
+    log.feed(b"", final=True)
+    assert log.damaged_bytes + log.cut_bytes <= len(data)
+    with contextlib.suppress(ValueError):
+        flight = Px4Log(log.topics(), 1)
+        times = [record.time_us for record in flight.records()]
+        assert times == sorted(times)
+
+
+@given(damaged(dataflash_messages()), CUTS, st.booleans())
+def dataflash(data: bytes, cuts: list[int], is_text: bool) -> None:
+    """Any DataFlash log: an end, and no byte counted twice."""
+    names = ArdupilotReader(1).names
+    log = DataflashReader(names, is_text=is_text)
+    found = [name for chunk in chunks_of(data, cuts) for name, _ in log.feed(chunk)]
+    found += [name for name, _ in log.feed(b"", final=True)]
+    assert set(found) <= names
+    assert log.damaged_bytes + log.cut_bytes <= len(data)
+
+
 @st.composite
 def files(draw: st.DrawFn) -> tuple[str, bytes]:
     """Make a file such as people hand over, and the ending of its name."""
@@ -310,6 +381,8 @@ def files(draw: st.DrawFn) -> tuple[str, bytes]:
         st.sampled_from([(".csv", text), (".csv", b"# gps_latency_s=9.9.9\n" + text)])
         | st.tuples(st.just(".csv"), tables())
         | st.tuples(st.just(".tlog"), damaged(st.builds(encode_record, st.just(7), messages())))
+        | st.tuples(st.just(".ulg"), damaged(ulog_messages()).map(lambda log: ULOG_HEAD + log))
+        | st.tuples(st.just(".bin"), damaged(dataflash_messages()))
         | st.tuples(st.sampled_from([".csv", ".tlog"]), st.binary(max_size=200))
     )
     packed = draw(st.sampled_from(["", "gzip", "cut", "false"]))
@@ -352,7 +425,7 @@ TARGETS: Final[dict[str, Any]] = {
     target.__name__: target
     for target in (
         *(splitter, whole_frames, receiver, vehicle, control),
-        *(settings_file, table, tlog, command),
+        *(settings_file, table, tlog, ulog, dataflash, command),
     )
 }
 """By name."""
@@ -383,6 +456,8 @@ def main() -> int:
     if unknown := set(wanted) - set(TARGETS):
         parser.error(f"no such target: {', '.join(sorted(unknown))}")
     failed: set[str] = set()
+    # A property may be made ready only once.
+    ready = {name: bounded(name, options.examples, always_the_same=False) for name in wanted}
     end_s, runs = time.monotonic() + 60.0 * options.minutes, dict.fromkeys(wanted, 0)
     for name in itertools.cycle(wanted):
         if time.monotonic() > end_s or failed >= set(wanted):
@@ -390,7 +465,7 @@ def main() -> int:
         if name in failed:
             continue
         try:
-            bounded(name, options.examples, always_the_same=False)()
+            ready[name]()
         except Exception as error:  # noqa: BLE001
             failed.add(name)
             print(f"{name}: {type(error).__name__}: {error}")

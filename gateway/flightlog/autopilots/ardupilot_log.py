@@ -38,6 +38,8 @@ LATE_US: Final = US_PER_S
 """Messages of one loop are not quite in order; one later than this has a damaged time."""
 AHEAD_US: Final = 3_600 * US_PER_S
 """And so has one that jumps ahead by more."""
+BELIEVED: Final = 50
+"""So many messages in a row that agree about another time are right: the clock has leaped."""
 FIX_2D: Final = 2
 SENSOR_NUMBERS: Final = ("I", "C")
 """Columns with the number of the sensor, or Kalman filter, of a message."""
@@ -58,10 +60,14 @@ class ArdupilotReader:
     def __init__(self, vehicle_id: int) -> None:
         self.dropped = 0
         """Messages with an impossible time."""
+        self.leaps = 0
+        """How often the autopilot's clock jumped by more than that."""
         self.zero_us: int | None = None
         """The autopilot's time at the records' zero."""
         self._vehicle_id = vehicle_id
         self._newest_us = 0
+        self._odd_us = self._odd_count = 0
+        """The newest time that was not believed, and how many agreed about it."""
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
         """The newest fix, which waits for its accuracies."""
@@ -113,10 +119,23 @@ class ArdupilotReader:
             self.zero_us = own_us
         time_us = own_us - self.zero_us
         if not -LATE_US <= time_us - self._newest_us <= AHEAD_US:
-            self.dropped += 1
-            return None
+            if not self._has_leaped(own_us):
+                self.dropped += 1
+                return None
+            # The records' clock never goes back: a log that begins anew continues.
+            self.zero_us += min(time_us - self._newest_us, 0)
+            time_us = own_us - self.zero_us
+        self._odd_count = 0
         self._newest_us = max(self._newest_us, time_us)
         return self._newest_us
+
+    def _has_leaped(self, own_us: int) -> bool:
+        """Return whether enough messages in a row have such an odd time."""
+        agrees = abs(own_us - self._odd_us) <= LATE_US
+        self._odd_us, self._odd_count = own_us, self._odd_count + 1 if agrees else 1
+        has_leaped = self._odd_count == BELIEVED
+        self.leaps += has_leaped
+        return has_leaped
 
     def _imu(self, m: Message, time_us: int) -> list[Imported]:
         mag, self._mag = self._mag, None
@@ -146,9 +165,6 @@ class ArdupilotReader:
         has_fix = fix_type is not GpsFixType.NONE
         course_rad = math.radians(m.GCrs)
         level = (m.Spd * math.cos(course_rad), m.Spd * math.sin(course_rad))
-        utc_us = None
-        if m.GWk and has_fix:
-            utc_us = GPS_EPOCH_UNIX_US + m.GWk * WEEK_US + m.GMS * 1000 - LEAP_US
         self._fix = GpsFix(
             time_us=time_us,
             node=NodeId(self._vehicle_id, 1),
@@ -167,7 +183,7 @@ class ArdupilotReader:
             speed_acc_mps=NAN,
             course_acc_deg=NAN,
             pdop=NAN,
-            utc_us=utc_us,
+            utc_us=utc_of(m) if has_fix else None,
         )
         return []
 
@@ -220,3 +236,8 @@ class ArdupilotReader:
                 flags=flags,
             )
         ]
+
+
+def utc_of(m: Message) -> int | None:
+    """Return the civil time of a GPS message in µs since 1970; None before it is known."""
+    return GPS_EPOCH_UNIX_US + m.GWk * WEEK_US + m.GMS * 1000 - LEAP_US if m.GWk else None

@@ -14,6 +14,7 @@ from statistics import median_low
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gateway.flightlog.table.autopilot import VELOCITY_AGE_US
@@ -33,7 +34,7 @@ from gateway.records import (
     NodeId,
     Vec3,
 )
-from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA
+from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA, US_PER_S
 
 TOPICS: Final = (
     *("sensor_combined", "vehicle_magnetometer", "vehicle_air_data", "sensor_baro"),
@@ -43,6 +44,10 @@ TOPICS: Final = (
 """All that is read."""
 LEAST_PA: Final = 2000.0
 """A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
+AROUND: Final = 5
+"""Rows whose median time is believed."""
+FAR_US: Final = 60 * US_PER_S
+"""A row so far from that has a damaged time."""
 NOT_THERE: Final = 0x7FFFFFFF
 """A time relative to the sample's that means "no new one"."""
 EXTRAPOLATED: Final = 8
@@ -77,8 +82,13 @@ class Px4Log:
     def __init__(self, topics: Mapping[str, Topic], vehicle_id: int) -> None:
         self.dropped = 0
         """Samples with an impossible time."""
+        sound = {name: _sound_columns(topic) for name, topic in topics.items()}
+        self.left_out = sorted(name for name, topic in sound.items() if _lacks(name, topic))
+        """Topics without the fields that are needed of them."""
         self._topics = {
-            name: self._in_order(topic) for name, topic in topics.items() if "timestamp" in topic
+            name: self._in_order(topic)
+            for name, topic in sound.items()
+            if name not in self.left_out
         }
         if not len(self._topics.get("sensor_combined", {}).get("timestamp", ())):
             raise ValueError("holds no sensor_combined, the samples of the IMU")
@@ -92,7 +102,7 @@ class Px4Log:
         found = [
             row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
             for row in self._rows(*_GPS_TOPICS)
-            if row.get("time_utc_usec", 0) > UNIX_YEAR_2000_US
+            if UNIX_YEAR_2000_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
         ]
         return self._zero_us + median_low(found) if found else None
 
@@ -102,9 +112,13 @@ class Px4Log:
         return heapq.merge(*streams, key=lambda record: (record.time_us, ORDER[type(record)]))
 
     def _in_order(self, topic: Topic) -> Topic:
-        """Sort by time, and leave out rows without one."""
+        """Sort by time, and leave out rows without one, or with one far from those around it."""
         time_us = topic["timestamp"].astype(np.int64)
         sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
+        if len(time_us) >= AROUND:
+            around = np.median(sliding_window_view(time_us, AROUND), axis=1)
+            usual = np.pad(around, AROUND // 2, mode="edge")
+            sound &= np.abs(time_us - usual) < FAR_US
         self.dropped += int(np.count_nonzero(~sound))
         order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
         return {name: column[order] for name, column in topic.items()}
@@ -136,7 +150,9 @@ class Px4Log:
     def _fields_at_samples(self) -> dict[int, Vec3]:
         """Return the newest magnetic field of each IMU sample that has a new one, by its number."""
         imu = self._topics["sensor_combined"]
-        if "vehicle_magnetometer" not in self._topics and "magnetometer_ga[0]" in imu:
+        if "vehicle_magnetometer" not in self._topics and all(
+            axis in imu for axis in _axes("magnetometer_ga")
+        ):
             relative = imu.get("magnetometer_timestamp_relative", np.zeros(len(imu["timestamp"])))
             at = np.flatnonzero(relative != NOT_THERE).tolist()
             rows = list(self._rows("sensor_combined"))
@@ -190,7 +206,7 @@ class Px4Log:
             speed_acc_mps=row.get("s_variance_m_s", NAN) or NAN,
             course_acc_deg=math.degrees(row.get("c_variance_rad", NAN)) or NAN,
             pdop=math.hypot(row.get("hdop", NAN), row.get("vdop", NAN)) or NAN,
-            utc_us=utc_us if utc_us > UNIX_YEAR_2000_US else None,
+            utc_us=utc_us if UNIX_YEAR_2000_US < utc_us < LARGEST_WHOLE else None,
         )
 
     def _states(self) -> Iterator[NavState]:
@@ -233,6 +249,47 @@ class _Newest:
             self._row, self._next = self._next, next(self._rows, None)
         is_new = self._row and time_us - self._row["timestamp"] <= VELOCITY_AGE_US
         return self._row if is_new else {}
+
+
+_WHOLE: Final = frozenset((
+    "time_utc_usec", "fix_type", "satellites_used", "timestamp", "timestamp_time_relative",
+    "magnetometer_timestamp_relative", "baro_timestamp_relative",
+))  # fmt: skip
+"""Fields that are whole numbers."""
+
+
+def _axes(name: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{name}[{axis}]" for axis in range(count))
+
+
+_GPS_FIELDS: Final = (
+    ("lat", "latitude_deg"), ("lon", "longitude_deg"), ("vel_n_m_s",), ("vel_e_m_s",),
+    ("vel_d_m_s",),
+)  # fmt: skip
+_NEEDED: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
+    "sensor_combined": tuple(
+        (axis,) for axis in (*_axes("accelerometer_m_s2"), *_axes("gyro_rad"))
+    ),
+    "vehicle_magnetometer": tuple((axis,) for axis in _axes("magnetometer_ga")),
+    "vehicle_attitude": tuple((axis,) for axis in _axes("q", 4)),
+    "vehicle_gps_position": _GPS_FIELDS,
+    "sensor_gps": _GPS_FIELDS,
+}
+"""One of each is needed of a topic, beside its time."""
+
+
+def _sound_columns(topic: Topic) -> Topic:
+    """Leave out columns that are no numbers, or no whole ones where there are only such."""
+    return {
+        name: column
+        for name, column in topic.items()
+        if column.dtype.kind in ("iub" if name in _WHOLE else "iubf")
+    }
+
+
+def _lacks(name: str, topic: Topic) -> bool:
+    needed = (("timestamp",), *_NEEDED.get(name, ()))
+    return not all(any(field in topic for field in fields) for fields in needed)
 
 
 _GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")

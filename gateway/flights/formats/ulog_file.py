@@ -1,16 +1,13 @@
-"""ULog, the log of PX4, read by pyulog."""
+"""ULog, the log of PX4."""
 
-import contextlib
-import io
+import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
-
-from pyulog import ULog
-from pyulog.exceptions import ULogException
+from typing import Final
 
 from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
+from gateway.flightlog.autopilots.ulog import UlogReader
 from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
@@ -21,22 +18,23 @@ SYSTEM_ID: Final = "MAV_SYS_ID"
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a ULog as a flight; raises FlightError if there is none in it."""
-    log = _load(path, options)
-    topics = {data.name: data.data for data in reversed(log.data_list)}
-    known = log.initial_parameters.get(SYSTEM_ID, 1)
-    vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
+    log = UlogReader(TOPICS)
+    for data in read_chunks(path, options.progress):
+        log.feed(data)
+    log.feed(b"", final=True)
+    if log.is_newer:
+        raise FlightError(f"{path}: cannot be read: its flags say that it needs a newer program")
+    known = log.parameters.get(SYSTEM_ID, math.nan)
+    vehicle_id = options.system_id or (int(known) if 1 <= known <= 255 else 1)
     try:
-        flight = Px4Log(topics, vehicle_id)
+        flight = Px4Log(log.topics(), vehicle_id)
     except ValueError as error:
-        raise FlightError(f"{path}: {error}{_damage(log)}") from error
+        raise FlightError("; it ".join([f"{path}: {error}", *_damage(log)])) from error
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
-        try:
-            for record in flight.records():
-                yield from builder.add(record)
-        except KeyError as error:
-            raise FlightError(f"{path}: one of its topics has no field {error}") from error
+        for record in flight.records():
+            yield from builder.add(record)
         yield from builder.flush()
 
     table = table_of_rows(rows(), options, vehicle_id, flight.unix_us_at_zero)
@@ -44,25 +42,19 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     return table
 
 
-def _load(path: Path, options: ReadOptions) -> Any:
-    content = io.BytesIO(b"".join(read_chunks(path, options.progress)))
-    try:
-        # Damage that it prints to the terminal is reported by `_remarks`.
-        with contextlib.redirect_stdout(io.StringIO()):
-            return ULog(content, list(TOPICS))
-    except ULogException as error:
-        raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error
+def _damage(log: UlogReader) -> Iterator[str]:
+    if log.damaged_bytes:
+        yield f"is damaged: {log.damaged_bytes} bytes cannot be understood and were left out"
+    if log.cut_bytes:
+        yield f"ends within a message: {log.cut_bytes} bytes were left out"
 
 
-def _damage(log: Any) -> str:
-    return "; it is damaged, so that may be lost" if log.file_corruption else ""
-
-
-def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
-    if log.file_corruption:
-        yield "is damaged; what is sound of it was read"
-    if log.dropouts:
-        lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
-        yield f"its logger was too slow {len(log.dropouts)} times, {lost_s:.1f} s are not in it"
+def _remarks(log: UlogReader, flight: Px4Log) -> Iterator[str]:
+    yield from _damage(log)
+    if log.dropouts_ms:
+        lost_s = sum(log.dropouts_ms) / MS_PER_S
+        yield f"its logger was too slow {len(log.dropouts_ms)} times, {lost_s:.1f} s are not in it"
+    if flight.left_out:
+        yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
     if flight.dropped:
         yield f"{flight.dropped} samples without a time that can be were left out"

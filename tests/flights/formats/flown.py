@@ -253,10 +253,10 @@ def dataflash_size(form: str) -> int:
 
 
 def make_dataflash() -> bytes:
-    return b"".join(_packed(name, values) for name, values in dataflash_rows())
+    return b"".join(packed(name, values) for name, values in dataflash_rows())
 
 
-def _packed(name: str, values: Sequence[float | bytes]) -> bytes:
+def packed(name: str, values: Sequence[float | bytes]) -> bytes:
     number, form, _ = DATAFLASH[name]
     scaled = [
         round(value * SCALES[letter])

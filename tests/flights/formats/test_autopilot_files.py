@@ -4,6 +4,7 @@ import gzip
 import itertools
 import json
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -172,10 +173,22 @@ def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
 def test_what_is_not_installed_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "gateway.flights.formats.ulog_file", raising=False)
-    monkeypatch.setitem(sys.modules, "pyulog", None)
-    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.csv", code=2)
-    assert "needs pyulog, the extra mavgate[formats]" in " ".join(text.split())
+    monkeypatch.delitem(sys.modules, "gateway.flights.formats.mcap_file", raising=False)
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.mcap", code=2)
+    assert "needs mcap.writer, the extra mavgate[formats]" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_log_that_shrinks_while_it_is_read_just_ends(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    path = flown.write(tmp_path / name, (folder / name).read_bytes())
+    rows = open_rows(path, OPTIONS).plain_rows
+    found = [next(rows)]
+    os.truncate(path, 0)
+    found += rows
+    assert all(a.time_us <= b.time_us for a, b in itertools.pairwise(found))
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
