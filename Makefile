@@ -14,10 +14,13 @@ demo: .venv/.run
 	.venv/bin/mavgate demo
 
 # Tests that need the AVR tool chain or a browser skip, and say so, where it could not be installed.
+# A third of their time they wait, so there are three workers for two cores; and they start hundreds of
+# processes, which shall not each compile all sources anew.
+test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.dev
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
-	.venv/bin/pytest -q -n 2 --dist loadfile
+	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files

@@ -1,6 +1,7 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,13 @@ USERS_OWN = (
 """What tells a program where its user keeps things, or that it is a service."""
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run first the files with slow tests, so that no worker is left alone with one in the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    all_of = Counter(item.path for item in items)
+    items.sort(key=lambda item: (-slow[item.path], -all_of[item.path]))
 
 
 class ManualClock:

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,7 +22,7 @@ from gateway.compiled.entry_point import (
     dispatched,
     nothing_compiled,
 )
-from gateway.compiled.machine_code import keep_code
+from gateway.compiled.machine_code import compiling, keep_code
 from gateway.estimation.complementary.complementary_kernels import KERNELS
 
 FLOAT = np.dtype(np.float64)
@@ -49,6 +50,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def kept_in(folder: Path) -> list[Path]:
+    return list(folder.glob("*.code"))
+
+
 def use(entry: Callable[[int, int, float], None]) -> list[float]:
     numbers = np.array([1.0, 2.5])
     entry(address_of(numbers), 2, 0.25)
@@ -63,7 +68,7 @@ def test_an_entry_point_does_what_its_function_does_and_is_kept(folder: Path) ->
     assert use(first) == [3.25, 7.75]
     assert first.is_kept
     assert use(EntryPoint(scale)) == [3.25, 7.75]
-    assert len(list(folder.iterdir())) == 1
+    assert len(kept_in(folder)) == 1
 
 
 @pytest.mark.io
@@ -73,7 +78,7 @@ def test_a_running_gateway_compiles_nothing(folder: Path) -> None:
             use(EntryPoint(scale))
         with pytest.raises(NotCompiledError):
             dispatched(scale)(0, 0, 0.0)
-    assert not list(folder.iterdir())
+    assert not kept_in(folder)
     use(EntryPoint(scale))
     with nothing_compiled():
         assert use(EntryPoint(scale)) == [3.25, 7.75], "what is kept is loaded"
@@ -85,7 +90,7 @@ def test_a_running_gateway_compiles_nothing(folder: Path) -> None:
 )
 def test_damaged_code_is_made_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
     use(EntryPoint(scale))
-    [file] = folder.iterdir()
+    [file] = kept_in(folder)
     sound = file.read_bytes()
     file.write_bytes(damage(sound))
     assert not EntryPoint(scale).is_kept
@@ -101,7 +106,7 @@ def test_code_of_an_earlier_source_goes(folder: Path, monkeypatch: pytest.Monkey
     # The compiler of this process has bound the constant already.
     monkeypatch.setitem(globals(), "scaled", compiled(lambda x: 5.0 * x))
     assert use(EntryPoint(scale)) == [5.25, 12.75]
-    assert len(list(folder.iterdir())) == 1
+    assert len(kept_in(folder)) == 1
 
 
 @pytest.mark.io
@@ -116,10 +121,28 @@ def test_where_nothing_can_be_kept_it_works_all_the_same(
 
 
 @pytest.mark.io
+def test_what_another_process_compiles_is_waited_for(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread stands for the process: a lock of files keeps them apart as well."""
+    code, name, digest = compile_entry(compiled(scale)), f"{__name__}.scale", digest_of(scale)
+
+    def fail(_: object) -> None:
+        raise AssertionError("compiled twice")
+
+    monkeypatch.setattr("gateway.compiled.compiler.compile_entry", fail)
+    with ThreadPoolExecutor() as pool:
+        with compiling(name):
+            found = pool.submit(EntryPoint(scale).code)
+            keep_code(name, digest, code)
+        assert found.result() == code
+
+
+@pytest.mark.io
 def test_an_entry_point_may_not_allocate(folder: Path) -> None:
     with pytest.raises(TypeError, match="allocate"):
         EntryPoint(allocate)(3)
-    assert list(folder.iterdir()) == []
+    assert not kept_in(folder)
 
 
 @pytest.mark.io

@@ -9,7 +9,13 @@ from inspect import signature
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 from gateway.compiled import compiled, digest_of
-from gateway.compiled.machine_code import MachineCode, keep_code, kept_code, load_code
+from gateway.compiled.machine_code import (
+    MachineCode,
+    compiling,
+    keep_code,
+    kept_code,
+    load_code,
+)
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -94,11 +100,16 @@ class EntryPoint(Generic[Parameters]):
         if code is None:
             if not _may_compile:
                 raise NotCompiledError(f"{name} is not compiled yet")
-            # Imported late, here and below: numba takes 60 MB.
-            from gateway.compiled.compiler import compile_entry
+            with compiling(name):
+                code = kept_code(name, digest) or self._compile(name, digest)
+        return code
 
-            code = compile_entry(self._function)
-            keep_code(name, digest, code)
+    def _compile(self, name: str, digest: str) -> MachineCode:
+        # Imported late, here and below: numba takes 60 MB.
+        from gateway.compiled.compiler import compile_entry
+
+        code = compile_entry(self._function)
+        keep_code(name, digest, code)
         return code
 
     def _load(self, code: MachineCode) -> Callable[..., None]:

@@ -6,6 +6,7 @@ from and for, and its first bytes are a digest of its content: damaged or foreig
 
 import contextlib
 import ctypes
+import fcntl
 import hashlib
 import os
 import sys
@@ -101,6 +102,27 @@ def keep_code(name: str, digest: str, code: MachineCode) -> None:
                 if old != target:
                     old.unlink()
             return
+
+
+@contextlib.contextmanager
+def compiling(name: str) -> Iterator[None]:
+    """Compile a function in one process at a time: the next finds what the one before has cached.
+
+    Where nothing can be cached, nothing is waited for.
+
+    Parameters
+    ----------
+    name : str
+        As for `kept_code`.
+    """
+    with contextlib.ExitStack() as opened:
+        for folder in _folders():
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = opened.enter_context((folder / f"{name}.lock").open("a"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                break
+        yield
 
 
 def load_code(code: MachineCode) -> int:

@@ -32,8 +32,7 @@ from gateway.records import NavFlags
 from tools.flights import Flight, north_east_m, simulated_flight
 from tools.score_estimators import attitude_scores
 
-ESTIMATORS = ("eskf", "complementary")
-"""In another order than the spoilt flights have: workers that begin both compile one each."""
+ESTIMATORS = ("complementary", "eskf")
 FASTEST_MPS = 1000.0
 Nonsense = Callable[[SampleLog, np.random.Generator], None]
 
