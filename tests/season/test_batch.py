@@ -14,6 +14,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
+from gateway.analysis.reporting.sections.ground_track import ground_track
 from gateway.cli.app import app
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
@@ -190,11 +191,17 @@ def test_names_that_are_not_utf8_stop_nothing(season: Path, tmp_path: Path) -> N
     assert places == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
 
 
-def test_a_report_is_put_in_place_as_a_whole(season: Path, tmp_path: Path) -> None:
+def test_a_report_is_put_in_place_as_a_whole(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One section stands for all of them, which take ten seconds to draw."""
+    monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (ground_track,))
     code, _ = run("report", season / FLIGHTS[0], "-o", tmp_path)
     assert code == 0
-    assert "Flight report: alpha" in (tmp_path / "reports" / "alpha" / "index.html").read_text()
-    assert (tmp_path / "reports" / "alpha" / "ground_track.svg").exists()
+    folder = tmp_path / "reports" / "alpha"
+    assert "Flight report: alpha" in (folder / "index.html").read_text()
+    names = {"index.html", "ground_track.png", "ground_track.svg"}
+    assert {file.name for file in folder.iterdir()} == names
 
 
 def test_two_recordings_of_one_name_are_kept_apart(season: Path, tmp_path: Path) -> None:

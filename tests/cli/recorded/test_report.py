@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.analysis.reporting.page import Report
+from gateway.analysis.reporting.sections.raw_sensors import timing
 from gateway.cli.app import app
 from gateway.cli.recorded import report
 from gateway.flightlog.table.row import row_to_line
@@ -16,8 +17,11 @@ from tests.analysis.test_sources import rows
 pytestmark = pytest.mark.io
 
 
-@pytest.mark.slow
-def test_a_recording_is_reported_beside_other_settings(tmp_path: Path) -> None:
+def test_a_recording_is_reported_beside_other_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One section stands for all of them, which take ten seconds to draw."""
+    monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (timing,))
     recording, other = tmp_path / "flight.csv", tmp_path / "other.toml"
     recording.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, rows(raw=True))))
     other.write_text('[estimation]\nestimator = "paper"\n')
