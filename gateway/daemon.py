@@ -99,7 +99,7 @@ class Daemon:
             self.now_us,
             on_foreign=lambda frame: self._recorder.frame(frame),
             on_gone=self._on_gone,
-            on_trouble=partial(self._announce, True),
+            on_trouble=self._announce,
             seal=partial(self._pipeline.seal, now_us=self.now_us),
             recordings=Path(settings.recording.folder).expanduser(),
         )

@@ -6,6 +6,7 @@ from and for, and its first bytes are a digest of its content: damaged or foreig
 
 import contextlib
 import ctypes
+import errno
 import fcntl
 import hashlib
 import os
@@ -126,14 +127,24 @@ def compiling(name: str) -> Iterator[None]:
 
 
 def load_code(code: MachineCode) -> int:
-    """Load machine code into this process for good, and return the address of its function."""
+    """Load machine code into this process for good, and return the address of its function.
+
+    Raises
+    ------
+    OSError
+        If there are no file descriptors left.
+    """
     if code.shared is not None:
-        # It may be forbidden to execute what lies there.
-        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(suffix=".so") as file:
-            file.write(code.shared)
-            file.flush()
-            function = ctypes.CDLL(file.name)[ENTRY]
-            return ctypes.cast(function, ctypes.c_void_p).value or 0
+        try:
+            with tempfile.NamedTemporaryFile(suffix=".so") as file:
+                file.write(code.shared)
+                file.flush()
+                function = ctypes.CDLL(file.name)[ENTRY]
+                return ctypes.cast(function, ctypes.c_void_p).value or 0
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                raise
+            # It may be forbidden to execute what lies there, or the disk is full.
     return _load_by_llvm(code.relocatable)
 
 

@@ -94,6 +94,7 @@ def run_panel(
     sock = _bound(settings, or_any=attached)
     parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
+    logging.getLogger("uvicorn.error").addFilter(without_traceback)
     lock = PageLock(settings.password, settings.viewer_password)
     config = uvicorn.Config(
         PageGuard(app, settings, lock),
@@ -112,6 +113,13 @@ def run_panel(
         raise PanelError(f"certificate {settings.certificate}: {error.strerror}") from error
     on_open = partial(on_link, _link(settings, sock))
     asyncio.run(_serve(config, sock, parts, on_open, attached=attached))
+
+
+def without_traceback(record: logging.LogRecord) -> bool:
+    """Let a log line pass, without a traceback where a browser sent what is no text."""
+    if record.exc_info and isinstance(record.exc_info[1], UnicodeDecodeError):
+        record.exc_info = None
+    return True
 
 
 def make_parts(

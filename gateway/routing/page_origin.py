@@ -51,6 +51,14 @@ def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
     return address is not None and (address.is_loopback or address == _address(local_host))
 
 
+def names_loopback(host_header: str) -> bool:
+    """Return whether a request's `Host` is loopback: a page of elsewhere, rebound to it, is not."""
+    try:
+        return is_loopback(urlsplit(f"//{host_header.strip()}").hostname or "")
+    except ValueError:
+        return False
+
+
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
         address = ipaddress.ip_address(host.partition("%")[0])

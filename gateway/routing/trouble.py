@@ -4,7 +4,7 @@ Every configured client gets its own texts. The clients of a listening port may 
 number: of them only a few are named in a minute, so that an attack cannot hide other texts.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from gateway.routing.client_table import ClientStats, ListenerStats
 from gateway.routing.digest import Digest
@@ -14,13 +14,25 @@ PATIENCE_US: Final = 5 * US_PER_S
 """A shorter outage is not announced."""
 QUIET_US: Final = 30 * US_PER_S
 """A client that has dropped nothing for so long is no longer slow."""
-TROUBLED_STATES: Final = frozenset({"unreachable", "resolving", "connecting"})
-"""`refused` is not among them: a ground station that is not running is nothing unusual."""
+TROUBLED_STATES: Final = {
+    "unreachable": "unreachable",
+    "resolving": "its address is not known",
+    "connecting": "not connected",
+}
+"""What to say if there is no reason. `refused` is not among them: a ground station that is not
+running is nothing unusual."""
 CALLERS_IN_FULL: Final = 3
 """Problems of listening ports' clients that are announced one by one in a minute."""
 
 Key = int | str
 """Id of a client, or URL of a listening port."""
+
+
+class News(NamedTuple):
+    """The begin or the end of a problem."""
+
+    is_trouble: bool
+    text: str
 
 
 class TroubleWatch:
@@ -39,8 +51,8 @@ class TroubleWatch:
         clients: tuple[ClientStats, ...],
         listeners: tuple[ListenerStats, ...],
         now_us: int,
-    ) -> list[str]:
-        """Look at all figures; return the new texts.
+    ) -> list[News]:
+        """Look at all figures; return what is new.
 
         Parameters
         ----------
@@ -53,37 +65,42 @@ class TroubleWatch:
 
         Returns
         -------
-        list of str
+        list of News
             Short texts.
         """
         ports = {listener.endpoint for listener in listeners}
         self._forget_all_but({client.client_id for client in clients}, ports)
-        texts = self._callers.poll(now_us)
+        news = [News(True, text) for text in self._callers.poll(now_us)]
         for listener in listeners:
-            texts += self._away(listener.endpoint, listener.name, listener.reason, now_us)
+            news += self._away(listener.endpoint, listener.name, listener.reason, now_us)
         for client in clients:
-            trouble = client.reason or client.state if client.state in TROUBLED_STATES else ""
+            state = TROUBLED_STATES.get(client.state, "")
+            trouble = client.reason or state if state else ""
             found = self._away(client.client_id, client.name, trouble, now_us)
             found += self._slow(client, now_us)
             if client.endpoint in ports:
-                found = [line for text in found for line in self._callers.say(text, now_us)]
-            texts += found
-        return texts
+                found = [
+                    News(is_trouble, line)
+                    for is_trouble, text in found
+                    for line in self._callers.say(text, now_us)
+                ]
+            news += found
+        return news
 
-    def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[str]:
+    def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[News]:
         if not trouble:
             self._away_since_us.pop(key, None)
             if key in self._away_told:
                 self._away_told.remove(key)
-                return [f"{name} is back"]
+                return [News(False, f"{name} is back")]
             return []
         since_us = self._away_since_us.setdefault(key, now_us)
         if key in self._away_told or now_us - since_us < PATIENCE_US:
             return []
         self._away_told.add(key)
-        return [f"{name}: {trouble}"]
+        return [News(True, f"{name}: {trouble}")]
 
-    def _slow(self, client: ClientStats, now_us: int) -> list[str]:
+    def _slow(self, client: ClientStats, now_us: int) -> list[News]:
         key = client.client_id
         before = self._dropped.pop(key, client.dropped)
         if client.state == "open":
@@ -94,7 +111,7 @@ class TroubleWatch:
             return []
         was_slow = key in self._slow_until_us
         self._slow_until_us[key] = now_us + QUIET_US
-        return [] if was_slow else [f"{client.name} is too slow: telemetry dropped"]
+        return [] if was_slow else [News(True, f"{client.name} is too slow: telemetry dropped")]
 
     def _forget_all_but(self, clients: set[int], listeners: set[str]) -> None:
         for known in (self._dropped, self._slow_until_us):

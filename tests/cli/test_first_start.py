@@ -1,12 +1,16 @@
 """What runs before everything is compiled, and what helps at the prompt."""
 
 import asyncio
+import errno
+import logging
 import math
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +18,7 @@ import pytest
 from gateway.cli.app import app
 from gateway.cli.support import warm_up
 from gateway.cli.support.warm_up import ENTRY_POINTS, SCANNER, make_ready
-from gateway.compiled import address_of, array_at, compiled_with
+from gateway.compiled import address_of, array_at, compiled_with, machine_code
 from gateway.compiled.entry_point import EntryPoint
 
 pytestmark = pytest.mark.io
@@ -95,6 +99,38 @@ def test_without_a_compiler_it_goes_on_as_python(
     assert not compiling.take_one()
     assert "the compiler has failed" in caplog.text
     assert quotient(points["paper"], 7.0, 2.0) == 3.5
+
+
+async def test_what_cannot_be_loaded_now_is_loaded_later_and_told_once(
+    points: dict[str, EntryPoint[int]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """At the limit of file descriptors."""
+    later: list[Callable[[], None]] = []
+    monkeypatch.setattr(
+        asyncio.get_running_loop(), "call_later", lambda _, work: later.append(work)
+    )
+    compiling = make_ready("eskf")
+    assert compiling is not None
+    with monkeypatch.context() as short:
+        none_left = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        short.setattr(machine_code.tempfile, "NamedTemporaryFile", Mock(side_effect=none_left))
+        by_llvm = Mock(side_effect=none_left)
+        short.setattr(machine_code, "_load_by_llvm", by_llvm)
+        with pytest.raises(OSError, match="Too many"):
+            machine_code.load_code(machine_code.MachineCode(b"", b"library"))
+        by_llvm.assert_not_called()
+        while compiling.take_one():
+            pass
+        later.pop()()
+    assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING] == [
+        "machine code is loaded later: [Errno 24] Too many open files"
+    ]
+    assert all(quotient(point, 1.0, 0.0) == 1.0 for point in points.values()), "as Python"
+    (load,) = later
+    load()
+    assert all(quotient(point, 1.0, 0.0) == math.inf for point in points.values())
 
 
 def test_the_chosen_estimators_are_compiled_first(

@@ -1,6 +1,7 @@
 """Who may reach the page: tested on the guard alone, before an application that grants all."""
 
 import http
+import logging
 from collections.abc import AsyncIterator
 
 import httpx
@@ -9,6 +10,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
+from gateway.panel.panel_server import without_traceback
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.serving.page_guard import COOKIE, MAX_BODY, ROLE, PageGuard
 from gateway.panel.serving.page_lock import MAX_FAILURES, PageLock, hash_password, matches
@@ -184,3 +186,14 @@ def test_hash_matches_its_password_alone() -> None:
 def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: str) -> None:
     with pytest.raises(ValueError, match=missing):
         PanelSettings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("error", "is_kept"),
+    [(UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no text"), False), (OSError("another"), True)],
+)
+def test_what_is_no_text_is_one_line_in_the_log(error: Exception, is_kept: bool) -> None:
+    cause = (type(error), error, None)
+    record = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Invalid", (), cause)
+    assert without_traceback(record)
+    assert (record.exc_info is not None) == is_kept

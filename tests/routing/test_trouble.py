@@ -33,7 +33,7 @@ def client(**changes: object) -> tuple[ClientStats, ...]:
 
 
 def look(watch: TroubleWatch, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
-    return watch.update(clients, (), now_us)
+    return [text for _, text in watch.update(clients, (), now_us)]
 
 
 def test_a_short_absence_is_not_reported() -> None:
@@ -52,6 +52,12 @@ def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
     assert look(watch, client(), 22 * S) == []
 
 
+def test_a_router_that_has_gone_is_reported_in_plain_words() -> None:
+    watch = TroubleWatch()
+    texts = [text for n in range(20) for text in look(watch, client(state="connecting"), n * S)]
+    assert texts == ["tablet: not connected"]
+
+
 def test_the_reason_is_reported_if_it_is_known() -> None:
     watch = TroubleWatch()
     away = client(state="unreachable", reason="Permission denied")
@@ -62,10 +68,10 @@ def test_the_reason_is_reported_if_it_is_known() -> None:
 def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
     watch, taken = TroubleWatch(), "Address already in use"
     closed = ListenerStats("here", "udp-listen:0.0.0.0:14550", "closed", taken, 0, 0, 0)
-    texts = [text for n in range(20) for text in watch.update((), (closed,), n * S)]
-    assert texts == [f"here: {taken}"]
+    news = [each for n in range(20) for each in watch.update((), (closed,), n * S)]
+    assert news == [(True, f"here: {taken}")]
     opened = dataclasses.replace(closed, state="open", reason="", port=14550)
-    assert watch.update((), (opened,), 21 * S) == ["here is back"]
+    assert watch.update((), (opened,), 21 * S) == [(False, "here is back")]
     watch.update((), (closed,), 22 * S)
     assert watch.update((), (), 23 * S) == []
     assert not watch._away_since_us
@@ -115,7 +121,7 @@ def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
             for number in range(n * 10, n * 10 + 20)
         )
         clients = (*client(dropped=100 * (n >= 50)), *strangers)
-        texts += watch.update(clients, listeners, n * S)
+        texts += [text for _, text in watch.update(clients, listeners, n * S)]
     assert texts.count("tablet is too slow: telemetry dropped") == 1
     assert len([text for text in texts if text.startswith("stranger")]) == 2 * 3
     (summed,) = [text for text in texts if "more troubles" in text]

@@ -5,6 +5,7 @@ import gc
 import logging
 import os
 import signal
+from collections import deque
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Final
@@ -12,6 +13,7 @@ from typing import Final
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.compiled.entry_point import EntryPoint
+from gateway.compiled.machine_code import MachineCode
 from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper.paper_entry import step_live
@@ -33,6 +35,8 @@ ENTRY_POINTS: Final[dict[str, tuple[EntryPoint[...], ...]]] = {
     SCANNER: (scan_at,),
 }
 """The machine code that each estimator needs, the largest first, and what every gateway needs."""
+LOAD_AGAIN_S: Final = 5.0
+"""After which machine code is loaded that could not be, as there were no file descriptors left."""
 BEHIND: Final = 10
 """Niceness of the process that compiles while telemetry runs."""
 
@@ -85,6 +89,9 @@ class Compilation:
 
     def __init__(self, names: Sequence[str]) -> None:
         self._missing = {(name, k) for name in names for k in range(len(ENTRY_POINTS[name]))}
+        self._received: deque[tuple[str, int, MachineCode]] = deque()
+        """What is not loaded yet."""
+        self._is_told = False
         self._receiver = begin_copy(_compile, names)
 
     def watch(self) -> None:
@@ -101,16 +108,31 @@ class Compilation:
     def take_one(self) -> bool:
         """Wait for the next function and load it; return whether there was one."""
         try:
-            name, place, code = self._receiver.recv()
+            self._received.append(self._receiver.recv())
         except EOFError:
-            if self._missing:
+            if len(self._missing) > len(self._received):
                 log.warning("the compiler has failed: estimates go on costing more computing")
             return False
-        ENTRY_POINTS[name][place].take(code)
-        self._missing.discard((name, place))
-        if not self._missing:
-            log.info("everything is compiled; later starts find it so")
+        if len(self._received) == 1:
+            self._load()
         return True
+
+    def _load(self) -> None:
+        """Load what has been received; what cannot be loaded now is tried again."""
+        while self._received:
+            name, place, code = self._received[0]
+            try:
+                ENTRY_POINTS[name][place].take(code)
+            except (OSError, ImportError) as error:
+                if not self._is_told:
+                    log.warning("machine code is loaded later: %s", error)
+                self._is_told = True
+                asyncio.get_running_loop().call_later(LOAD_AGAIN_S, self._load)
+                return
+            self._received.popleft()
+            self._missing.discard((name, place))
+            if not self._missing:
+                log.info("everything is compiled; later starts find it so")
 
 
 def _compile(names: Sequence[str], sender: Connection) -> None:

@@ -21,10 +21,10 @@ from gateway.wire.mavlink_splitter import SplitFault
 
 READ_BYTES: Final = 4096
 """The most that is read from one client at one wake-up; see `HubContext.read_bytes`."""
-STRANGERS_RATE: Final = 64_000
+STRANGERS_READ_RATE: Final = 64_000
 """Bytes a second read from all untrusted clients together: at most 5000 frames, a tenth of a
 processor. What is beyond waits with the sender, or is lost in the kernel."""
-STRANGERS_BURST: Final = 256_000
+STRANGERS_READ_BURST: Final = 256_000
 
 Write = Callable[[bytes], object]
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from gateway.edges.hub.client import READ_BYTES, STRANGERS_BURST, STRANGERS_RATE, Client
+from gateway.edges.hub.client import READ_BYTES, STRANGERS_READ_BURST, STRANGERS_READ_RATE, Client
 from gateway.edges.hub.listener import Listener
 from gateway.edges.hub.router import Router
 from gateway.edges.hub.transports import CLIENTS, LISTENERS
@@ -63,7 +63,7 @@ class Hub:
     on_gone : callable, optional
         Called with the id of a client that has gone for good.
     on_trouble : callable, optional
-        Called with a short text when a problem of a client begins or ends.
+        Called when a problem of a client begins (True) or ends, with a short text.
     seal : callable, optional
         Numbers, and signs, each frame of ours that leaves; without it none is signed.
     recordings : Path, optional
@@ -77,7 +77,7 @@ class Hub:
         now_us: Callable[[], int],
         on_foreign: Callable[[bytes], None] | None = None,
         on_gone: Callable[[int], None] | None = None,
-        on_trouble: Callable[[str], None] | None = None,
+        on_trouble: Callable[[bool, str], None] | None = None,
         seal: Seal = restamp,
         recordings: Path | None = None,
     ) -> None:
@@ -85,7 +85,7 @@ class Hub:
         self.recordings = recordings
         self.seal = seal
         self.now_us = now_us
-        self.strangers = Purse(STRANGERS_RATE, STRANGERS_BURST, STRANGERS_BURST)
+        self.strangers = Purse(STRANGERS_READ_RATE, STRANGERS_READ_BURST, STRANGERS_READ_BURST)
         self._on_gone = on_gone
         self._on_trouble = on_trouble
         self._trouble = TroubleWatch()
@@ -377,10 +377,10 @@ class Hub:
     def _report_trouble(self, now_us: int) -> None:
         for line in self._visits.poll(now_us):
             log.info("%s", line)
-        for text in self._trouble.update(self.clients(), self.listeners(), now_us):
-            log.warning("%s", text)
+        for is_trouble, text in self._trouble.update(self.clients(), self.listeners(), now_us):
+            log.log(logging.WARNING if is_trouble else logging.INFO, "%s", text)
             if self._on_trouble is not None:
-                self._on_trouble(text)
+                self._on_trouble(is_trouble, text)
 
     def _log_visit(self, client: Client, text: str) -> None:
         is_caller = client.endpoint.kind in LISTENERS

@@ -2,25 +2,28 @@
 
 import asyncio
 import logging
+import re
 import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ListenerStats
+from gateway.routing.page_origin import names_loopback
 
 log = logging.getLogger(__name__)
 
 REQUEST_LIMIT_S: Final = 5.0
 MAX_REQUEST_BYTES: Final = 8192
 MAX_CONNECTIONS: Final = 8
+HOST: Final = re.compile(rb"^host:(.*?)\r$", re.IGNORECASE | re.MULTILINE)
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 RETRY_S: Final = 5.0
 """Between attempts to bind a port in use: about the interval of a scraper."""
 
 
 class MetricsServer:
-    """Answer every HTTP GET with the present metrics.
+    """Answer an HTTP GET with the present metrics, unless a page asks under a name of its own.
 
     Parameters
     ----------
@@ -123,9 +126,11 @@ class MetricsServer:
                 log.debug("metrics request failed: %s", error)
 
     async def _respond(self, request: bytes) -> bytes:
-        words = request.split()
-        if words[:1] != [b"GET"]:
+        if not request.startswith(b"GET "):
             return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
+        host = HOST.search(request)
+        if host is not None and not names_loopback(host[1].decode("latin-1")):
+            return b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
         pieces = []
         for piece in self._text():
             # All of them take some milliseconds, so telemetry goes on between two.

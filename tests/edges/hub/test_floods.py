@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateway.edges.hub.client import READ_BYTES, STRANGERS_BURST, STRANGERS_RATE
+from gateway.edges.hub.client import READ_BYTES, STRANGERS_READ_BURST, STRANGERS_READ_RATE
 from gateway.edges.hub.udp import MAX_DATAGRAM
 
 pytestmark = pytest.mark.io
@@ -68,7 +68,7 @@ async def test_strangers_together_are_read_slowly(rig: Any, kind: str) -> None:
             await asyncio.sleep(0)
 
     async with asyncio.timeout(60):
-        await flood_until(STRANGERS_BURST)
+        await flood_until(STRANGERS_READ_BURST)
         for _ in range(20):
             for sock in floods:
                 send(sock)
@@ -76,11 +76,11 @@ async def test_strangers_together_are_read_slowly(rig: Any, kind: str) -> None:
         await caller(rig, other, quiet_port)
         await rig.until(lambda: any(incoming.trusted for incoming in rig.incoming))
         # Each of the two may have been reading when the last was spent.
-        limit = STRANGERS_BURST + len(floods) * (READ_BYTES + MAX_DATAGRAM)
-        assert STRANGERS_BURST <= taken() < limit
+        limit = STRANGERS_READ_BURST + len(floods) * (READ_BYTES + MAX_DATAGRAM)
+        assert STRANGERS_READ_BURST <= taken() < limit
         rig.clock.us += 2_000_000
-        await flood_until(STRANGERS_BURST + STRANGERS_RATE)
-        assert taken() < limit + 2 * STRANGERS_RATE
+        await flood_until(STRANGERS_READ_BURST + STRANGERS_READ_RATE)
+        assert taken() < limit + 2 * STRANGERS_READ_RATE
 
 
 async def test_who_becomes_trusted_is_read_at_once(rig: Any) -> None:

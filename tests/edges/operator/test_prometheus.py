@@ -154,7 +154,7 @@ class TestServer:
     async def test_serves_and_refuses(self) -> None:
         server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         server.listen(free_port())
-        answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+        answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: localhost:9\r\n\r\n")
         head, _, body = answer.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200 OK")
         assert f"Content-Length: {len(body)}".encode() in head
@@ -166,6 +166,25 @@ class TestServer:
         assert server.port == 0
         with pytest.raises(ConnectionRefusedError):
             await self.ask(port, b"GET / HTTP/1.1\r\n\r\n")
+
+    @pytest.mark.parametrize(
+        ("host", "status"),
+        [
+            *((host, b"200") for host in ("127.0.0.1", "127.0.0.1:99", "[::1]:99", "LOCALHOST")),
+            *(
+                (host, b"403")
+                for host in ("evil.example", "localhost.evil.example", "", "[", "\xff")
+            ),
+        ],
+    )
+    async def test_a_page_that_is_rebound_to_loopback_gets_nothing(
+        self, host: str, status: bytes
+    ) -> None:
+        server = MetricsServer(lambda: iter(["text"]))
+        for name in ("Host", "hOST"):
+            request = f"GET / HTTP/1.1\r\nAccept: */*\r\n{name}: {host}\r\n\r\n"
+            answer = await server._respond(request.encode("latin-1"))
+            assert answer.startswith(b"HTTP/1.1 " + status)
 
     async def test_the_loop_goes_on_between_two_families(self) -> None:
         called: list[int] = []
