@@ -26,6 +26,8 @@ FIRST_FIELD_S: Final = 5.0
 TURNING_RADPS: Final = 0.35
 STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
+PLACE_RAD: Final = 1.0 * RAD_PER_DEG
+"""What the declination is off, and the compass on its board."""
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
 """How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
 STUCK_TURN_RAD: Final = 0.2

@@ -13,8 +13,9 @@ USABLE_FIXES: Final = frozenset(
 )
 FIELD_RENEWAL_M: Final = 20_000.0
 """The declination changes by well under 0.5 deg over this way."""
-NO_DECLINATION_RAD: Final = 0.2
-"""Magnetic north may be off by so much where the declination is not known."""
+NO_DECLINATION_RAD: Final = 0.29
+"""Magnetic north may be off by so much where the declination is not known: the root of the mean
+square of the declination within 60 deg of the equator."""
 
 
 class ReferenceSettings(Settings, frozen=True):

@@ -13,14 +13,11 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.magfield import MIN_FIELD_UT, SETTLE_S, bent_share_sq
+from gateway.estimation.magfield import MIN_FIELD_UT, PLACE_RAD, SETTLE_S, bent_share_sq
 from gateway.records import Vec3
-from gateway.units import RAD_PER_DEG
 
 IRON_TAU_S: Final = 60.0
 """The mean of the field is taken over this time: it holds turns in all directions."""
-PLACE_RAD: Final = 1.0 * RAD_PER_DEG
-"""What the declination is off, and the compass on its board."""
 EXPECTED_SHARE: Final = 1.0 / 3.0
 """The iron to be expected counts as much as what one axis of three has shown."""
 

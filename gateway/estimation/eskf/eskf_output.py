@@ -17,6 +17,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
 from gateway.estimation.eskf.iron import standing_field_var
+from gateway.estimation.eskf.level_doubt import standing_level_var
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR
 from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
@@ -68,6 +69,9 @@ def write_output(s: EskfState, row: FloatArray) -> None:
     fill(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], NAN)
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
+        for k in range(2):
+            told = row[NAV_ATTITUDE_STD + k]
+            row[NAV_ATTITUDE_STD + k] = math.sqrt(told * told + standing_level_var(s))
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_place(s, row)
 

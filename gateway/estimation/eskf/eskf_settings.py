@@ -61,7 +61,14 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Gyroscope bias at the start.", "deg/s", ge=0.01, le=20.0)
     ] = 0.6
     accel_bias_mps2: Annotated[
-        float, setting("Accelerometer bias at the start.", "m/s2", ge=0.001, le=2.0)
+        float,
+        setting(
+            "Accelerometer bias while nothing but gravity tells the level; at the first fix it is "
+            "taken to be 0.04 at least.",
+            "m/s2",
+            ge=0.001,
+            le=2.0,
+        ),
     ] = 0.0195
     gps_position_m: Annotated[
         float, setting("Noise of a fix from one to the next, horizontal.", "m", ge=0.01, le=50.0)
@@ -97,7 +104,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 4.7
     mag_bias_ut: Annotated[
         float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
-    ] = 0.3
+    ] = 0.5
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.005

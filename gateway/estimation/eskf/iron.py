@@ -20,7 +20,7 @@ from gateway.estimation.eskf.measure import (
     compass_row,
 )
 from gateway.estimation.kernel_record import as_vec
-from gateway.estimation.magfield import FIELD_TAU_S, FIRST_FIELD_S, STALE_MAG_S
+from gateway.estimation.magfield import FIELD_TAU_S, FIRST_FIELD_S, PLACE_RAD, STALE_MAG_S
 from gateway.records import Vec3
 
 MEAN_S: Final = 60.0
@@ -126,11 +126,11 @@ def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
 
 @compiled
 def standing_field_var(s: EskfState) -> float:
-    """Return the variance of a heading by iron that nothing tells from it yet, rad2.
+    """Return the variance of a heading by iron and place that nothing tells from it yet, rad2.
 
     It is one error for as long as the flight lasts, until GPS makes the iron a state of its own.
     """
     level_ut = math.hypot(s.field_n[0], s.field_n[1])
     if s.iron_search_started == 1 or level_ut == 0.0:
         return 0.0
-    return (s.left_iron_ut / level_ut) ** 2
+    return (s.left_iron_ut / level_ut) ** 2 + PLACE_RAD * PLACE_RAD

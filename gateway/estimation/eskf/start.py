@@ -23,6 +23,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.iron import has_followed_compass
+from gateway.estimation.eskf.level_doubt import doubt_level
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
@@ -114,8 +115,6 @@ def start_iron_search(s: EskfState) -> None:
 
     A heading that came from the compass has the iron's error, reversed.
     """
-    if s.iron_search_started == 1:
-        return
     s.iron_search_started = 1
     by_compass = has_followed_compass(s)
     variance = s.left_iron_ut * s.left_iron_ut
@@ -158,7 +157,9 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
-    start_iron_search(s)
+    if s.iron_search_started == 0:
+        doubt_level(s, p)
+        start_iron_search(s)
     s.off_last_m = s.contradiction_m = 0.0
 
 

@@ -1,0 +1,42 @@
+"""The level before GPS: it rests on the accelerometer, whose bias tilts it.
+
+A level found by gravity has the error `bias / g`. Before there are velocities to compare with,
+nothing tells that bias from tilt: it cannot be estimated, but the tilt is told with it.
+"""
+
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.covariance import renew
+from gateway.estimation.eskf.eskf_settings import EskfGains
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
+from gateway.estimation.kernel_record import as_quat
+from gateway.geometry.quaternion import rotate
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+LEFT_BIAS_MPS2: Final = 0.04
+"""What a calibration leaves along each axis, and the axes of the chip on its board add."""
+LEFT_LEVEL_VAR: Final = (LEFT_BIAS_MPS2 / STANDARD_GRAVITY_MPS2) ** 2
+"""The same of the level, rad2."""
+
+
+@compiled
+def standing_level_var(s: EskfState) -> float:
+    """Return the variance of the tilt about a level axis by a bias that nothing tells yet, rad2."""
+    return 0.0 if s.iron_search_started == 1 else LEFT_LEVEL_VAR
+
+
+@compiled
+def doubt_level(s: EskfState, p: EskfGains) -> None:
+    """Look for the bias from here on, and for what it has tilted."""
+    variance = max(LEFT_BIAS_MPS2**2, p.accel_bias_var)
+    q = as_quat(s.q_nb)
+    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
+    for k in range(3):
+        renew(s, ACCEL_BIAS + k, variance)
+        share = variance / STANDARD_GRAVITY_MPS2
+        north, east = share * axes[k][0], share * axes[k][1]
+        s.P[TILT, ACCEL_BIAS + k] = s.P[ACCEL_BIAS + k, TILT] = east
+        s.P[TILT + 1, ACCEL_BIAS + k] = s.P[ACCEL_BIAS + k, TILT + 1] = -north
+    for k in range(2):
+        s.P[TILT + k, TILT + k] += variance / STANDARD_GRAVITY_MPS2**2

@@ -1,0 +1,110 @@
+"""What a heading and a level are off by that nothing but GPS can tell: it must be told as sigma."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.estimation.columns import (
+    ACCEL,
+    GPS_ALT,
+    GPS_COLUMNS,
+    GPS_DECLINATION,
+    GPS_LAT,
+    GPS_USABLE,
+    GPS_VEL,
+    GYRO,
+    IMU_COLUMNS,
+    MAG,
+    NAV_ATTITUDE_STD,
+)
+from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
+from gateway.estimation.eskf.level_doubt import doubt_level
+from gateway.estimation.kernel import SampleLog
+from gateway.estimation.kernel_record import new_record
+from gateway.estimation.magfield import CompassSettings
+from gateway.estimation.reference import NO_DECLINATION_RAD, ReferenceSettings
+from gateway.estimation.rest import RestSettings
+from gateway.geometry.geomagnetism import magnetic_field
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
+
+SEEDS = range(24)
+STANDS_S = 30.0
+SETTLED_S = 15.0
+FIELD_N_UT = np.array([21.0, 0.0, 43.0])
+IRON_UT = 0.5
+"""What the calibration of an aircraft's compass leaves along each axis."""
+MOUNTING_RAD = math.radians(1.0)
+LEFT_MPS2 = 0.04
+"""The same of its accelerometer."""
+
+
+def standing(seed: int, *, fixes: bool) -> SampleLog:
+    """Stand level and towards north, with calibrated sensors."""
+    rng, n = np.random.default_rng(seed), round(STANDS_S * RATE_HZ)
+    imu = np.zeros((n, IMU_COLUMNS))
+    imu[:, ACCEL : ACCEL + 3] = rng.normal(0.0, LEFT_MPS2, 3) + rng.normal(0.0, 0.05, (n, 3))
+    imu[:, ACCEL + 2] -= G
+    imu[:, GYRO : GYRO + 3] = rng.normal(0.0, 0.005, 3) + rng.normal(0.0, 0.002, (n, 3))
+    turn = Rotation.from_rotvec([0.0, 0.0, rng.normal(0.0, MOUNTING_RAD)])
+    imu[:, MAG : MAG + 3] = turn.apply(FIELD_N_UT) + rng.normal(0.0, IRON_UT, 3)
+    imu[:, MAG : MAG + 3] += rng.normal(0.0, 0.4, (n, 3))
+    us = np.arange(n) * (1_000_000 // RATE_HZ)
+    at = np.arange(RATE_HZ, n if fixes else RATE_HZ, RATE_HZ // FIXES_HZ)
+    gps = np.full((len(at), GPS_COLUMNS), math.nan)
+    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
+    gps[:, GPS_LAT : GPS_ALT + 1] = (LAT_DEG, LON_DEG, ALT_M)
+    gps[:, GPS_VEL : GPS_VEL + 3] = rng.normal(0.0, 0.05, (len(at), 3))
+    return SampleLog(us, imu, np.empty(0, np.int64), np.empty(0), us[at], gps)
+
+
+@pytest.mark.parametrize("fixes", [True, False], ids=["gps", "without"])
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_what_stands_is_as_level_and_as_well_headed_as_told(name: str, fixes: bool) -> None:
+    off, told = [], []
+    for seed in SEEDS:
+        out = estimator_of(name).run(standing(seed, fixes=fixes))[round(SETTLED_S * RATE_HZ) :]
+        # The truth is no turn at all, and the errors are small.
+        off.append(2.0 * out[:, 1:4])
+        told.append(out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3])
+    ratios = np.sqrt(np.mean(np.square(off), axis=(0, 1)) / np.mean(np.square(told), axis=(0, 1)))
+    assert (ratios > 0.3).all()
+    assert (ratios < 1.2).all()
+    assert (np.mean(np.abs(off) < 2.0 * np.array(told), axis=(0, 1)) >= 0.9).all()
+
+
+def test_doubt_of_the_level_leaves_what_gravity_showed(rng: np.random.Generator) -> None:
+    """A bias and the tilt by it together change no force that the accelerometer has shown."""
+    gains = make_gains(EskfSettings(), ReferenceSettings(), RestSettings(), CompassSettings())
+    s = new_record(EskfState)
+    q = rng.normal(size=4)
+    s.q_nb[:] = q / np.linalg.norm(q)
+    doubt_level(s, gains)
+    w, x, y, z = s.q_nb
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        ]
+    )
+    rows = np.zeros((2, len(s.P)))
+    # The level force that is left: `tilt x (0, 0, -g) - R bias`.
+    rows[0, TILT + 1], rows[1, TILT] = -G, G
+    rows[:, ACCEL_BIAS : ACCEL_BIAS + 3] = -R
+    np.testing.assert_allclose(rows @ s.P @ rows.T, 0.0, atol=1e-12)
+    assert math.degrees(math.sqrt(s.P[TILT, TILT])) > 0.2
+    assert np.linalg.eigvalsh(s.P).min() > -1e-12
+
+
+def test_a_heading_without_declination_is_as_good_as_told() -> None:
+    """Over the globe up to 60 deg, by area."""
+    square, weight = 0.0, 0.0
+    for lat_deg in range(-60, 61, 10):
+        share = math.cos(math.radians(lat_deg))
+        for lon_deg in range(-180, 180, 20):
+            field = magnetic_field(float(lat_deg), float(lon_deg), 0.0, 2026.5)
+            square, weight = square + share * field.declination_rad**2, weight + share
+    assert math.sqrt(square / weight) == pytest.approx(NO_DECLINATION_RAD, rel=0.1)
