@@ -9,7 +9,6 @@ shrunk, shown and kept in `.hypothesis`, so that the next run begins with it.
 """
 
 import argparse
-import contextlib
 import gzip
 import itertools
 import math
@@ -33,10 +32,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.config import ConfigError, GatewaySettings, load
 from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams
 from gateway.edges.operator.control_verbs import AircraftVerbs, Named, Text, To
-from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
-from gateway.flightlog.autopilots.dataflash import DataflashReader
-from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
-from gateway.flightlog.autopilots.ulog import UlogReader
+from gateway.flightlog.autopilots.px4_log import TOPICS
 from gateway.flightlog.moment import parse_moment
 from gateway.flightlog.table.row import COLUMNS, TableRow
 from gateway.flightlog.table.table import TableHeader, TableReader, encode_head, encode_line
@@ -341,31 +337,6 @@ def dataflash_messages(draw: st.DrawFn) -> bytes:
     return b"\xa3\x95\x80" + layout
 
 
-@given(damaged(ulog_messages()), CUTS)
-def ulog(data: bytes, cuts: list[int]) -> None:
-    """Any ULog: an end, records in the order of time, and no byte counted twice."""
-    log = UlogReader(TOPICS)
-    for chunk in chunks_of(ULOG_HEAD + data, cuts):
-        log.feed(chunk)
-    log.feed(b"", final=True)
-    assert log.damaged_bytes + log.cut_bytes <= len(data)
-    with contextlib.suppress(ValueError):
-        flight = Px4Log(log.topics(), 1)
-        times = [record.time_us for record in flight.records()]
-        assert times == sorted(times)
-
-
-@given(damaged(dataflash_messages()), CUTS, st.booleans())
-def dataflash(data: bytes, cuts: list[int], is_text: bool) -> None:
-    """Any DataFlash log: an end, and no byte counted twice."""
-    names = ArdupilotReader(1).names
-    log = DataflashReader(names, is_text=is_text)
-    found = [name for chunk in chunks_of(data, cuts) for name, _ in log.feed(chunk)]
-    found += [name for name, _ in log.feed(b"", final=True)]
-    assert set(found) <= names
-    assert log.damaged_bytes + log.cut_bytes <= len(data)
-
-
 @st.composite
 def files(draw: st.DrawFn) -> tuple[str, bytes]:
     """Make a file such as people hand over, and the ending of its name."""
@@ -425,7 +396,7 @@ TARGETS: Final[dict[str, Any]] = {
     target.__name__: target
     for target in (
         *(splitter, whole_frames, receiver, vehicle, control),
-        *(settings_file, table, tlog, ulog, dataflash, command),
+        *(settings_file, table, tlog, command),
     )
 }
 """By name."""

@@ -14,7 +14,7 @@ from gateway.cli.command_table import COMMANDS, load_command
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
 LARGE = (
     *("numba", "numpy", "scipy", "pandas", "pymavlink", "matplotlib", "nicegui"),
-    *("mcap", "pyarrow"),
+    *("mcap", "pyarrow", "pyulog"),
 )
 
 

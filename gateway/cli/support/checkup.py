@@ -29,7 +29,7 @@ EXTRAS: Final = {
     "plot": ("jinja2", "matplotlib"),
     "panel": ("nicegui", "pmtiles"),
     "fleet": ("zenoh",),
-    "formats": ("mcap", "pyarrow"),
+    "formats": ("mcap", "pyarrow", "pyulog"),
 }
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0

@@ -165,6 +165,9 @@ class ArdupilotReader:
         has_fix = fix_type is not GpsFixType.NONE
         course_rad = math.radians(m.GCrs)
         level = (m.Spd * math.cos(course_rad), m.Spd * math.sin(course_rad))
+        utc_us = None
+        if m.GWk and has_fix:
+            utc_us = GPS_EPOCH_UNIX_US + m.GWk * WEEK_US + m.GMS * 1000 - LEAP_US
         self._fix = GpsFix(
             time_us=time_us,
             node=NodeId(self._vehicle_id, 1),
@@ -183,7 +186,7 @@ class ArdupilotReader:
             speed_acc_mps=NAN,
             course_acc_deg=NAN,
             pdop=NAN,
-            utc_us=utc_of(m) if has_fix else None,
+            utc_us=utc_us,
         )
         return []
 
@@ -236,8 +239,3 @@ class ArdupilotReader:
                 flags=flags,
             )
         ]
-
-
-def utc_of(m: Message) -> int | None:
-    """Return the civil time of a GPS message in µs since 1970; None before it is known."""
-    return GPS_EPOCH_UNIX_US + m.GWk * WEEK_US + m.GMS * 1000 - LEAP_US if m.GWk else None

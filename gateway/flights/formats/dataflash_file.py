@@ -1,105 +1,135 @@
-"""DataFlash, the log of ArduPilot, in binary (.bin) and as text (.log)."""
+"""DataFlash, the log of ArduPilot, in binary (.bin) and as text (.log), read by pymavlink."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+import contextlib
+import io
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
-from statistics import median_low
-from typing import Final
+from typing import Any, Final
 
-from gateway.edges.disk.recording_streams import read_chunks
-from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader, utc_of
-from gateway.flightlog.autopilots.dataflash import HEAD, DataflashReader, NamedMessage
+from pymavlink.DFReader import DFReader_binary, DFReader_text
+
+from gateway.edges.disk.recording_streams import GZIP, read_chunks
+from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
+from gateway.units import US_PER_S
 
+MAGIC: Final = b"\xa3\x95"
 SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
-FIXES: Final = 5
-"""Of which the median gives civil time."""
-BROKEN: Final = (AttributeError, TypeError, ValueError, OverflowError)
-"""What a message of other columns, or with impossible values, makes a reader raise."""
+_AS_TEXT: Final = bytes(range(128)) + b"?" * 128
+_SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
+
+
+class _Complaints(io.TextIOBase):
+    """Count the damage that pymavlink prints to the terminal."""
+
+    def __init__(self) -> None:
+        self.bytes = self.messages = 0
+        self.spoken = False
+
+    def write(self, text: str) -> int:
+        self.spoken = True
+        self.bytes += sum(map(int, _SKIPPED.findall(text)))
+        return len(text)
+
+    def quietly(self, call: Callable[[], Any]) -> Any:
+        """Call while counting what is printed."""
+        with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
+            return call()
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
-    known, zero_unix_us = _facts_of(path, replace(options, progress=None))
+    heard = _Complaints()
+    log = _open(path, options, heard)
+    named = (log.params.get(name) for name in SYSTEM_IDS)
+    known = next((int(value) for value in named if value is not None), 1)
     vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
     reader = ArdupilotReader(vehicle_id)
     remarks: list[str] = []
-    damage: list[str] = []
 
     def rows() -> Iterator[TableRow]:
-        builder, log = RowBuilder(), _log_of(path)
-        for record in _records(_messages(path, options, log), log, reader):
-            yield from builder.add(record)
-        yield from builder.flush()
-        damage.extend(_remarks(log, reader))
-        remarks.extend(f"{path}: {remark}" for remark in damage)
+        builder = RowBuilder()
+        with contextlib.closing(log):
+            for record in _records(log, heard, reader):
+                yield from builder.add(record)
+            yield from builder.flush()
+            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, heard, reader))
 
     stream = rows()
     first = next((row for row in stream if row.imu is not None), None)
     if first is None:
-        reason = f"{path}: holds no IMU messages, so there is nothing to fuse"
-        raise FlightError("; it ".join([reason, *damage]))
-    zero_us = None if zero_unix_us is None else zero_unix_us + (reader.zero_us or 0)
-    table = table_of_rows(_chained(first, stream), options, vehicle_id, zero_us)
+        raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
+    # By the first week and time of GPS; 0 without one.
+    unix_us = round(log.clock.timebase * US_PER_S) if log.clock.timebase else None
+    zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
+    table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
     table.remarks = remarks
     return table
 
 
-def _chained(first: TableRow, others: Iterator[TableRow]) -> Iterator[TableRow]:
-    yield first
-    yield from others
-
-
-def _log_of(path: Path) -> DataflashReader:
-    first = next(read_chunks(path), b"")
-    names = {*ArdupilotReader(1).names, "PARM"}
-    return DataflashReader(names, is_text=not first.startswith(HEAD))
-
-
-def _messages(path: Path, options: ReadOptions, log: DataflashReader) -> Iterator[NamedMessage]:
-    for data in read_chunks(path, options.progress):
-        yield from log.feed(data)
-    yield from log.feed(b"", final=True)
-
-
-def _facts_of(path: Path, options: ReadOptions) -> tuple[int, int | None]:
-    """Return the system id, and the civil time at the autopilot's zero by its first fixes."""
-    system_id, found = 1, list[int]()
-    for name, message in _messages(path, options, _log_of(path)):
+def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
+    """Open a log; a packed one, or text, is copied unpacked to a temporary file."""
+    content = read_chunks(path, options.progress)
+    first = next(content, b"")
+    is_binary = first.startswith(MAGIC)
+    kind = DFReader_binary if is_binary else DFReader_text
+    with tempfile.NamedTemporaryFile() as plain:
+        file = path
+        if path.suffix == GZIP or not is_binary:
+            for data in chain([first], content):
+                # A byte that is not text must not stop the reading.
+                plain.write(data if is_binary else data.translate(_AS_TEXT))
+            plain.flush()
+            file = Path(plain.name)
+        log = kind.__new__(kind)
+        # The fast indexer prints to the terminal directly, not through Python.
+        log.init_arrays_fast = log.init_arrays
         try:
-            if name == "PARM" and message.Name in SYSTEM_IDS:
-                system_id = int(message.Value)
-            elif name == "GPS" and (utc_us := utc_of(message)) is not None:
-                found.append(utc_us - int(message.TimeUS))
-        except BROKEN:
-            continue
-        if len(found) == FIXES:
-            break
-    return system_id, median_low(found) if found else None
+            heard.quietly(lambda: kind.__init__(log, str(file)))
+        except Exception as error:
+            # Damage makes pymavlink raise anything, bare exceptions included.
+            log.close()
+            raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
+        return log
 
 
-def _records(
-    messages: Iterator[NamedMessage], log: DataflashReader, reader: ArdupilotReader
-) -> Iterator[Imported]:
-    """Read the whole log; a message that cannot be understood is counted."""
-    for name, message in messages:
+def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[Imported]:
+    """Read the whole log; a message that cannot be decoded is counted.
+
+    Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
+    damage, so it is read message by message.
+    """
+
+    def wanted() -> Any:
+        return log.recv_match(type=reader.names, strict=True)
+
+    take = log.recv_msg if heard.spoken else wanted
+    while True:
+        begin = log.offset
         try:
-            found = reader.feed(name, message)
-        except BROKEN:
-            log.broken += 1
+            message = heard.quietly(take)
+            found = [] if message is None else reader.feed(message.get_type(), message)
+        except Exception:  # noqa: BLE001 - as above
+            heard.messages += 1
+            log.offset = max(log.offset, begin + 1)
             continue
+        if message is None:
+            yield from reader.flush()
+            return
         yield from found
-    yield from reader.flush()
 
 
-def _remarks(log: DataflashReader, reader: ArdupilotReader) -> Iterator[str]:
-    if log.damaged_bytes:
-        yield f"is damaged: {log.damaged_bytes} bytes are no messages and were left out"
-    if log.cut_bytes:
-        yield f"ends within a message: {log.cut_bytes} bytes were left out"
-    if broken := reader.dropped + log.broken:
+def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:
+    if heard.bytes:
+        yield f"is damaged: {heard.bytes} bytes are no messages and were left out"
+    if log.offset < log.data_len:
+        yield f"ends within a message: {log.data_len - log.offset} bytes were left out"
+    if broken := reader.dropped + heard.messages:
         yield f"is damaged: {broken} messages cannot be understood and were left out"
     if reader.leaps:
         yield f"its clock leaped {reader.leaps} times"

@@ -1,35 +1,70 @@
-"""ULog, the log of PX4."""
+"""ULog, the log of PX4, read by pyulog."""
 
-import math
+import contextlib
+import io
+import struct
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from pyulog import ULog
+from pyulog.exceptions import ULogException
 
 from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
-from gateway.flightlog.autopilots.ulog import UlogReader
 from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
 
 MS_PER_S: Final = 1000.0
 SYSTEM_ID: Final = "MAV_SYS_ID"
+MOST_VALUES: Final = 1 << 16
+"""In a row: a message has no more bytes."""
+BROKEN: Final = (
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
+    *(struct.error, RecursionError),
+)
+"""What damage makes pyulog raise, beside its own error."""
+
+
+class _Content(io.BytesIO):
+    """The bytes of a log.
+
+    pyulog steps back by as much as it has asked for. Where the log is cut that is more than it has
+    got, and it would read the same bytes for ever.
+    """
+
+    unread = 0
+    """Bytes behind what pyulog has read when it closes this."""
+    _missing = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self._missing = max((size or 0) - len(data), 0)
+        return data
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        return super().seek(offset + self._missing * (whence == io.SEEK_CUR), whence)
+
+    def close(self) -> None:
+        if not self.closed:
+            self.unread = len(self.getbuffer()) - self.tell()
+        super().close()
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a ULog as a flight; raises FlightError if there is none in it."""
-    log = UlogReader(TOPICS)
-    for data in read_chunks(path, options.progress):
-        log.feed(data)
-    log.feed(b"", final=True)
-    if log.is_newer:
-        raise FlightError(f"{path}: cannot be read: its flags say that it needs a newer program")
-    known = log.parameters.get(SYSTEM_ID, math.nan)
-    vehicle_id = options.system_id or (int(known) if 1 <= known <= 255 else 1)
+    content = b"".join(read_chunks(path, options.progress))
+    log, unread = _load(path, content)
+    topics = {data.name: data.data for data in reversed(log.data_list)}
+    known = log.initial_parameters.get(SYSTEM_ID, 1)
+    is_id = isinstance(known, int) and 1 <= known <= 255
+    vehicle_id = options.system_id or (known if is_id else 1)
     try:
-        flight = Px4Log(log.topics(), vehicle_id)
+        flight = Px4Log(topics, vehicle_id)
     except ValueError as error:
-        raise FlightError("; it ".join([f"{path}: {error}", *_damage(log)])) from error
+        raise FlightError("; it ".join([f"{path}: {error}", *_damage(log, unread)])) from error
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
@@ -38,22 +73,47 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
         yield from builder.flush()
 
     table = table_of_rows(rows(), options, vehicle_id, flight.unix_us_at_zero)
-    table.remarks += [f"{path}: {remark}" for remark in _remarks(log, flight)]
+    remarks = [*_damage(log, unread), *_remarks(log, flight)]
+    table.remarks += [f"{path}: {remark}" for remark in remarks]
     return table
 
 
-def _damage(log: UlogReader) -> Iterator[str]:
-    if log.damaged_bytes:
-        yield f"is damaged: {log.damaged_bytes} bytes cannot be understood and were left out"
-    if log.cut_bytes:
-        yield f"ends within a message: {log.cut_bytes} bytes were left out"
+def _load(path: Path, content: bytes) -> tuple[Any, int]:
+    """Return the log, and how many bytes at its end could not be read."""
+    # Damage that it prints to the terminal is reported as remarks.
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
+            file = _Content(content)
+            return ULog(file, list(TOPICS)), file.unread
+        except (ULogException, *BROKEN) as error:
+            raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error
 
 
-def _remarks(log: UlogReader, flight: Px4Log) -> Iterator[str]:
-    yield from _damage(log)
-    if log.dropouts_ms:
-        lost_s = sum(log.dropouts_ms) / MS_PER_S
-        yield f"its logger was too slow {len(log.dropouts_ms)} times, {lost_s:.1f} s are not in it"
+def _check_formats(formats: dict[str, Any]) -> None:
+    """Raise an error of `BROKEN` for formats that would fill the memory."""
+
+    @cache
+    def values_of(kind: str) -> int:
+        fields = formats[kind].fields if kind in formats else ()
+        return sum(max(count, 1) * values_of(part) for part, count, _ in fields) if fields else 1
+
+    for name in formats:
+        if values_of(name) > MOST_VALUES:
+            raise ValueError(f"{name} has more values than a message can hold")
+
+
+def _damage(log: Any, unread: int) -> Iterator[str]:
+    if log.file_corruption:
+        yield "is damaged; what is sound of it was read"
+    if unread:
+        yield f"is damaged: its last {unread} bytes cannot be read"
+
+
+def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
+    if log.dropouts:
+        lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
+        yield f"its logger was too slow {len(log.dropouts)} times, {lost_s:.1f} s are not in it"
     if flight.left_out:
         yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
     if flight.dropped:

@@ -4,7 +4,6 @@ import gzip
 import itertools
 import json
 import math
-import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -173,22 +172,10 @@ def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
 def test_what_is_not_installed_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "gateway.flights.formats.mcap_file", raising=False)
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.mcap", code=2)
-    assert "needs mcap.writer, the extra mavgate[formats]" in " ".join(text.split())
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_log_that_shrinks_while_it_is_read_just_ends(
-    folder: Path, tmp_path: Path, name: str
-) -> None:
-    path = flown.write(tmp_path / name, (folder / name).read_bytes())
-    rows = open_rows(path, OPTIONS).plain_rows
-    found = [next(rows)]
-    os.truncate(path, 0)
-    found += rows
-    assert all(a.time_us <= b.time_us for a, b in itertools.pairwise(found))
+    monkeypatch.delitem(sys.modules, "gateway.flights.formats.ulog_file", raising=False)
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.csv", code=2)
+    assert "needs pyulog, the extra mavgate[formats]" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
@@ -232,3 +219,49 @@ def test_no_damage_is_fatal(folder: Path, tmp_path: Path, name: str, seed: int) 
         return
     assert all(a.time_us <= b.time_us for a, b in itertools.pairwise(rows))
     assert all(isinstance(remark, str) for remark in table.remarks)
+
+
+@pytest.mark.parametrize("end", [b"\0" * 40, b"\x10\x27\xee", b"\xff" * 40, b"\x01\x00"])
+def test_a_ulog_that_is_cut_in_its_formats_ends(tmp_path: Path, end: bytes) -> None:
+    head = b"".join(flown.Ulog(flown.FORMATS, {"MAV_SYS_ID": 7}).parts[:6])
+    stub = flown.write(tmp_path / "cut.ulg", head + end)
+    with pytest.raises(FlightError, match=r"cut.ulg: holds no sensor_combined"):
+        rows_of(stub)
+
+
+@pytest.mark.parametrize(
+    "formats",
+    [
+        ["vehicle_attitude:vehicle_attitude again;"],
+        ["vehicle_attitude:a[3999] b;", "a:" + "b[3999] x;" * 50, "b:uint8_t x;"],
+    ],
+)
+def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: list[str]) -> None:
+    log = flown.Ulog({}, {})
+    log.parts += [flown.ulog_message(b"F", text.encode()) for text in formats]
+    log.parts.append(flown.ulog_message(b"A", bytes(3) + b"vehicle_attitude"))
+    path = flown.write(tmp_path / "odd.ulg", b"".join(log.parts))
+    with pytest.raises(FlightError, match=r"odd.ulg: cannot be read as a ULog"):
+        rows_of(path)
+
+
+def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(folder: Path, tmp_path: Path) -> None:
+    data = (folder / "new.ulg").read_bytes()
+    middle = data.index(flown.SYNC, len(data) // 2) - 3
+    # A dropout tells its length in two bytes.
+    odd = flown.ulog_message(b"O", b"\0")
+    spoilt = flown.write(tmp_path / "odd.ulg", data[:middle] + odd + data[middle:])
+    table, rows = rows_of(spoilt)
+    assert len(rows) > 0.4 * len(whole(folder / "new.ulg")[1])
+    assert f"its last {len(data) - middle} bytes cannot be read" in " ".join(table.remarks)
+
+
+@pytest.mark.parametrize("letters", [b"Q?", b"Q\xff"])
+def test_a_dataflash_log_with_an_unknown_kind_of_value_is_refused(
+    tmp_path: Path, letters: bytes
+) -> None:
+    layout = flown.packed("FMT", (200, 12, b"NEW", letters, b"TimeUS,X"))
+    data = flown.make_dataflash()
+    path = flown.write(tmp_path / "odd.bin", data[:89] + layout + data[89:])
+    with pytest.raises(FlightError, match=r"odd.bin: its list of formats is damaged"):
+        rows_of(path)
