@@ -24,6 +24,7 @@ STEP_US: Final = US_PER_S // 2
 """Positions nearer in time than this are not summed: at rest their noise would be a distance."""
 LEAST_STEP_M: Final = 1.0
 
+MENDED: Final = "{} records have a damaged time; they are taken to be as old as the ones before"
 HEARTBEAT_ID: Final = 0
 GLOBAL_POSITION_INT_ID: Final = 33
 _POSITION: Final = struct.Struct("<Iii")
@@ -168,6 +169,7 @@ class TlogSummary:
             gaps=tuple(self._gaps.found),
             damaged_bytes=index.damaged_bytes,
             damaged_runs=len(index.damage),
+            remarks=(MENDED.format(index.mended),) if index.mended else (),
         )
 
     def _add_position(self, batch: Batch, i: int) -> None:

@@ -31,7 +31,7 @@ from gateway.edges.disk.recording_streams import (
     read_blocks,
 )
 from gateway.flightlog.moment import civil_time
-from gateway.flightlog.summary import FileInfo, VehicleInfo
+from gateway.flightlog.summary import MENDED, FileInfo, VehicleInfo
 from gateway.flightlog.table.table import (
     TableFault,
     TableHeader,
@@ -125,6 +125,8 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
     for batch in read_batches(file, advance, strict=True):
         for run in batch.damage:
             report(f"at byte {run.offset}: {run.size} bytes that are no record")
+        if batch.mended:
+            console_of().print(MENDED.format(batch.mended), markup=False)
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
         found = found or len(batch.starts) > 0
     if not found:

@@ -21,6 +21,9 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_station_heartbeat
 
 DAY_US: Final = 86_400 * US_PER_S
+"""Records that lie further apart are of different days: nothing is said of what is between."""
+ORDER_US: Final = 2 * US_PER_S
+"""A time that is further before the record before, or behind the next one, is damaged."""
 STRIDE: Final = 256
 """Records between two entries of the index: a seek scans at most this many, some 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
@@ -82,6 +85,8 @@ class Batch:
     """Sender of each frame: system id << 8 | component id."""
     message_ids: IntArray
     damage: tuple[Damage, ...]
+    mended: int = 0
+    """How many of the times were damaged, and are those of the record before."""
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -131,6 +136,8 @@ class TlogScanner:
         self._strict = strict
         self._rest = b""
         self._in_step = True
+        self._last_us: int | None = None
+        """Time of the newest record."""
 
     def feed(self, data: bytes, *, final: bool = False) -> Batch:
         """Take the next bytes of the file.
@@ -165,34 +172,48 @@ class TlogScanner:
         self._rest = data[end:]
         self._offset += end
         found = columns[:, :count]
-        if damaged:
-            found = _without_torn_times(found, runs[1, :damaged])
+        mended = self._mend(found[2], data[end : end + TIME_SIZE]) if count else 0
         begins, ends = runs[:, :damaged].tolist()
         damage = tuple(Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True))
         starts, sizes, times, origins, message_ids = found
-        return Batch(data, offset, starts, sizes, times, origins, message_ids, damage)
+        return Batch(data, offset, starts, sizes, times, origins, message_ids, damage, mended)
 
+    def _mend(self, times: IntArray, following: bytes) -> int:
+        """Give records whose time is damaged, which no checksum shows, that of the one before.
 
-def _without_torn_times(columns: IntArray, damage_ends: IntArray) -> IntArray:
-    """Leave out records whose time is partly destroyed by the damage before them.
+        Parameters
+        ----------
+        times : ndarray, shape (n,)
+            In µs; changed in place.
+        following : bytes
+            The time of the record behind, if there is one and it is in step.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (COLUMNS, n)
-        Records from `scan`.
-    damage_ends : ndarray, shape (m,)
-        Where each damage ends; extended over the records left out.
-    """
-    starts, sizes, times = columns[:3]
-    far = np.abs(np.diff(times)) > DAY_US
-    torn = []
-    for run, end in enumerate(damage_ends.tolist()):
-        i = int(np.searchsorted(starts, end))
-        # The last of a batch has nothing after it to compare with.
-        if i < len(far) and starts[i] == end and far[i] and (i == 0 or far[i - 1]):
-            torn.append(i)
-            damage_ends[run] = end + TIME_SIZE + sizes[i]
-    return np.delete(columns, torn, axis=1)
+        Returns
+        -------
+        int
+            How many were changed.
+        """
+        # A time begins with a zero, or it is none.
+        is_known = self._in_step and len(following) == TIME_SIZE and following[0] == 0
+        next_us = int.from_bytes(following, "big") if is_known else int(times[-1])
+        last_us = int(times[0]) if self._last_us is None else self._last_us
+        after = np.append(times[1:], next_us)
+        before = np.insert(times[:-1], 0, last_us)
+        if self._last_us is None and abs(int(after[0]) - last_us) > DAY_US:
+            before[0] = after[0]
+        if not is_known and abs(int(before[-1]) - next_us) > DAY_US:
+            after[-1] = before[-1]
+        gap = after - before
+        odd = (times < before - ORDER_US) | (times > after + ORDER_US)
+        mended = -2
+        count = 0
+        for i in np.flatnonzero(odd & (gap >= -ORDER_US) & (gap <= DAY_US)).tolist():
+            # Behind a record that was damaged the order is as it should be.
+            if i != mended + 1:
+                times[i] = before[i]
+                mended, count = i, count + 1
+        self._last_us = int(times[-1])
+        return count
 
 
 class TlogIndex:
@@ -218,6 +239,8 @@ class TlogIndex:
         self.damage: list[Damage] = []
         """The first `MAX_DAMAGE_RUNS` runs."""
         self.damaged_bytes = 0
+        self.mended = 0
+        """Records whose time was damaged."""
         self._offsets = array("q")
         self._times = array("q")
 
@@ -225,6 +248,7 @@ class TlogIndex:
         """Take in the next batch of the file."""
         for run in batch.damage:
             self._add_damage(run)
+        self.mended += batch.mended
         if not len(batch):
             return
         self.origins |= set(np.unique(batch.origins).tolist())

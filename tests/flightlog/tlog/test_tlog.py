@@ -138,7 +138,9 @@ def test_zeros_at_the_end_as_after_a_power_cut_are_damage() -> None:
 
 @pytest.mark.parametrize("fill", [b"\0", b"\xff"])
 @pytest.mark.parametrize("torn", range(9))
-def test_a_record_that_lost_a_part_of_its_time_goes_too(torn: int, fill: bytes) -> None:
+def test_a_record_that_lost_a_part_of_its_time_has_that_of_the_one_before(
+    torn: int, fill: bytes
+) -> None:
     records = make_records(100)
     head, data = make_tlog(records[:50]), make_tlog(records)
     cut = data[: len(head) - 20] + fill * (20 + torn) + data[len(head) + torn :]
@@ -147,7 +149,41 @@ def test_a_record_that_lost_a_part_of_its_time_goes_too(torn: int, fill: bytes) 
     assert found[:49] == records[:49]
     assert found[-49:] == records[51:]
     assert all(abs(record.time_us - START_US) < 3600e6 for record in found)
+    assert [record.frame for record in found[49:-49]] in ([], [records[50].frame])
     assert index_of(batches).damaged_bytes == len(cut) - len(make_tlog(found))
+
+
+@pytest.mark.parametrize("chunk", [None, 1, 50, 333])
+@pytest.mark.parametrize("hit", [(0,), (20,), (39,), (5, 7, 9, 30)], ids=str)
+@pytest.mark.parametrize("flip", [1 << 23, 1 << 30, 1 << 40, 1 << 50])
+def test_a_flipped_time_is_no_gap(chunk: int | None, hit: tuple[int, ...], flip: int) -> None:
+    records = make_records(40)
+    spoilt = list(records)
+    for i in hit:
+        spoilt[i] = TlogRecord(records[i].time_us ^ flip, records[i].frame)
+    batches = scan(make_tlog(spoilt), chunk=chunk)
+    found, index = records_of(batches), index_of(batches)
+    assert [record.frame for record in found] == [record.frame for record in records]
+    is_seen = flip > 1 << 30 or hit not in ((0,), (39,))
+    assert index.mended == is_seen * len(hit)
+    assert [r.time_us for i, r in enumerate(found) if i not in hit] == [
+        r.time_us for i, r in enumerate(records) if i not in hit
+    ]
+    for i in hit:
+        beside = records[abs(i - 1)].time_us
+        assert found[i].time_us == (beside if is_seen else spoilt[i].time_us)
+
+
+@pytest.mark.parametrize("chunk", [None, 1, 50])
+@pytest.mark.parametrize("leap_us", [-(10**15), -5_000_000, 5_000_000, 10**15])
+def test_a_clock_that_leaps_is_left_alone(chunk: int | None, leap_us: int) -> None:
+    records = [
+        TlogRecord(r.time_us + (leap_us if i >= 20 else 0), r.frame)
+        for i, r in enumerate(make_records(40))
+    ]
+    batches = scan(make_tlog(records), chunk=chunk)
+    assert records_of(batches) == records
+    assert index_of(batches).mended == 0
 
 
 def test_index_finds_each_time() -> None:
