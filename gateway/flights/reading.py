@@ -207,11 +207,10 @@ def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterato
     return heapq.merge(*streams, key=lambda record: record.time_us)
 
 
-def foreign_rows(lines: Iterable[str], options: ReadOptions) -> Iterator[TableRow]:
-    """Read the lines of another program's CSV; raises ValueError as `ForeignReader.rows`."""
+def foreign_reader(options: ReadOptions) -> ForeignReader:
+    """Make the reader of another program's CSV."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
-    reader = ForeignReader(known, options.system_id or 1, lenient=options.columns is None)
-    return reader.rows(lines)
+    return ForeignReader(known, options.system_id or 1, lenient=options.columns is None)
 
 
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
@@ -252,14 +251,22 @@ def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock
 
 
 def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
-    rows = foreign_rows(_lines(path, options.progress), options)
+    reader = foreign_reader(options)
+    rows = reader.rows(_lines(path, options.progress))
     try:
         first = next(rows, None)
     except ValueError as error:
         raise FlightError(f"{path}: {error}; name its columns with --columns MAP") from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
-    return table_of_rows(chain([first], rows), options, options.system_id or 1)
+
+    def told() -> Iterator[TableRow]:
+        yield from rows
+        if reader.faults:
+            table.remarks.append(f"{path}: {reader.faults} lines cannot be read and were left out")
+
+    table = table_of_rows(chain([first], told()), options, options.system_id or 1)
+    return table
 
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:

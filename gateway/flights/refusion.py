@@ -17,7 +17,7 @@ from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
-from gateway.flights.reading import ReadOptions, RecordedTable, foreign_rows, is_table, open_rows
+from gateway.flights.reading import ReadOptions, RecordedTable, foreign_reader, is_table, open_rows
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,
@@ -115,7 +115,8 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
         return None
     head, tail = read_ends(file)
     if kind is FileKind.FOREIGN:
-        rows = list(foreign_rows((head + tail).decode(errors="replace").splitlines(), options))
+        lines = (head + tail).decode(errors="replace").splitlines()
+        rows = list(foreign_reader(options).rows(lines))
         zero_us = 0
     else:
         reader = TableReader()

@@ -2,16 +2,18 @@
 
 import csv
 import gzip
+import io
 import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.edges.disk.recording_streams import open_recording
 from gateway.simulator.recorded import RecordedFlight
 
 GZIP_MAGIC: Final = b"\x1f\x8b"
@@ -43,12 +45,13 @@ def read_flight(path: Path) -> RecordedFlight:
         If the file cannot be read, a cell is no number, or columns or rows are missing.
     """
     try:
-        data = path.read_bytes()
-        if data.startswith(GZIP_MAGIC):
-            data = gzip.decompress(data)
         metadata: dict[str, str] = {}
-        lines = data.decode("utf-8").splitlines()
-        columns = _columns(csv.reader(_without_comments(lines, metadata)))
+        with open_recording(path) as raw:
+            is_packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+            raw.seek(0)
+            plain = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
+            lines = io.TextIOWrapper(plain, encoding="utf-8")
+            columns = _columns(csv.reader(_without_comments(lines, metadata)))
         latency_s = float(metadata.get("gps_latency_s", DEFAULT_LATENCY_S))
         return RecordedFlight.from_columns(columns, latency_s)
     except OSError as error:

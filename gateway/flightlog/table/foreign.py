@@ -17,12 +17,19 @@ from gateway.records import (
     Vec3,
 )
 from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
 
 EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
 """May be mapped though the table has no such columns: heights become pressures, speed and course
 the velocity where it is not given."""
 NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 """Without these there is nothing to fuse."""
+ORDER_US: Final = 2 * US_PER_S
+"""A line that is so far before the one before, or behind the next one, has a damaged time."""
+DAY_US: Final = 86_400 * US_PER_S
+"""Of lines further apart nothing is known of what is between."""
+LATE_US: Final = 60 * US_PER_S
+"""What was measured so long before or after its line has a damaged time, or another clock's."""
 SEA_LEVEL_PA: Final = 101_325.0
 _EXPONENT: Final = 1.0 / 0.190263
 _SCALE_M: Final = 44_330.769
@@ -77,7 +84,7 @@ class ForeignReader:
         self._vehicle_id = vehicle_id
         self._lenient = lenient
         self.faults = 0
-        """Lines that could not be read."""
+        """Lines that could not be read, or whose time is not between those beside them."""
 
     def rows(self, lines: Iterable[str]) -> Iterator[TableRow]:
         """Read a whole file.
@@ -101,6 +108,19 @@ class ForeignReader:
             self._check(set(table.fieldnames or ()))
         except csv.Error as error:
             raise ValueError(f"no line of column names: {error}") from error
+        before: TableRow | None = None
+        held: TableRow | None = None
+        for row in self._readable(table):
+            if held is not None and before is not None and _is_odd(before, held, row):
+                self.faults += 1
+            elif held is not None:
+                yield held
+                before = held
+            held = row
+        if held is not None:
+            yield held
+
+    def _readable(self, table: Iterator[dict[str, str]]) -> Iterator[TableRow]:
         while True:
             try:
                 yield self._row(next(table))
@@ -158,7 +178,7 @@ class ForeignReader:
             if math.isnan(pressure_pa):
                 return None
         return BaroRaw(
-            time_us=round(value.get("baro_time_us", time_us)),
+            time_us=_measured_us(value.get("baro_time_us", time_us), time_us),
             node=NodeId(self._vehicle_id, 0),
             node_time_us=time_us,
             pressure_pa=pressure_pa,
@@ -170,7 +190,7 @@ class ForeignReader:
             return None
         utc_us = value.get("gps_utc_us", NAN)
         return GpsFix(
-            time_us=round(value.get("gps_time_us", time_us)),
+            time_us=_measured_us(value.get("gps_time_us", time_us), time_us),
             node=NodeId(self._vehicle_id, 1),
             node_time_us=time_us,
             itow_ms=round(value.get("gps_itow_ms", 0)),
@@ -189,6 +209,18 @@ class ForeignReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
+
+
+def _is_odd(before: TableRow, row: TableRow, after: TableRow) -> bool:
+    """Return whether a row's time is damaged: not between those beside it, which are in order."""
+    is_in_order = -ORDER_US <= after.time_us - before.time_us <= DAY_US
+    is_between = before.time_us - ORDER_US <= row.time_us <= after.time_us + ORDER_US
+    return is_in_order and not is_between
+
+
+def _measured_us(own_us: float, row_us: int) -> int:
+    """Return when a value was measured; its line's time if that cannot be, or on another clock."""
+    return round(own_us) if abs(own_us - row_us) <= LATE_US else row_us
 
 
 def pressure_at_height(alt_m: float) -> float:

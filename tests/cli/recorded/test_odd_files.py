@@ -72,7 +72,8 @@ def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) 
     out = tmp_path / "out.csv"
     told = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
     assert "samples fused" in told
-    assert 90 <= int(told.partition("out.csv: ")[2].split()[0]) <= 100
+    assert "10 lines cannot be read and were left out" in told
+    assert "out.csv: 90 samples" in told
 
 
 @pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])

@@ -81,3 +81,28 @@ def test_a_file_without_the_columns_is_refused() -> None:
 def test_a_wrong_map_is_refused(columns: dict[str, str], text: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=text):
         msgspec.convert({"columns": columns}, ColumnMap)
+
+
+def times_of(*times_s: float) -> tuple[int, list[float]]:
+    reader, rows = read(*(f"{t},0,0,-9.8,0,0,0,,,,,,,,,,,,,," for t in times_s))
+    return reader.faults, [row.time_us / 1e6 for row in rows]
+
+
+SECONDS = tuple(range(10, 20))
+
+
+@pytest.mark.parametrize("odd", [86_410.0, -86_400.0, 1e9, 10.0, 30.0])
+def test_a_line_with_a_damaged_time_is_left_out(odd: float) -> None:
+    assert times_of(*SECONDS[:5], odd, *SECONDS[5:]) == (1, [*SECONDS])
+
+
+@pytest.mark.parametrize("leap", [-86_400, -60, 60, 86_400 * 400])
+def test_a_clock_that_leaps_is_left_alone(leap: int) -> None:
+    times = [*SECONDS, *(t + leap for t in SECONDS)]
+    assert times_of(*times) == (0, times)
+
+
+@pytest.mark.parametrize("own", ["86401", "-86400", "1e12", "1780000000"])
+def test_a_fix_of_another_time_is_as_old_as_its_line(own: str) -> None:
+    _, (row,) = read(f"1.5,0,0,-9.8,0,0,0,,,,,{own},47.1,8.5,430,1,2,3,,,")
+    assert row.gps.time_us == row.time_us
