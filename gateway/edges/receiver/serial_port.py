@@ -9,6 +9,7 @@
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 from collections.abc import Callable
@@ -135,6 +136,30 @@ def find_port(wanted: str, ports: list[Port]) -> str:
     raise PortNotFoundError(f"no port fits {wanted!r}; this machine has {seen}")
 
 
+def why_not_open(error: Exception, ports: list[Port]) -> str:
+    """Return why a device cannot be opened, and under which name an adapter is found that is there.
+
+    Parameters
+    ----------
+    error : Exception
+        As pyserial raises it.
+    ports : list of Port
+        The ports of this machine.
+
+    Returns
+    -------
+    str
+    """
+    number = getattr(error, "errno", None)
+    if number == errno.EAGAIN:
+        return "another program has it open"
+    if number is None and isinstance(error, serial.SerialException):
+        return "not a serial port"
+    known = ports if number == errno.ENOENT else []
+    others = [f"{p.device} is there, always found as usb:{p.usb_id}" for p in known if p.known]
+    return "; ".join([reason_of(error), *others])
+
+
 class SerialPort:
     """Keep one serial port open and pass on its bytes.
 
@@ -195,9 +220,9 @@ class SerialPort:
 
     def _open(self) -> None:
         self._retry = None
-        device = self._settings.port
+        device, ports = self._settings.port, list_serial_ports()
         try:
-            device = find_port(device, list_serial_ports())
+            device = find_port(device, ports)
             self._port = serial.Serial(
                 device, self._settings.baud, timeout=0, write_timeout=0, exclusive=True
             )
@@ -206,7 +231,7 @@ class SerialPort:
             self._try_later()
             return
         except (OSError, ValueError) as error:
-            self._complain(f"receiver {device}: {reason_of(error)}")
+            self._complain(f"receiver {device}: {why_not_open(error, ports)}")
             self._try_later()
             return
         with contextlib.suppress(OSError, ValueError):

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from gateway.edges.receiver.serial_port import (
     LONGEST_RETRY_S,
@@ -15,6 +16,7 @@ from gateway.edges.receiver.serial_port import (
     SerialPort,
     SerialSettings,
     find_port,
+    why_not_open,
 )
 
 CH340 = Port("/dev/ttyUSB0", "1a86:7523", "", "WCH CH340", known=True)
@@ -50,6 +52,38 @@ def test_find_port(wanted: str, ports: list[Port], device: str) -> None:
 def test_find_port_says_what_there_is(wanted: str, ports: list[Port], message: str) -> None:
     with pytest.raises(PortNotFoundError, match=message):
         find_port(wanted, ports)
+
+
+@pytest.mark.parametrize(
+    ("ports", "hint"),
+    [
+        ([], ""),
+        ([MODEM], ""),
+        ([CH340, MODEM], "; /dev/ttyUSB0 is there, always found as usb:1a86:7523"),
+    ],
+)
+def test_an_adapter_under_another_name_is_named(ports: list[Port], hint: str) -> None:
+    with pytest.raises(serial.SerialException) as raised:
+        serial.Serial("/dev/ttyUSB99")
+    assert why_not_open(raised.value, ports) == "No such file or directory" + hint
+
+
+def test_a_port_that_another_program_holds_is_said_to_be_so() -> None:
+    master, slave = os.openpty()
+    try:
+        with serial.Serial(os.ttyname(slave), timeout=0, exclusive=True) as held:
+            with pytest.raises(serial.SerialException) as raised:
+                serial.Serial(held.port, timeout=0, exclusive=True)
+            assert why_not_open(raised.value, [CH340]) == "another program has it open"
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_what_is_no_serial_port_is_said_to_be_none() -> None:
+    with pytest.raises(serial.SerialException) as raised:
+        serial.Serial("/dev/null", timeout=0)
+    assert why_not_open(raised.value, [CH340]) == "not a serial port"
 
 
 class Bench:
