@@ -1,6 +1,8 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
 import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +21,23 @@ USERS_OWN = (
 """What tells a program where its user keeps things, or that it is a service."""
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+_COMPILING: list[subprocess.Popen[bytes]] = []
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the estimators beside the first tests: each worker would compile its own."""
+    if session.config.getoption("numprocesses", None):
+        for name in ("eskf", "complementary"):
+            words = [sys.executable, "-m", "tests.compile_ahead", name]
+            _COMPILING.append(subprocess.Popen(words, cwd=ROOT))
+
+
+def pytest_sessionfinish() -> None:
+    for process in _COMPILING:
+        process.kill()
+        process.wait()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -21,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic, overload, typeof_impl
 
 from gateway.compiled import array_at, digest_of, is_compiled, record_at
-from gateway.compiled.machine_code import ENTRY, MachineCode
+from gateway.compiled.machine_code import ENTRY, MachineCode, compiling
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
 """Offline fusion of a log must give exactly what it gave live."""
@@ -119,6 +119,13 @@ def compile_dispatcher(function: Callable[..., Any]) -> Callable[..., Any]:
     files.__class__ = _FileBySignature
     # Numba itself compares only the function's own file, not those of the functions it calls.
     files._source_stamp = digest_of(function)  # noqa: SLF001
+    compile_or_load = dispatcher.compile
+
+    def compile_alone(signature: object) -> object:
+        with compiling(f"{function.__module__}.{function.__qualname__}"):
+            return compile_or_load(signature)
+
+    dispatcher.compile = compile_alone
     return dispatcher  # type: ignore[no-any-return]
 
 
