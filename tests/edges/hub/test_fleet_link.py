@@ -263,9 +263,25 @@ class TestTrouble:
         assert len(set(numbers)) == len(numbers), "no frame twice"
 
     async def test_no_router_yet(self, rig: Rig) -> None:
-        hub = rig.hub(f"zenoh:tcp/127.0.0.1:{free_port()}?site=field")
+        place = f"tcp/127.0.0.1:{free_port()}"
+        hub = rig.hub(f"zenoh:{place}?site=field")
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
-        assert "Unable to connect" in hub.clients()[0].reason
+        assert hub.clients()[0].reason == f"no router answers at {place}"
+
+    def test_where_certificates_are_used_they_may_be_the_reason(self) -> None:
+        error = zenoh.ZError("Unable to connect to any of [Single(tls/h:1)]!  at /x/y.rs:4.")
+        text = "no router answers at tls/h:1, or a certificate does not fit"
+        assert zenoh_session._words(error) == text
+
+    @pytest.mark.parametrize("name", zenoh_session.TLS_FILES)
+    async def test_a_certificate_that_is_not_there_is_named(
+        self, rig: Rig, tmp_path: Path, name: str
+    ) -> None:
+        file, missing = tmp_path / "zenoh.json5", tmp_path / "missing.pem"
+        file.write_text(json.dumps({"transport": {"link": {"tls": {name: str(missing)}}}}))
+        hub = rig.hub(f"zenoh:tls/127.0.0.1:7447?site=field&config={file}")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert hub.clients()[0].reason == f"{name} {missing}: No such file or directory"
 
     async def test_a_router_that_stalls_holds_nobody_up(
         self, rig: Rig, router: Router, patient: Path

@@ -12,6 +12,7 @@ share batches leave as soon as the link is free, so that nothing is held back fo
 import asyncio
 import logging
 import queue
+import re
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -19,6 +20,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
+import msgspec
+
+from gateway.edges.reasons import reason_of
 from gateway.routing.outbox import BULK_IDS
 
 if TYPE_CHECKING:
@@ -43,6 +47,13 @@ GIVE_UP_S: Final = 10.0
 """Zenoh gives a message up after half of this, and closes the link."""
 PATIENT_IDS: Final = BULK_IDS | {75, 76, 77, 253}
 """Parameters, missions, files, commands, their answers, texts: none of them comes again."""
+
+TLS_FILES: Final = (
+    "root_ca_certificate",
+    *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
+)
+NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
+SECURED: Final = ("tls/", "quic/", "wss/")
 
 Item = TypeVar("Item")
 _Patient = tuple["zenoh.Publisher", bytes, bytes | None]
@@ -94,14 +105,26 @@ def open_session(config: "zenoh.Config") -> "zenoh.Session":
     Raises
     ------
     OSError
-        If there is nobody at the place.
+        If there is nobody at the place, or a certificate or key cannot be read.
     """
     import zenoh
 
+    _check_files(config)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise OSError(_words(error)) from None
+
+
+def _check_files(config: "zenoh.Config") -> None:
+    """Name a certificate or key that cannot be read; Zenoh only says that it cannot connect."""
+    tls: dict[str, Any] = msgspec.json.decode(config.get_json("transport/link/tls")) or {}
+    for name in TLS_FILES:
+        if file := tls.get(name):
+            try:
+                Path(file).open("rb").close()
+            except OSError as error:
+                raise OSError(f"{name} {file}: {reason_of(error)}") from None
 
 
 def end_session(session: "zenoh.Session", outlets: "Outlets | None", declared: list[Any]) -> None:
@@ -352,4 +375,8 @@ class Outlets:
 
 def _words(error: Exception) -> str:
     """Return what Zenoh says, without where in its source it says so."""
-    return str(error).partition(" at /")[0].strip()
+    text = str(error).partition(" at /")[0].strip()
+    if (found := NO_ANSWER.fullmatch(text)) is None:
+        return text
+    is_secured = found[1].startswith(SECURED)
+    return f"no router answers at {found[1]}{', or a certificate does not fit' * is_secured}"
