@@ -42,6 +42,15 @@ from tools.spoil_flight import no_mag
 BROAD_30 = "broad_30_disturbed_stationary_magnet_C"
 
 
+def test_what_a_smoothed_heading_owes_to_the_compass_comes_from_its_end() -> None:
+    """A heading that only drifts is the same all along; one that began anew is another."""
+    P, on_compass = np.tile(np.eye(STATES), (3, 1, 1)), np.array([1.0, 0.9, 0.4, 0.2])
+    F = P.copy()
+    F[0] = 0.0
+    _backward(P, F, P, np.zeros((3, STATES)), P[0], on_compass)
+    np.testing.assert_allclose(on_compass, [1.0, 0.2, 0.2, 0.2], atol=1e-6)
+
+
 def test_backward_is_the_joint_estimate() -> None:
     """One coordinate that walks, measured at each node: the normal equations are solved."""
     rng = np.random.default_rng(5)
@@ -59,7 +68,7 @@ def test_backward_is_the_joint_estimate() -> None:
         means.append(x)
     last = np.zeros((STATES, STATES))
     last[0, 0] = var
-    begins, _, variances = _backward(P, F, foreseen, d, last)
+    begins, _, variances = _backward(P, F, foreseen, d, last, np.zeros(count + 1))
     walk = np.diff(np.eye(count + 1), axis=0)
     joint = np.eye(count + 1) / r + walk.T @ walk / q
     expected = np.linalg.solve(joint, z / r)

@@ -1,6 +1,8 @@
 """What a heading and a level are off by that nothing but GPS can tell: it must be told as sigma."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ from gateway.estimation.reference import NO_DECLINATION_RAD, ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geomagnetism import magnetic_field
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
-from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
+from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of, flight, part
 
 SEEDS = range(24)
 STANDS_S = 30.0
@@ -108,3 +110,34 @@ def test_a_heading_without_declination_is_as_good_as_told() -> None:
             field = magnetic_field(float(lat_deg), float(lon_deg), 0.0, 2026.5)
             square, weight = square + share * field.declination_rad**2, weight + share
     assert math.sqrt(square / weight) == pytest.approx(NO_DECLINATION_RAD, rel=0.1)
+
+
+@pytest.mark.parametrize("receiver", ["good", "bad"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_compass_that_is_turned_on_its_board_turns_the_heading_by_what_is_told(
+    seed: int, receiver: str
+) -> None:
+    """The more GPS has told in motion, the less."""
+    log, heading = flight(seed, receiver)
+    headings, shares = [], []
+    for turned_rad in (0.0, MOUNTING_RAD):
+        imu, read = log.imu.copy(), heading + turned_rad
+        imu[:, MAG] = FIELD_N_UT[0] * np.cos(read)
+        imu[:, MAG + 1] = -FIELD_N_UT[0] * np.sin(read)
+        imu[:, MAG + 2] = FIELD_N_UT[2]
+        estimator = estimator_of("eskf")
+        found: list[float] = []
+        for begin, end in pairwise([0.0, STANDS_S, 45.0, 60.0, 80.0, 100.0]):
+            rows, fixes = (
+                slice(*np.searchsorted(us, [begin * 1e6, end * 1e6]).tolist())
+                for us in (log.imu_time_us, log.gps_time_us)
+            )
+            out = estimator.run(part(replace(log, imu=imu), rows, fixes))
+            w, x, y, z = out[-1, :4]
+            found.append(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+            shares.append(estimator.state.compass_share)
+        headings.append(np.array(found))
+    turned = np.remainder(headings[1] - headings[0] + math.pi, 2.0 * math.pi) - math.pi
+    off = np.abs(turned / MOUNTING_RAD - shares[: len(turned)])
+    assert off.mean() < 0.25
+    assert off[-1] < 0.15

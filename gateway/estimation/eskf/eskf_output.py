@@ -16,7 +16,7 @@ from gateway.estimation.columns import (
     NAV_VEL_STD,
 )
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
-from gateway.estimation.eskf.iron import standing_field_var
+from gateway.estimation.eskf.iron import board_var, standing_field_var
 from gateway.estimation.eskf.level_doubt import standing_level_var
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR
 from gateway.estimation.filtering.filter_state import sensor_flags
@@ -80,7 +80,7 @@ def write_output(s: EskfState, row: FloatArray) -> None:
 def heading_std_rad(s: EskfState) -> float:
     """Return how sure the heading is: what iron and the declination add to the covariance, too."""
     variance = s.P[TILT + 2, TILT + 2] if s.heading_known == 1 else NO_HEADING_VAR
-    variance += standing_field_var(s)
+    variance += standing_field_var(s) + board_var(s)
     if s.heading_known == 1 and s.heading_true == 0:
         variance += NO_DECLINATION_RAD * NO_DECLINATION_RAD
     return math.sqrt(max(variance, 0.0))

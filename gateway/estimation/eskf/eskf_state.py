@@ -69,6 +69,9 @@ class EskfState(FilterState):
     left_iron_ut: float
     """Standard deviation per axis of what bends the field: iron that the calibration left, and more
     where the field in motion is not that of the place where the heading was read."""
+    compass_share: float
+    """How much of what the compass is off on its board the heading is off: 1 while only it tells
+    the heading, less the more GPS does."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
     iron_norm: float

@@ -125,12 +125,18 @@ def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
 
 
 @compiled
+def board_var(s: EskfState) -> float:
+    """Return the variance of the heading by what the compass is off on its board, rad2."""
+    return float((s.compass_share * PLACE_RAD) ** 2)
+
+
+@compiled
 def standing_field_var(s: EskfState) -> float:
-    """Return the variance of a heading by iron and place that nothing tells from it yet, rad2.
+    """Return the variance of a heading by iron that nothing tells from it yet, rad2.
 
     It is one error for as long as the flight lasts, until GPS makes the iron a state of its own.
     """
     level_ut = math.hypot(s.field_n[0], s.field_n[1])
     if s.iron_search_started == 1 or level_ut == 0.0:
         return 0.0
-    return (s.left_iron_ut / level_ut) ** 2 + PLACE_RAD * PLACE_RAD
+    return (s.left_iron_ut / level_ut) ** 2

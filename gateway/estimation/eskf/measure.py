@@ -217,6 +217,7 @@ def update_by_fix(
     lag : float
         Age of the fix, s.
     """
+    before = s.P[TILT + 2, TILT + 2]
     late_pos, late_vel = delay_variances(s, p, once, lag)
     repeated = max(1.0, p.velocity_correlation_s / max(s.time_s - s.fix_s, 0.05))
     for k in range(3):
@@ -232,6 +233,7 @@ def update_by_fix(
         update_scalar(
             s, off_pos[k], reported_variance(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq
         )
+    s.compass_share *= s.P[TILT + 2, TILT + 2] / before
     inject(s)
 
 
@@ -260,8 +262,13 @@ def unexplained_iron_sq(s: EskfState) -> float:
 def update_by_compass(
     s: EskfState, p: EskfGains, field_n: Vec3, declination: float, weight: float, dt: float
 ) -> None:
-    """Update by the direction of the horizontal field, `dt` after the last such update."""
+    """Update by the direction of the horizontal field, `dt` after the last such update.
+
+    What the compass is off on its board is no noise: the heading is off by as much of it as its
+    variance owes to the compass.
+    """
     propagate(s, p)
+    before = s.P[TILT + 2, TILT + 2]
     repeated = max(1.0, COMPASS_CORRELATION_S / dt)
     measured = declination - math.atan2(field_n[1], field_n[0])
     compass_row(s, field_n)
@@ -272,6 +279,7 @@ def update_by_compass(
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
     update_scalar(s, wrap_pi(measured), repeated * p.mag_var / weight + lasting, p.gate_sq)
+    s.compass_share = 1.0 - (1.0 - s.compass_share) * s.P[TILT + 2, TILT + 2] / before
     inject(s)
 
 

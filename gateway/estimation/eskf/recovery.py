@@ -47,6 +47,7 @@ def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: fl
     renew(s, TILT, level_var)
     renew(s, TILT + 1, level_var)
     renew(s, TILT + 2, heading_var)
+    s.compass_share = 0.0
     for k in range(3):
         renew(s, VEL + k, HAND_VAR)
         s.vel_n[k] = 0.0
@@ -106,6 +107,7 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
         if tells_heading(s, ENOUGH_HEADING_RAD):
             turn_heading(s, heading_difference(as_quat(s.found_q_nb), as_quat(s.q_nb)))
             renew(s, TILT + 2, s.heading_std * s.heading_std)
+            s.compass_share = 0.0
             s.heading_known = s.heading_true = 1
         return
     write_quat(s.q_nb, find(s, as_quat(s.q_nb), ENOUGH_HEADING_RAD))

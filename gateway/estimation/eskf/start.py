@@ -106,7 +106,7 @@ def start_heading_by_compass(
     renew(s, TILT + 2, NO_HEADING_VAR)
     compass_row(s, field_n)
     update_scalar(s, 0.0, variance, p.gate_sq)
-    s.heading_known = 1
+    s.heading_known, s.compass_share = 1, 1.0
 
 
 @compiled

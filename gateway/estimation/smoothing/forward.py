@@ -39,7 +39,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.eskf.iron import standing_field_var
+from gateway.estimation.eskf.iron import board_var, standing_field_var
 from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
 from gateway.geometry.geodesy import displacement_m
@@ -145,7 +145,7 @@ def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
         for k in range(3):
             beyond = row[column + k] ** 2 - s.P[first + k, first + k]
             if first + k == TILT + 2:
-                beyond -= standing_field_var(s)
+                beyond -= standing_field_var(s) + board_var(s)
             # NaN, which is told of what is not known, stays.
             row[column + k] = 0.0 if beyond < 0.0 else math.sqrt(beyond)
 
@@ -182,6 +182,7 @@ def run_forward(
     anew: BoolArray,
     shown: FloatArray,
     doubt: FloatArray,
+    on_compass: FloatArray,
 ) -> None:
     """Run the filter, and a copy of it from each node to the next.
 
@@ -210,6 +211,8 @@ def run_forward(
         with what this pass has shown.
     doubt : ndarray, shape (m + 1,)
         Filled: `standing_field_var` at each node and at the end, rad2.
+    on_compass : ndarray, shape (m + 1,)
+        Filled: `compass_share` there.
     """
     s, copy = states[0], states[1]
     taken = np.zeros(2, np.int64)
@@ -217,7 +220,7 @@ def run_forward(
         s.unaided_sq = max(s.unaided_sq, shown[k, 0])
         s.flies = max(s.flies, int(shown[k, 1]))
         begin_node(s, p, P[k], F[k])
-        doubt[k] = standing_field_var(s)
+        doubt[k], on_compass[k] = standing_field_var(s), s.compass_share
         states[1] = states[0]
         for i in range(nodes[k], nodes[k + 1]):
             now = imu_time_us[i]
@@ -239,4 +242,5 @@ def run_forward(
         flown = s.aided == 0 and s.at_rest == 0
         shown[k, 0] = s.unaided_sq if flown else 0.0
         shown[k, 1] = s.flies if flown else 0.0
-    doubt[nodes.shape[0] - 1] = standing_field_var(s)
+    last = nodes.shape[0] - 1
+    doubt[last], on_compass[last] = standing_field_var(s), s.compass_share

@@ -43,6 +43,7 @@ from gateway.estimation.eskf.unaided_velocity import FLOWN_S, WAY_S
 from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
+from gateway.estimation.magfield import PLACE_RAD
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
 from gateway.geometry.geodesy import radii_m
 
@@ -95,20 +96,20 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, foreseen = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, anew = np.empty((count, STATES)), np.empty(len(out), np.bool_)
-    shown, doubt = np.zeros((count, SHOWN)), np.empty(count + 1)
+    shown, doubt, on_compass = np.zeros((count, SHOWN)), np.empty(count + 1), np.empty(count + 1)
     arguments = (
         states, gains, nodes,
         log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
-        out, P, F, foreseen, d, anew, shown, doubt,
+        out, P, F, foreseen, d, anew, shown, doubt, on_compass,
     )  # fmt: skip
     run_forward(*arguments)
     if shown.any():
         shown[:] = _hindsight(shown)
         states[0] = state
         run_forward(*arguments)
-    found = _backward(P, F, foreseen, d, states[0]["P"])
+    found = _backward(P, F, foreseen, d, states[0]["P"], on_compass)
     begins, ends, variances = (numbers[:, :MOVED] for numbers in found)
-    variances[:, TILT + 2] += _lasting_doubt(doubt, F)
+    variances[:, TILT + 2] += _lasting_doubt(doubt, F) + (PLACE_RAD * on_compass) ** 2
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out, latency_s
 
@@ -183,8 +184,11 @@ def _backward(
     foreseen: FloatArray,
     d: FloatArray,
     last_P: FloatArray,
+    on_compass: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Recurse from the end, whose covariance is `last_P`.
+
+    Changes `on_compass`, the filter's, into what is left of the smoothed heading on the compass.
 
     Returns
     -------
@@ -207,6 +211,7 @@ def _backward(
         gain = gains[k - first]
         ends[k] = d[k] + begins[k + 1]
         begins[k] = gain @ ends[k]
+        on_compass[k] += gain[TILT + 2, TILT + 2] * (on_compass[k + 1] - on_compass[k])
         later_P = P[k] + gain @ (later_P - foreseen[k]) @ gain.T
         variances[k] = np.diagonal(later_P)
     return begins, ends, variances
