@@ -234,6 +234,34 @@ def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
     assert find_flights(tmp_path) == []
 
 
+def catalogued(number: int) -> CataloguedFile:
+    return CataloguedFile(f"{number}.csv", f"{number}", None, 1, 2, "d" * 500)
+
+
+def test_a_catalogue_that_another_indexing_made_meanwhile_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Hangar(tmp_path)
+    first.put([catalogued(1)])
+    looks, is_made = [False], Hangar._is_made
+    monkeypatch.setattr(Hangar, "_is_made", lambda self: looks.pop() if looks else is_made(self))
+    second = Hangar(tmp_path)
+    second.put([catalogued(2)])
+    assert second.known().keys() == first.known().keys() == {"1.csv", "2.csv"}
+    for hangar in (first, second):
+        hangar.close()
+
+
+def test_a_damaged_catalogue_is_said(tmp_path: Path) -> None:
+    hangar = Hangar(tmp_path)
+    hangar.put(catalogued(number) for number in range(200))
+    hangar.close()
+    data = (tmp_path / HANGAR_NAME).read_bytes()
+    (tmp_path / HANGAR_NAME).write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
+    with pytest.raises(HangarError, match="delete it and index again"):
+        index_folder(tmp_path, OPTIONS, LocalProcesses(1))
+
+
 def test_the_tracks_are_geojson(folder: Path) -> None:
     found = geojson_of(folder, "kind = 'tlog'")
     (flight,) = found["features"]

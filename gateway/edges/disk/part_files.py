@@ -67,7 +67,8 @@ class PartFiles:
     folder : Path
         Created if it does not exist.
     session : str
-        Name of the recording; a number is added if the first part finds it taken.
+        Name of the recording; a number is added if the first part finds it taken, also with its
+        first bytes: another gateway may record in the same folder.
     part : int
         From 1.
     """
@@ -154,7 +155,13 @@ class PartFiles:
 
     def _open(self, ending: str) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
-        self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
+        try:
+            self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
+        except FileExistsError:
+            if self._part != 1 or self._files:
+                raise
+            self.session = free_name(self._folder, self.session)
+            self._files[ending] = os.open(self._path(ending), flags, RIGHTS)
         self._sizes[ending] = 0
         self._has_new_names = True
 

@@ -293,6 +293,7 @@ class Recorder:
             if part.size > PENDING_LIMIT:
                 return self._session.failed("disk is too slow", now_us)
             self._disk = await done_by(self._writer, files.write, part.take())
+            self._session.name = part.session = files.session
             self._check_sync()
         except OSError as error:
             return self._session.failed(reason_of(error), self._clock())

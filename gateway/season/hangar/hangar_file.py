@@ -80,18 +80,20 @@ class Hangar:
         self.path = folder / HANGAR_NAME
         with _told(self.path):
             self._db = sqlite3.connect(self.path, timeout=BUSY_S)
-            if self._db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
+            if not self._is_made():
                 self._make()
 
     def close(self) -> None:
         """Keep what was added."""
-        self._db.commit()
+        with _told(self.path):
+            self._db.commit()
         self._db.close()
 
     def known(self) -> dict[str, tuple[int, int, str]]:
         """Return size, time of modification and digest of every file."""
-        rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
-        return {path: (size, modified, digest) for path, size, modified, digest in rows}
+        with _told(self.path):
+            rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
+            return {path: (size, modified, digest) for path, size, modified, digest in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
         """Put files in the place of what was known of them, all or none."""
@@ -111,10 +113,17 @@ class Hangar:
             for path in paths:
                 self._forget(path)
 
+    def _is_made(self) -> bool:
+        return bool(self._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA)
+
     def _make(self) -> None:
         columns = {**_FILE_COLUMNS, **_FACT_COLUMNS}
         listed = ", ".join(f"{name} {kind}" for name, kind in columns.items())
         with self._db:
+            # Another indexing may have made it meanwhile, and have put flights into it.
+            self._db.execute("BEGIN IMMEDIATE")
+            if self._is_made():
+                return
             self._db.execute("DROP TABLE IF EXISTS flights")
             self._db.execute("DROP TABLE IF EXISTS tracks")
             self._db.execute(f"CREATE TABLE flights (id INTEGER PRIMARY KEY, {listed})")

@@ -406,6 +406,26 @@ def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
     first.close({})
 
 
+async def test_two_gateways_that_record_in_one_folder_lose_nothing(
+    tmp_path: Path, clock: ManualClock
+) -> None:
+    benches = [Bench(tmp_path, clock), Bench(tmp_path, clock)]
+    for bench in benches:
+        await bench.turn(0.0)
+    for bench in benches:
+        bench.send(FRAMES)
+    for bench in benches:
+        await bench.turn(0.0)
+    assert {bench.recorder.status().name for bench in benches} == {NAME, f"{NAME}-2"}
+    for bench in benches:
+        bench.send(FRAMES)
+        bench.recorder.close()
+        assert bench.troubles == []
+    for name in (NAME, f"{NAME}-2"):
+        records = read_tlog(tmp_path / f"{name}_01.tlog")
+        assert [record.frame for record in records] == 2 * FRAMES
+
+
 async def test_it_records_only_once_the_disk_has_taken_something(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
