@@ -1,11 +1,12 @@
 """Tracks for maps: all vehicles of a flight with their events, as KML and GPX."""
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Final
-from xml.sax.saxutils import escape
+from xml.sax import saxutils
 
 from gateway.units import US_PER_S
 
@@ -13,6 +14,7 @@ INTERVAL_US: Final = US_PER_S // 5
 """A map shows no more than five points a second."""
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
+_NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,7 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
         'xmlns:gx="http://www.google.com/kml/ext/2.2">\n'
-        f"<Document><name>{escape(name)}</name>\n"
+        f"<Document><name>{_escaped(name)}</name>\n"
     )
     yield from (
         f'<Style id="track{number}"><LineStyle><color>{colour}</color><width>3</width></LineStyle>'
@@ -95,7 +97,7 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
         for number, colour in enumerate(COLOURS)
     )
     for number, vehicle in enumerate(vehicles):
-        yield f"<Folder><name>{escape(vehicle.name)}</name>\n"
+        yield f"<Folder><name>{_escaped(vehicle.name)}</name>\n"
         yield from _kml_track(vehicle, f"#track{number % len(COLOURS)}")
         yield from map(_kml_place, vehicle.places)
         yield "</Folder>\n"
@@ -104,7 +106,7 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
 
 def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
     yield (
-        f"<Placemark><name>{escape(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
+        f"<Placemark><name>{_escaped(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
         "<gx:Track><altitudeMode>absolute</altitudeMode>\n"
     )
     yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in vehicle.points)
@@ -117,7 +119,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
 
 def _kml_place(place: MapPlace) -> str:
     return (
-        f"<Placemark><name>{escape(place.name)}</name><description>{place.kind}</description>"
+        f"<Placemark><name>{_escaped(place.name)}</name><description>{place.kind}</description>"
         f"<TimeStamp><when>{iso_time(place.at.time_us)}</when></TimeStamp>"
         "<Point><altitudeMode>absolute</altitudeMode>"
         f"<coordinates>{_kml_coordinates(place.at, ',')}</coordinates></Point></Placemark>\n"
@@ -147,22 +149,27 @@ def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<gpx version="1.1" creator="mavgate" xmlns="http://www.topografix.com/GPX/1/1" '
         'xmlns:mavgate="urn:mavgate:attitude:1">\n'
-        f"<metadata><name>{escape(name)}</name></metadata>\n"
+        f"<metadata><name>{_escaped(name)}</name></metadata>\n"
     )
     for vehicle in vehicles:
         yield from (
-            f"<wpt {_gpx_place(place.at)}{_gpx_time(place.at)}<name>{escape(place.name)}</name>"
-            f"<desc>{escape(vehicle.name)}</desc><type>{place.kind}</type></wpt>\n"
+            f"<wpt {_gpx_place(place.at)}{_gpx_time(place.at)}<name>{_escaped(place.name)}</name>"
+            f"<desc>{_escaped(vehicle.name)}</desc><type>{place.kind}</type></wpt>\n"
             for place in vehicle.places
         )
     for vehicle in vehicles:
-        yield f"<trk><name>{escape(vehicle.name)}</name><trkseg>\n"
+        yield f"<trk><name>{_escaped(vehicle.name)}</name><trkseg>\n"
         yield from (
             f"<trkpt {_gpx_place(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
             for p in vehicle.points
         )
         yield "</trkseg></trk>\n"
     yield "</gpx>\n"
+
+
+def _escaped(text: str) -> str:
+    """Write a text in XML, which has no control characters at all, not even escaped ones."""
+    return saxutils.escape(_NOT_IN_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
 def _gpx_place(point: TrackPoint) -> str:

@@ -1,6 +1,9 @@
 """Tracks for maps, read back by an XML parser."""
 
+from collections.abc import Callable, Iterator
 from xml.etree import ElementTree as ET
+
+import pytest
 
 from gateway.flightlog.mapshape import (
     MapPlace,
@@ -87,3 +90,13 @@ def test_points_too_near_in_time_are_left_out() -> None:
 def test_no_points_is_still_a_file() -> None:
     ET.fromstring("".join(to_kml("x", [])))
     ET.fromstring("".join(to_gpx("x", [])))
+
+
+@pytest.mark.parametrize("write", [to_kml, to_gpx])
+def test_texts_that_xml_cannot_hold_leave_it_readable(write: Callable[..., Iterator[str]]) -> None:
+    odd = "".join(map(chr, range(0x20))) + "\x7f\ud800\udcff\ufffe\uffff]]>\N{HELICOPTER}"
+    vehicles = [VehicleTrack(odd, POINTS, [MapPlace(PlaceKind.MARK, odd, POINTS[0])])]
+    text = "".join(write(odd, vehicles))
+    names = [e.text or "" for e in ET.fromstring(text.encode()).iter() if e.tag.endswith("name")]
+    assert len(names) >= 3
+    assert sum("\N{HELICOPTER}" in name for name in names) >= 3
