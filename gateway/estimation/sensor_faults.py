@@ -37,6 +37,8 @@ class HealthState:
 
     fault: int
     """1 while the newest sample was not usable as it came."""
+    sound_s: float
+    """Time since one was not, or since the last silence."""
     stuck_gyro_s: float
     stuck_accel_s: float
     repeated_s: float
@@ -189,6 +191,7 @@ def check_sensors(
     good_gyro = is_sound(gyro, GYRO_LIMIT_RADPS) and s.stuck_gyro_s < STUCK_S
     good_accel = is_sound(accel, ACCEL_LIMIT_MPS2) and s.stuck_accel_s < STUCK_S
     s.fault = 0 if good_gyro and good_accel and clipped == 0.0 else 1
+    s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
     good_gyro, good_accel = good_gyro and not odd, good_accel and not odd
     if good_gyro:
         write_vec(s.gyro_held, gyro)

@@ -29,6 +29,7 @@ from gateway.estimation.complementary.manoeuvre import (
 )
 from gateway.estimation.complementary.navigation import REST_DECAY_S
 from gateway.estimation.complementary.unaided import unaided_level_std, watch_level
+from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -130,13 +131,17 @@ def settle_place(
 ) -> None:
     """Bring place and speed to the accuracy of a fix, by the share that it was blended with.
 
-    The error of its place is slow and does not average out, that of its velocity does.
+    The error of its place is slow and does not average out, that of its velocity does, but for what
+    lasts.
     """
-    share = 1.0 - math.exp(-(s.time_s - s.fix_s) / p.tau_position_s)
+    dt = s.time_s - s.fix_s
+    share = 1.0 - math.exp(-dt / p.tau_position_s)
     h_acc = row[GPS_H_ACC]
     fix_m = h_acc * AXIS_SHARE if h_acc > 0.0 else FIX_M
     late_m = JITTER_S * math.hypot(s.vel_n[0], s.vel_n[1])
     s.fix_place_m = s.told_place_m + share * (math.hypot(fix_m, late_m) - s.told_place_m)
+    lasting_sq = lasting_noise_sq(s, s.pull_mps2 * s.pull_mps2, dt)
+    noise_mps = math.sqrt(max(noise_mps * noise_mps, lasting_sq))
     s.fix_speed_mps = math.hypot((1.0 - share) * s.told_speed_mps, share * noise_mps)
     s.pushed_place_m = s.pushed_speed_mps = s.pushed_rough_sq = 0.0
     s.told_place_m, s.told_speed_mps = s.fix_place_m, s.fix_speed_mps

@@ -213,8 +213,6 @@ class ComplementaryState(FilterState):
     """Time since, and angle that the aircraft has turned by."""
     rate_density: float
     """Density of the noise of the angular rate, as rough as it was of late, rad2/s."""
-    force_density: float
-    """The same of the specific force, m2/s3."""
     accel_bias_d: float
     """Error of the vertical acceleration, positive down."""
     baro_offset_m: float

@@ -25,6 +25,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
+from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import (
@@ -62,8 +63,6 @@ FORCE_WALK_M2PS5: Final = 0.002**2
 """Bias of the accelerometer at the start, at most, and its random walk."""
 ROUGH_SHARE: Final = 0.5
 """Of what is uneven in the angular rate: an engine's shaking to and fro adds up less than noise."""
-ROUGH_TAU_S: Final = 2.0
-"""The roughness of the sensors is averaged over this time."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
 UNKNOWN_VAR: Final = 10.0
@@ -214,7 +213,7 @@ def note_roughness(s: ComplementaryState) -> None:
     """Average the noise of the sensors, of which the covariance has been told."""
     share = min(s.carried_s / ROUGH_TAU_S, 1.0)
     s.rate_density += share * (ROUGH_SHARE * s.rough_gyro / s.carried_s - s.rate_density)
-    s.force_density += share * (s.rough_accel / s.carried_s - s.force_density)
+    note_force_noise(s, s.carried_s)
     s.rough_gyro = s.rough_accel = 0.0
 
 

@@ -28,6 +28,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
+from gateway.estimation.filtering.roughness import note_force_noise
 from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
@@ -59,6 +60,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     turned = p.gyro_roughness_sq * s.rough_gyro + p.gyro_turn_var * s.pending_rad + s.clipped_rad2
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
     pulled += s.clipped_m2ps2
+    note_force_noise(s, dt)
     s.clipped_rad2 = s.clipped_m2ps2 = 0.0
     s.pending_accel_sq = s.rough_gyro = s.rough_accel = s.pending_rad = 0.0
     kept = math.exp(-dt / p.gps_wander_s)

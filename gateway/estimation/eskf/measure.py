@@ -33,6 +33,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
+from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.geometry.quaternion import rotate, wrap_pi
@@ -147,8 +148,8 @@ def set_wander_variance(s: EskfState, p: EskfGains, row: FloatArray) -> None:
 def velocity_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int) -> float:
     """Return the noise of one component of a fix's velocity, m2/s2.
 
-    A heading that rests on nothing but these velocities turns with their errors: it counts them as
-    large as they have shown themselves. Beside a compass, which shows them too, they are as set.
+    A heading that rests on nothing but these velocities turns with their errors: it counts them no
+    smaller than the alignment does.
     """
     usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
     variance = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARE[k])
@@ -158,11 +159,17 @@ def velocity_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int) -> fl
 
 
 @compiled
+def mean_acceleration(once: Vec3, lag: float) -> Vec3:
+    """Return the mean acceleration over the lag, m/s2; `once` as of `lag_integrals`."""
+    span = max(lag, 0.02)
+    return (once[0] / span, once[1] / span, once[2] / span + STANDARD_GRAVITY_MPS2)
+
+
+@compiled
 def delay_variances(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
     """Compute the variances that the jitter of the latency adds to position and velocity."""
     v, j = s.vel_n, p.gps_jitter_sq
-    span = max(lag, 0.02)
-    a = (once[0] / span, once[1] / span, once[2] / span + STANDARD_GRAVITY_MPS2)
+    a = mean_acceleration(once, lag)
     return (
         (j * v[0] * v[0], j * v[1] * v[1], j * v[2] * v[2]),
         (j * a[0] * a[0], j * a[1] * a[1], j * a[2] * a[2]),
@@ -220,12 +227,14 @@ def update_by_fix(
     before = s.P[TILT + 2, TILT + 2]
     late_pos, late_vel = delay_variances(s, p, once, lag)
     repeated = max(1.0, p.velocity_correlation_s / max(s.time_s - s.fix_s, 0.05))
+    north, east, _ = mean_acceleration(once, lag)
+    unexpected = lasting_noise_sq(s, north * north + east * east, s.time_s - s.fix_s)
     for k in range(3):
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             noise = repeated * velocity_variance(s, p, row, k) + late_vel[k]
-            update_scalar(s, off_vel[k], noise, VELOCITY_GATE_SQ)
+            update_scalar(s, off_vel[k], max(noise, unexpected), VELOCITY_GATE_SQ)
         if not math.isfinite(off_pos[k]):
             continue
         position_row(s, k, once, twice, lag)

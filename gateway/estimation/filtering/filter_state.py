@@ -57,6 +57,8 @@ class FilterState(
 ):
     """The part of a filter's state that says nothing of its model."""
 
+    noise_shown: float
+    """`noise_excess` over time, of a sound IMU alone; see `receiver_noise`."""
     started: int
     base_us: int
     time_us: int

@@ -9,6 +9,7 @@ from gateway.estimation.alignment.review import MOVING_MPS
 from gateway.estimation.alignment.wahba import align_by_velocity
 from gateway.estimation.columns import GPS_DECLINATION, GPS_DIP, GPS_LAT, GPS_LON, GPS_USABLE
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState
+from gateway.estimation.filtering.receiver_noise import note_receiver_noise
 from gateway.estimation.history import recall
 from gateway.estimation.kernel_record import FloatArray, as_vec
 from gateway.estimation.local_position import NEVER_S, fix_position, fix_velocity, move_origin
@@ -72,7 +73,10 @@ def is_flown_unaided(s: FilterState, vel: Vec3) -> bool:
 def pair_with(s: FilterState, at_s: float, vel: Vec3, noise_mps: float) -> float:
     """Give a velocity to the alignment as of when it was valid; see `align_by_velocity`."""
     at_s = look_back(s, at_s)
-    return align_by_velocity(s, at_s, vel, as_vec(s.then), noise_mps)
+    dt = align_by_velocity(s, at_s, vel, as_vec(s.then), noise_mps)
+    if dt > 0.0:
+        note_receiver_noise(s)
+    return dt
 
 
 @compiled

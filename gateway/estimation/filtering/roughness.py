@@ -6,6 +6,8 @@ from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray
 from gateway.records import Vec3
 
+ROUGH_TAU_S: Final = 2.0
+"""The roughness of the sensors is averaged over this time."""
 ROUGH_LIMIT: Final = 1e4
 """A larger change is a fault, and NaN compares false."""
 
@@ -21,6 +23,8 @@ class RoughnessState:
     """Variance of the angle over that time if what is uneven in the rate were white noise, rad2."""
     rough_accel: float
     """The same of the velocity, m2/s2."""
+    force_density: float
+    """Density of the noise of the specific force, as rough as it was of late, m2/s3."""
 
 
 @compiled
@@ -43,3 +47,10 @@ def collect_roughness(
     if turn < ROUGH_LIMIT and pull < ROUGH_LIMIT:
         s.rough_gyro += share * turn
         s.rough_accel += share * pull
+
+
+@compiled
+def note_force_noise(s: RoughnessState, dt: float) -> None:
+    """Average the noise of the specific force, before what was collected over `dt` is cleared."""
+    share = min(dt / ROUGH_TAU_S, 1.0)
+    s.force_density += share * (s.rough_accel / dt - s.force_density)
