@@ -19,6 +19,8 @@ from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
 
 MS_PER_S: Final = 1000.0
 SYSTEM_ID: Final = "MAV_SYS_ID"
+HEADER: Final = 3
+"""Bytes before the content of a message."""
 MOST_VALUES: Final = 1 << 16
 """In a row: a message has no more bytes."""
 BROKEN: Final = (
@@ -36,10 +38,12 @@ class _Content(io.BytesIO):
     """
 
     unread = 0
-    """Bytes behind what pyulog has read when it closes this."""
-    _missing = 0
+    """Bytes behind the last message that pyulog has read whole."""
+    _missing = _header_at = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
+        if size == HEADER:
+            self._header_at = self.tell()
         data = super().read(size)
         self._missing = max((size or 0) - len(data), 0)
         return data
@@ -49,7 +53,8 @@ class _Content(io.BytesIO):
 
     def close(self) -> None:
         if not self.closed:
-            self.unread = len(self.getbuffer()) - self.tell()
+            end = self._header_at if self._missing else self.tell()
+            self.unread = len(self.getbuffer()) - end
         super().close()
 
 
@@ -107,7 +112,7 @@ def _damage(log: Any, unread: int) -> Iterator[str]:
     if log.file_corruption:
         yield "is damaged; what is sound of it was read"
     if unread:
-        yield f"is damaged: its last {unread} bytes cannot be read"
+        yield f"its last {unread} bytes cannot be read"
 
 
 def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:

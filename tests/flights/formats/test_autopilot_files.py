@@ -245,15 +245,25 @@ def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: li
         rows_of(path)
 
 
-def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("odd", "is_read"),
+    [
+        # A dropout tells its length in two bytes.
+        (flown.ulog_message(b"O", b"\0"), True),
+        # A message that seems to last beyond the end.
+        (b"\xff\xffD", False),
+    ],
+)
+def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(
+    folder: Path, tmp_path: Path, odd: bytes, is_read: bool
+) -> None:
     data = (folder / "new.ulg").read_bytes()
-    middle = data.index(flown.SYNC, len(data) // 2) - 3
-    # A dropout tells its length in two bytes.
-    odd = flown.ulog_message(b"O", b"\0")
+    middle = data.index(flown.SYNC, len(data) - 40_000) - 3
     spoilt = flown.write(tmp_path / "odd.ulg", data[:middle] + odd + data[middle:])
     table, rows = rows_of(spoilt)
     assert len(rows) > 0.4 * len(whole(folder / "new.ulg")[1])
-    assert f"its last {len(data) - middle} bytes cannot be read" in " ".join(table.remarks)
+    lost = len(data) - middle + (0 if is_read else len(odd))
+    assert f"its last {lost} bytes cannot be read" in " ".join(table.remarks)
 
 
 @pytest.mark.parametrize("letters", [b"Q?", b"Q\xff"])
