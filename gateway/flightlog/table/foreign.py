@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final
 
 from gateway.flightlog.table.row import COLUMNS, TableRow, check_times
+from gateway.flightlog.tlog.tlog import DAY_US, ORDER_US
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -24,10 +25,6 @@ EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
 the velocity where it is not given."""
 NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 """Without these there is nothing to fuse."""
-ORDER_US: Final = 2 * US_PER_S
-"""A line that is so far before the one before, or behind the next one, has a damaged time."""
-DAY_US: Final = 86_400 * US_PER_S
-"""Of lines further apart nothing is known of what is between."""
 LATE_US: Final = 60 * US_PER_S
 """What was measured so long before or after its line has a damaged time, or another clock's."""
 SEA_LEVEL_PA: Final = 101_325.0

@@ -21,7 +21,6 @@ from gateway.edges.hub.fleet_link.site_keys import (
     recordings_key,
 )
 from gateway.edges.hub.fleet_link.zenoh_session import (
-    AT_ONCE,
     HOW_TO_ADD,
     PATIENT_IDS,
     Inlet,
@@ -29,6 +28,7 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     end_session,
     frames_of,
     open_session,
+    part_of_turn,
     session_config,
 )
 from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
@@ -229,4 +229,4 @@ class ZenohClient(Client):
 
 def _cost(data: bytes) -> float:
     """Return which part of a turn a message takes: no more is read from any client at a time."""
-    return max(1 / AT_ONCE, len(data) / READ_BYTES)
+    return part_of_turn(len(data), READ_BYTES)

@@ -35,10 +35,10 @@ MAX_WAITING: Final = 4096
 """What has come and was not taken yet: a third of a second of two hundred aircraft."""
 AT_ONCE: Final = 64
 """Taken in one turn of the loop, so that a flood cannot starve the others."""
-BYTES_AT_ONCE: Final = 4 * 4096
-"""Taken in one turn by a fleet, which has no samples that would have to wait meanwhile."""
 MAX_MESSAGE: Final = 4096
 """Bytes of one message with frames, as of a datagram; ours have at most 1100."""
+BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
+"""Taken in one turn by a fleet, which has no samples that would have to wait meanwhile."""
 MAX_PATIENT: Final = 1024
 """What waits for a congested link and must not be lost: a whole parameter list."""
 BATCHES: Final = 4
@@ -149,6 +149,22 @@ def frames_of(sample: "zenoh.Sample") -> bytes:
     return sample.payload.to_bytes()[:MAX_MESSAGE]
 
 
+def part_of_turn(size: int, bytes_at_once: int) -> float:
+    """Return which part of a turn of the loop a message of this size takes."""
+    return max(1 / AT_ONCE, size / bytes_at_once)
+
+
+def take_a_turn(
+    waiting: deque[Item], take: Callable[[Item], None], cost: Callable[[Item], float]
+) -> None:
+    """Take from the front what makes one turn of the loop full; `cost` tells the part of each."""
+    spent = 0.0
+    while waiting and spent < 1.0:
+        item = waiting.popleft()
+        spent += cost(item)
+        take(item)
+
+
 class Inlet(Generic[Item]):
     """Hands items from a thread to the loop, in order; when too many wait the oldest go.
 
@@ -202,11 +218,7 @@ class Inlet(Generic[Item]):
             return
         # Before the queue is looked at: what comes from now on wakes us again.
         self._is_due = False
-        spent = 0.0
-        while self._waiting and spent < 1.0:
-            item = self._waiting.popleft()
-            spent += self._cost(item)
-            self._take(item)
+        take_a_turn(self._waiting, self._take, self._cost)
         if self._waiting and not self._is_due:
             self._is_due = True
             self._loop.call_soon(self._drain)
@@ -280,15 +292,15 @@ class Reader:
             else:
                 # Commands, parameters, missions, texts: none of them comes again.
                 self._take(oldest)
-        spent = 0.0
-        while waiting and spent < 1.0:
-            sample = waiting.popleft()
-            spent += max(1 / AT_ONCE, min(len(sample.payload), MAX_MESSAGE) / BYTES_AT_ONCE)
-            self._take(sample)
+        take_a_turn(waiting, self._take, _cost)
         if waiting:
             self._loop.call_soon(self._drain)
         else:
             self._all_taken.set()
+
+
+def _cost(sample: "zenoh.Sample") -> float:
+    return part_of_turn(min(len(sample.payload), MAX_MESSAGE), BYTES_AT_ONCE)
 
 
 class Outlets:
