@@ -12,6 +12,7 @@ import typer
 from gateway import __version__
 from gateway.cli.command_table import LazyGroup
 from gateway.edges.operator.log_limit import LogLimit
+from gateway.edges.printable import PrintableFormatter, printable
 from gateway.edges.reasons import reason_of
 
 log = logging.getLogger(__name__)
@@ -50,7 +51,8 @@ def _options(
         form = "%(message)s"
         handler = RichHandler(console=Console(stderr=True), show_path=False)
     handler.addFilter(LogLimit())
-    logging.basicConfig(level=level, format=form, handlers=[handler])
+    handler.setFormatter(PrintableFormatter(form))
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 def _prepare_streams() -> None:
@@ -72,4 +74,4 @@ def main() -> None:
         app()
     except OSError as error:
         log.debug("Ended by %r", error, exc_info=error)
-        sys.exit(f"{error.filename or 'output'}: {reason_of(error)}")
+        sys.exit(printable(f"{error.filename or 'output'}: {reason_of(error)}"))

@@ -141,13 +141,13 @@ def _each(
         try:
             calibration = solve(step, calibration)
         except CalibrationError as error:
-            console.print(f"[red]{step}: {error}[/]")
+            console.print(f"{step}: {error}", style="red")
         except (KeyboardInterrupt, typer.Abort):
             left = ", ".join(steps[number:])
-            console.print(f"\n[yellow]Broken off. Not done: {left}.[/]")
+            console.print(f"\nBroken off. Not done: {left}.", style="yellow")
             break
         else:
-            console.print(f"[green]{step}: done[/]")
+            console.print(f"{step}: done", style="green")
             save(calibration)
     return calibration
 
@@ -282,7 +282,7 @@ class _Listening:
 
 
 def _ask(text: str) -> None:
-    console.print(f"\n[bold]{text}[/]")
+    console.print(f"\n{text}", style="bold")
     typer.prompt("Enter when ready", default="", show_default=False)
 
 

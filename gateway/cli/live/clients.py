@@ -42,7 +42,7 @@ def status(*, json: JsonOption = False) -> None:
         print(msgspec.json.encode(snapshot).decode())
         return
     console = console_of()
-    console.print(_summary(snapshot), markup=False)
+    console.print(_summary(snapshot))
     if nodes := snapshot["report"]["nodes"]:
         console.print()
         console.print(_nodes(nodes, snapshot))
@@ -74,7 +74,7 @@ def add(
     snapshot = ask("status")
     for added in (*snapshot["listeners"], *snapshot["clients"]):
         if added["endpoint"] == url and added["reason"]:
-            print(f"{added['name']}: {added['reason']}; trying again until it works")
+            console_of().print(f"{added['name']}: {added['reason']}; trying again until it works")
 
 
 def _save(file: Path, url: str) -> None:
@@ -187,7 +187,7 @@ def _print_clients(console: Console, snapshot: Record) -> None:
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
         if client["reason"]:
-            console.print(f"{client['name']}: {client['reason']}", style="yellow", markup=False)
+            console.print(f"{client['name']}: {client['reason']}", style="yellow")
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:

@@ -26,6 +26,6 @@ def doctor(*, config: ConfigOption = None) -> None:
     for finding in check_machine(read_settings(config)):
         wrong += finding.grade is Grade.WRONG
         console.print(f"{finding.grade:5} ", style=STYLES[finding.grade], end="")
-        console.print(f"{finding.what}: {finding.text}", markup=False)
+        console.print(f"{finding.what}: {finding.text}")
     if wrong:
         raise typer.Exit(1)

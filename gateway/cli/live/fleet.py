@@ -86,25 +86,25 @@ def status(*, json: JsonOption = False) -> None:
     console = console_of()
     role = "router at" if found["is_router"] else "connected to"
     lost = "" if found["is_linked"] else ", which is not there"
-    console.print(f"{role} {found['router']}{lost}", markup=False)
+    console.print(f"{role} {found['router']}{lost}")
     table = table_of("site", "", "ms", "system", "id here", "Hz", "age s", "lost", left=2)
     for each in found["sites"]:
         _add_site(table, each)
     console.print(table)
     if found["unmapped"]:
         text = f"no id left for: {', '.join(found['unmapped'])}; give one by `mavgate fleet id`"
-        console.print(text, markup=False)
+        console.print(text)
     if found["left_out"]:
-        console.print(f"left out by hand: {', '.join(found['left_out'])}", markup=False)
+        console.print(f"left out by hand: {', '.join(found['left_out'])}")
     if found["overflowed"]:
-        console.print(f"{found['overflowed']} messages came too fast to be taken", markup=False)
+        console.print(f"{found['overflowed']} messages came too fast to be taken")
     loops = [
         f"{site['looped']} through {site['name']}" for site in found["sites"] if site["looped"]
     ]
     if found["looped"]:
         loops.append(f"{found['looped']} through clients here")
     if loops:
-        console.print(f"looped frames ended: {', '.join(loops)}", markup=False)
+        console.print(f"looped frames ended: {', '.join(loops)}")
 
 
 @group.command("id")
@@ -118,7 +118,7 @@ def set_id(
         refuse(f"{vehicle!r} is not SITE/SYSTEM, as in field-1/1")
     params = {"site": name, "system_id": int(system), "own_id": own_id}
     for line in ask("fleet.id", params, of="fleet", wait_s=DISK_S):
-        print(line)
+        console_of().print(line)
 
 
 def _add_site(table: Any, site: Mapping[str, Any]) -> None:
@@ -236,7 +236,7 @@ def _fetch_all(fetch: RecordingFetch, recording: dict[str, Any], folder: Path) -
             state = "fetched" if is_new else "was here already"
             lines.append(f"{folder / file['name']} {state}")
     for line in lines:
-        print(line)
+        console_of().print(line)
 
 
 def _find(listed: list[dict[str, Any]], name: str) -> dict[str, Any] | None:

@@ -110,7 +110,7 @@ def delete(
     except RecordingError as error:
         refuse(str(error))
     for path in deleted.files:
-        print(f"deleted {path}")
+        console_of().print(f"deleted {path}")
 
 
 @group.command("list")
@@ -153,8 +153,8 @@ def _show(status: dict[str, Any]) -> None:
         line += f", {status['part_bytes'] / 1e6:.1f} MB"
     if status["reason"]:
         line += f" ({status['reason']})"
-    console.print(line, markup=False)
-    console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free", markup=False)
+    console.print(line)
+    console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free")
 
 
 def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":

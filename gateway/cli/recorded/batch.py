@@ -210,12 +210,11 @@ def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
 def _show_versus(compared: "Versus") -> None:
     console = console_of()
     for estimator, lead in compared.leads.items():
-        console.print(f"{estimator} against the other results: {lead.text}", markup=False)
+        console.print(f"{estimator} against the other results: {lead.text}")
     for change in compared.worse:
         console.print(
             f"worse: {change.place}, {change.estimator}: {change.before_m:.3f} m before, "
             f"{change.after_m:.3f} m now",
-            markup=False,
         )
 
 

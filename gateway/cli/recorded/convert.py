@@ -111,4 +111,4 @@ def convert(
     lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
     if lacks and message is None:
         print_remarks([f"{out} does not hold {lacks}"])
-    console_of().print(f"{out}: {size / 1e6:.3f} MB", markup=False)
+    console_of().print(f"{out}: {size / 1e6:.3f} MB")

@@ -119,7 +119,7 @@ def fuse_log(
         write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
     print_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-    console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}", markup=False)
+    console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}")
 
 
 def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
@@ -127,7 +127,7 @@ def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, 
     fusion = RowFusion(Aircraft(table.header.vehicle_id, aircraft), follow=False)
     rows = [block.cells for block in fusion.blocks(_with_begin(table.blocks))]
     for reason in fusion.refused:
-        console_of(stderr=True).print(SETTLES.format(reason), markup=False)
+        console_of(stderr=True).print(SETTLES.format(reason))
     cells = np.concatenate(rows)
     cells = cells[has_group(cells, NAV)]
     return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]

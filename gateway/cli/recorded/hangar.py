@@ -88,7 +88,6 @@ def index(
     console_of().print(
         f"{place}: {report.read} read, {report.unchanged} unchanged, {report.gone} gone; "
         f"{report.broken} of those read are broken",
-        markup=False,
     )
 
 

@@ -113,11 +113,11 @@ def recover(
         )
         before = file.stat().st_size
     for line in left_out[:SHOWN]:
-        console.print(line, markup=False)
+        console.print(line)
     if len(left_out) > SHOWN:
         console.print(f"and {len(left_out) - SHOWN} more places")
     verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
-    console.print(f"{target}: {size} of {before} bytes; {verdict}", markup=False)
+    console.print(f"{target}: {size} of {before} bytes; {verdict}")
 
 
 def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
@@ -126,7 +126,7 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
         for run in batch.damage:
             report(f"at byte {run.offset}: {run.size} bytes that are no record")
         if batch.mended:
-            console_of().print(MENDED.format(batch.mended), markup=False)
+            console_of().print(MENDED.format(batch.mended))
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
         found = found or len(batch.starts) > 0
     if not found:
@@ -152,16 +152,15 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
-    console.print(f"{file}: {found.kind}, {found.size / 1e6:.3f} MB", markup=False)
+    console.print(f"{file}: {found.kind}, {found.size / 1e6:.3f} MB")
     console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:
         head = found.header
         console.print(
             f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}",
-            markup=False,
         )
     for vehicle in found.vehicles:
-        console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n", markup=False)
+        console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n")
     for gap in found.gaps[:SHOWN]:
         at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
         console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
@@ -169,14 +168,15 @@ def _show(file: Path, found: FileInfo) -> None:
         console.print(f"and {len(found.gaps) - SHOWN} more gaps")
     for mark in found.marks:
         at_s = (mark.time_us - (found.first_us or 0)) / US_PER_S
-        console.print(f"mark at {_clock(at_s)}: {mark.text}", markup=False)
+        console.print(f"mark at {_clock(at_s)}: {mark.text}")
     if found.damaged_bytes:
         console.print(
-            f"[red]damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
-            "`mavgate recover` leaves them out[/red]"
+            f"damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
+            "`mavgate recover` leaves them out",
+            style="red",
         )
     for remark in found.remarks:
-        console.print(remark, markup=False)
+        console.print(remark)
 
 
 def _heading(vehicle: VehicleInfo, kind: str) -> str:

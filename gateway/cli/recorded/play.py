@@ -137,7 +137,7 @@ def play(
             flights = lay_out(recorded, system or [], with_commands=with_commands)
             prepare(flights, plan)
         for remark in (remark for flight in recorded for remark in flight.remarks):
-            console_of(stderr=True).print(remark, markup=False)
+            console_of(stderr=True).print(remark)
         names = [file.name for file in files]
         try:
             asyncio.run(
@@ -302,4 +302,4 @@ def _place(status: PlayerStatus) -> str:
 
 def _show(status: dict[str, Any]) -> None:
     place = PlayerStatus(**{**status, "files": tuple(status["files"])})
-    console_of().print(f"{place.state}: {_place(place)}", markup=False)
+    console_of().print(f"{place.state}: {_place(place)}")

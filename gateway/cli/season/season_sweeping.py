@@ -122,13 +122,11 @@ def _show(
         console.print(
             "against the settings that the flights came with, each flight judging only what the "
             f"others chose: {choice.over_base.text}",
-            markup=False,
         )
     if choice.over_second is not None:
         console.print(
             f"the winner against the second, on the flights that chose both: "
             f"{choice.over_second.text}",
-            markup=False,
         )
 
 

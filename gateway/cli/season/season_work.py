@@ -15,6 +15,7 @@ from gateway.cli.support.named_recordings import Wanted, files_of, recordings_fo
 from gateway.cli.support.recording_options import read_column_map, refusing
 from gateway.cli.support.settings_options import pipeline_settings, read_settings
 from gateway.cli.support.terminal import console_of
+from gateway.edges.printable import printable
 from gateway.flights.flight_terms import SettingsChoice
 from gateway.flights.reading import ReadOptions
 from gateway.season.batch.dask_executor import ClusterError, DaskCluster, has_dask
@@ -105,7 +106,7 @@ class SeasonWork:
         """Run a task on all, with a progress bar, and list what failed."""
         console = console_of(stderr=True)
         columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+            TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
             TimeRemainingColumn(),
         )  # fmt: skip
         with refusing():
@@ -118,7 +119,7 @@ class SeasonWork:
             bar = progress.add_task(task.name, total=len(items))
 
             def report(what: str, done: int, total: int) -> None:
-                text = f"{task.name}: {what.rsplit('/', 1)[-1][-40:]}"
+                text = f"{task.name}: {printable(what.rsplit('/', 1)[-1][-40:])}"
                 progress.update(bar, description=text, completed=done, total=total, refresh=True)
 
             try:
@@ -163,6 +164,6 @@ def _print_failures(results: Sequence[FlightResult]) -> None:
     for result in failed[:SHOWN]:
         text = result.error or ""
         line = text if text.startswith(result.place) else f"{result.place}: {text}"
-        console.print(line, style="red", markup=False)
+        console.print(line, style="red")
     if len(failed) > SHOWN:
         console.print(f"and {len(failed) - SHOWN} more that failed")

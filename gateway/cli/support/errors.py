@@ -17,7 +17,7 @@ def refuse(text: str) -> NoReturn:
         What was wrong, where, and what to do; one or more lines.
     """
     console = console_of(stderr=True)
-    console.print(text, style="red", markup=False, emoji=False)
+    console.print(text, style="red")
     raise typer.Exit(2)
 
 

@@ -84,7 +84,7 @@ def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
 def print_remarks(remarks: Iterable[str]) -> None:
     """Print remarks about a file to stderr."""
     for remark in remarks:
-        console_of(stderr=True).print(remark, markup=False)
+        console_of(stderr=True).print(remark)
 
 
 @contextmanager

@@ -126,7 +126,7 @@ def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
         text += f" with the estimator {estimator}"
     if len(idle) == len(axes):
         raise SweepError(f"{text}; vary another setting, or choose the estimator that uses it")
-    console_of(stderr=True).print(f"[yellow]{text}[/]")
+    console_of(stderr=True).print(text, style="yellow")
 
 
 def _progress() -> Progress:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+
+from gateway.edges.printable import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
 ENDLESS: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
@@ -18,11 +21,21 @@ JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 
 def console_of(*, stderr: bool = False) -> Console:
-    """Open a console that leaves long lines whole."""
+    """Open a console that leaves long lines whole, and obeys nothing that texts hold.
+
+    Names of files and texts of recordings are printed as they are: brackets and colons are no
+    markup, and control characters do not reach the terminal.
+    """
     # Imported late, because a service prints nothing.
     from rich.console import Console
 
-    console = Console(stderr=stderr, highlight=False, soft_wrap=True)
+    class PrintableConsole(Console):
+        def render_str(self, text: str, **how: Any) -> Text:
+            return super().render_str(printable(text), **how)
+
+    console = PrintableConsole(
+        stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False
+    )
     if not console.is_terminal:
         console.width = ENDLESS
     return console

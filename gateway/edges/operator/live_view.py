@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.edges.operator.log_line import UNKNOWN, figure_of
+from gateway.edges.printable import PrintableFormatter
 from gateway.geometry.quaternion import to_euler
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, ListenerStats
@@ -61,7 +62,7 @@ class RecentLog(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+        self.setFormatter(PrintableFormatter("%(asctime)s %(message)s", "%H:%M:%S"))
         self.lines: deque[tuple[str, str]] = deque(maxlen=LOG_LINES)
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -1,6 +1,7 @@
 """Odd input to the commands: what is wrong is said with the file, the line and what to do."""
 
 import gzip
+import logging
 import os
 import struct
 import tracemalloc
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
+from gateway.edges.printable import PrintableFormatter
 from gateway.flightlog.table.row import COLUMNS
 from gateway.flightlog.table.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
@@ -228,3 +230,29 @@ def test_settings_with_a_byte_order_mark_are_settings(tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
     file.write_bytes(b"\xef\xbb\xbf[recording]\nmode = 'always'\n")
     assert "all settings are right" in run("check-config", file)
+
+
+def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:
+    evil = "\x1b]0;owned\x07 \x9b2J [red] :bomb:"
+    recorded = table(tmp_path / "a\x1b[31m[red].csv")
+    mark = msgspec.json.encode({"time_us": 1000, "text": evil}).decode()
+    with recorded.open("a") as file:
+        file.write(f"# mark: {mark}\n")
+    told = run("info", recorded)
+    assert r"\x1b]0;owned\x07 \x9b2J [red] :bomb:" in told
+    assert r"a\x1b[31m[red].csv: table" in told
+    refused = run("info", tmp_path / "b\x1b[31m.csv", code=2)
+    assert r"b\x1b[31m.csv: No such file" in refused
+    assert not set("\x1b\x07\x9b") & set(told + refused)
+
+
+def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> None:
+    (tmp_path / "x[").mkdir()
+    table(tmp_path / "x[" / "y].csv")
+    run("hangar", tmp_path, "--jobs", 1)
+    assert "x[/y].csv" in run("hangar", "list", "-d", tmp_path)
+
+
+def test_a_log_line_holds_no_control_characters() -> None:
+    record = logging.makeLogRecord({"msg": "from %s", "args": ("\x1b[2J\r",)})
+    assert PrintableFormatter("%(message)s").format(record) == r"from \x1b[2J\x0d"
