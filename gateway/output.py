@@ -10,7 +10,7 @@ import errno
 import os
 import stat
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +18,8 @@ READABLE: Final = 0o666
 """Less the user's umask."""
 PRIVATE: Final = 0o600
 """For files with a passphrase."""
+LETTERS: Final = 40
+"""Of a file's name that the one beside it has too: four bytes each, of 255 that a name may have."""
 
 
 def check_output(
@@ -42,6 +44,7 @@ def check_output(
     try:
         there = path.lstat()
     except FileNotFoundError:
+        _check_writable(path, path.parent)
         return
     for read in inputs:
         if read is not None and read.exists() and os.path.samestat(read.stat(), path.stat()):
@@ -50,16 +53,24 @@ def check_output(
         raise OSError(errno.EINVAL, "is no regular file, and is not replaced", str(path))
     if not overwrite:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    _check_writable(path, path.parent)
 
 
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
-    if not path.exists() and not path.is_symlink():
-        return
-    if not path.is_dir():
-        raise OSError(errno.ENOTDIR, "is no folder", str(path))
-    if not overwrite and any(path.iterdir()):
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    if path.exists() or path.is_symlink():
+        if not path.is_dir():
+            raise OSError(errno.ENOTDIR, "is no folder", str(path))
+        if not overwrite and any(path.iterdir()):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    _check_writable(path, next(folder for folder in (path, *path.parents) if folder.is_dir()))
+
+
+def _check_writable(path: Path, folder: Path) -> None:
+    if not folder.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "is in a folder that is not there", str(path))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, "is in a folder that cannot be written", str(path))
 
 
 def write_new(
@@ -98,23 +109,36 @@ def write_new(
     check_output(path, inputs, overwrite=overwrite)
     if rights is None:
         rights = stat.S_IMODE(path.stat().st_mode) if path.exists() else READABLE & ~_mask()
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
-    fresh, size = Path(name), 0
-    try:
-        with os.fdopen(handle, "wb") as file:
-            for piece in pieces:
-                size += file.write(piece)
-            file.flush()
-            os.fchmod(file.fileno(), rights)
-            os.fsync(file.fileno())
-        if overwrite:
-            fresh.replace(path)
-        else:
-            _put_where_none_is(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    beside, size = f".{path.name[:LETTERS]}.", 0
+    with _named(path, beside):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=beside)
+        fresh = Path(name)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                for piece in pieces:
+                    size += file.write(piece)
+                file.flush()
+                os.fchmod(file.fileno(), rights)
+                os.fsync(file.fileno())
+            if overwrite:
+                fresh.replace(path)
+            else:
+                _put_where_none_is(fresh, path)
+        finally:
+            fresh.unlink(missing_ok=True)
     sync_folder(path.parent)
     return size
+
+
+@contextlib.contextmanager
+def _named(path: Path, beside: str) -> Iterator[None]:
+    """Name the file that the disk refuses, not the one beside it; others keep their names."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None or Path(error.filename).name.startswith(beside):
+            error.filename = str(path)
+        raise
 
 
 def _put_where_none_is(fresh: Path, path: Path) -> None:

@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -139,3 +140,44 @@ def test_a_folder_that_holds_something_is_asked_about(tmp_path: Path) -> None:
 def test_an_output_is_checked_before_the_work(tmp_path: Path) -> None:
     check_output(tmp_path / "a")
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_is_told_by_the_file_that_was_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = os.open("/dev/full", os.O_WRONLY)
+    monkeypatch.setattr(tempfile, "mkstemp", lambda **_: (full, str(tmp_path / ".a.csv.1")))
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_new(tmp_path / "a.csv", [b"1"])
+    assert caught.value.filename == str(tmp_path / "a.csv")
+
+
+def test_what_cannot_be_read_keeps_its_own_name(tmp_path: Path) -> None:
+    def pieces() -> Iterator[bytes]:
+        yield b"1"
+        raise OSError(errno.EIO, "is broken", "input.csv")
+
+    with pytest.raises(OSError, match="is broken") as caught:
+        write_new(tmp_path / "a.csv", pieces())
+    assert caught.value.filename == "input.csv"
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_long_name_in_any_script_can_be_written(tmp_path: Path) -> None:
+    name = "飛" * 83 + ".csv"
+    write_new(tmp_path / name, [b"1"])
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_folder_that_is_missing_or_read_only_is_told_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(FileNotFoundError, match="folder that is not there"):
+        check_output(tmp_path / "none" / "a.csv")
+    check_folder(tmp_path / "none" / "report")
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
+    with pytest.raises(PermissionError, match="cannot be written"):
+        check_output(tmp_path / "a.csv")
+    with pytest.raises(PermissionError, match="cannot be written"):
+        check_folder(tmp_path / "none" / "report")

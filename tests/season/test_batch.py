@@ -134,8 +134,9 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "replace", fail)
-        with pytest.raises(OSError, match="full"):
+        with pytest.raises(OSError, match="full"), folder.held():
             folder.keep(result, {"reports/a/index.html": b"page"})
+    assert not (tmp_path / ".partial").exists()
     assert folder.find("k") is None
     assert not (tmp_path / "reports" / "a").exists()
     again = ResultFolder(tmp_path)

@@ -1,5 +1,6 @@
 import json
 import os
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -232,6 +233,26 @@ def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
         find_flights(tmp_path)
     Hangar(tmp_path).close()
     assert find_flights(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [(sqlite3.SQLITE_FULL, "make room"), (sqlite3.SQLITE_IOERR | 9 << 8, "delete it and index")],
+)
+def test_a_catalogue_that_cannot_be_written_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+) -> None:
+    def fail(*_: object) -> None:
+        (tmp_path / HANGAR_NAME).touch()
+        error = sqlite3.OperationalError("no luck")
+        error.sqlite_errorcode = code
+        raise error
+
+    monkeypatch.setattr(Hangar, "_make", fail)
+    with pytest.raises(HangarError, match=f"no luck; .*{told}"):
+        Hangar(tmp_path)
+    with pytest.raises(HangarError, match="no catalogue yet"):
+        find_flights(tmp_path)
 
 
 def catalogued(number: int) -> CataloguedFile:

@@ -58,6 +58,8 @@ def run_season_sweep(
         With those that failed.
     """
     with refusing():
+        if kept is not None:
+            kept.mkdir(parents=True, exist_ok=True)
         for out in (options.output, options.table):
             if out is not None:
                 check_output(out, overwrite=options.overwrite)

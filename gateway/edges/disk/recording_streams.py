@@ -103,7 +103,7 @@ def open_descriptor(path: Path) -> int:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Raise a clear OSError for a damaged gzip file."""
+    """Raise a clear OSError for a damaged gzip file, and one with a name for what fails later."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
@@ -112,6 +112,9 @@ def readable(path: Path) -> Iterator[None]:
             f"is a damaged gzip file ({error}); `gzip -dc FILE > NEW` saves the intact part",
             str(path),
         ) from error
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:

@@ -39,7 +39,7 @@ class ResultFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs out, and remove what an interrupted one left half written.
+        """Keep other runs out, and remove what was left half written: by a killed one, or by this.
 
         Raises
         ------
@@ -49,8 +49,11 @@ class ResultFolder:
         descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             _lock(descriptor, self.folder)
-            shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
-            yield
+            self._clear()
+            try:
+                yield
+            finally:
+                self._clear()
         finally:
             # Processes that were forked meanwhile have it open, too.
             with suppress(OSError):
@@ -70,7 +73,7 @@ class ResultFolder:
         for name, content in files.items():
             path = staged / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            write_new(path, [content])
         # What belongs together (a page and its figures) is a folder, and is put in place at once.
         for unit in {Path(*Path(name).parts[:2]) for name in files}:
             target = self.folder / unit
@@ -80,6 +83,10 @@ class ResultFolder:
             (staged / unit).replace(target)
         shutil.rmtree(staged, ignore_errors=True)
         write_new(self._path(result.key), [msgspec.json.encode(result)], overwrite=True)
+
+    def _clear(self) -> None:
+        """Remove what was not put in its place."""
+        shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
 
     def _path(self, key: str) -> Path:
         return self.folder / RESULTS / f"{key}.json"

@@ -35,6 +35,15 @@ COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
 _PLACE: Final = struct.Struct("<iii")
 """Latitude and longitude in 1e-7 deg, height in cm."""
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
+_DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
+_NOT_WRITABLE: Final = "it stands beside the recordings: make their folder writable, or copy them"
+_WAYS_OUT: Final = {
+    sqlite3.SQLITE_FULL: "make room on the disk and index again",
+    sqlite3.SQLITE_BUSY: "another indexing is at work; wait for its end",
+    sqlite3.SQLITE_READONLY: _NOT_WRITABLE,
+    sqlite3.SQLITE_CANTOPEN: _NOT_WRITABLE,
+}
+"""By SQLite's code of the error."""
 
 Row = dict[str, Any]
 
@@ -191,7 +200,8 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
 def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
     """Open a catalogue for reading alone."""
     path = folder / HANGAR_NAME
-    if not path.exists():
+    # An indexing that found no room leaves an empty file.
+    if not path.exists() or not path.stat().st_size:
         raise HangarError(f"{folder} has no catalogue yet; `mavgate hangar {folder}` makes one")
     with _told(path):
         db = sqlite3.connect(
@@ -242,13 +252,13 @@ def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Say which catalogue SQLite cannot work with."""
+    """Say which catalogue SQLite cannot work with, and what to do."""
     try:
         yield
     except sqlite3.Error as error:
-        raise HangarError(
-            f"{path}: {error}; if it is no catalogue or damaged, delete it and index again"
-        ) from error
+        # The lowest byte; the others tell more precisely what failed.
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        raise HangarError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
 
 
 def _counts(place: Place) -> tuple[int, int, int]:
