@@ -1,11 +1,14 @@
 """The architecture, enforced: who may import whom, what is pure, how large a file may grow."""
 
 import ast
+import subprocess
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent / "gateway"
 
@@ -204,3 +207,13 @@ def test_imports_go_in_no_circle() -> None:
         for name, path in modules.items()
     }
     TopologicalSorter(graph).prepare()
+
+
+def test_nothing_that_git_ignores_is_in_the_repository() -> None:
+    """A checkout would put it in the place of what is there, such as a virtual environment."""
+    ask = ["git", "ls-files", "--cached", "--ignored", "--exclude-standard"]
+    try:
+        asked = subprocess.run(ask, cwd=ROOT.parent, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no repository here: {error}")
+    assert asked.stdout == ""
