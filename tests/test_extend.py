@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import MagicMock
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -23,6 +24,7 @@ from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flights.reading import READERS, ReadOptions
 from gateway.flights.writing import WRITERS, FlightToWrite
+from gateway.panel.added_views import ADDED_VIEWS, add_view
 from gateway.records import ImuRaw, Incoming, NavState
 from gateway.replay import header_for
 from gateway.routing.endpoint import ADDED_KINDS
@@ -40,6 +42,7 @@ REGISTRIES: tuple[dict, ...] = (
     READERS,
     OTHER_FORMATS,
     CLIENTS,
+    ADDED_VIEWS,
 )
 
 Install = Callable[[str, str], ModuleType]
@@ -155,6 +158,20 @@ def test_a_format_is_written_and_read(install: Install, tmp_path: Path) -> None:
     frames = [record.frame for record in again.frames()]
     assert any(message_id_of(f) == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION for f in frames)
     assert b"".join(WRITERS[".jsonl"](again)) == written.read_bytes()
+
+
+def test_a_view_is_built_on_the_page(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("my_tracker", example("A view of the panel"))
+    load_extensions()
+    nicegui, context = MagicMock(), MagicMock()
+    monkeypatch.setitem(sys.modules, "nicegui", nicegui)
+    context.vehicle.newest = {"RADIO_STATUS": MagicMock(rxerrors=7)}
+    (view,) = ADDED_VIEWS.values()
+    view.build(context)
+    assert view.title == "Radio"
+    nicegui.ui.label().classes().set_text.assert_called_with("7 samples lost")
+    with pytest.raises(ValueError, match="twice"):
+        add_view("Radio", "radio", "my_tracker:build")
 
 
 def test_an_unknown_estimator_is_refused_by_name() -> None:

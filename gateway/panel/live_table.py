@@ -48,11 +48,14 @@ class LiveTable:
         self._cells: dict[str, list[ui.label]] = {}
         self._shown: dict[str, Cells] = {}
         self._rows: dict[str, ui.element] = {}
-        with ui.element("div").classes("table-frame"), ui.element("table").classes("table"):
+        frame = ui.element("div").classes("table-frame").props("tabindex=0")
+        with frame, ui.element("table").classes("table"):
             with ui.element("thead"), ui.element("tr"):
-                for heading in (*columns, *([""] if buttons else [])):
-                    with ui.element("th"):
+                for heading in columns:
+                    with ui.element("th").props("scope=col"):
                         ui.label(heading)
+                if buttons:
+                    ui.element("td")
             self._body = ui.element("tbody")
         self._empty = ui.label(empty).classes("soft nothing")
 

@@ -1,4 +1,4 @@
-"""Prompts around a request: a notice if it failed, and a question before it is irreversible."""
+"""Headings, and prompts around a request: why it failed, a question before it cannot be undone."""
 
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +15,11 @@ from gateway.panel.view_context import NotAllowedError, ViewContext
 FAILURES: Final = (
     ControlError, CommandFailedError, NotAllowedError, PlaybackError, RecordingError, OSError,
 )  # fmt: skip
+
+
+def heading(text: str) -> ui.label:
+    """Add the heading of a card, which a screen reader finds as one."""
+    return ui.label(text).classes("title").props("role=heading aria-level=2")
 
 
 @contextmanager

@@ -176,6 +176,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     ui.run_with(
         app,
         title="mavgate",
+        language="en-GB",
         dark=None,
         favicon=WEB / "icon.svg",
         show_welcome_message=False,

@@ -4,14 +4,13 @@ A view is one entry of `VIEWS`; see `view_context.py` for the interface of its f
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
+from gateway.panel.added_views import ADDED_VIEWS, View
 from gateway.panel.page_prompts import notify_failure
 from gateway.panel.state.shown_units import ShownUnits
 from gateway.panel.view_context import PanelParts, Role, ViewContext
@@ -27,21 +26,15 @@ from gateway.panel.views import (
 )
 
 STATE_S: Final = 0.5
+TYPING: Final[list[Literal["input", "select", "button", "textarea"]]] = [
+    "input",
+    "select",
+    "textarea",
+]
+"""Elements in which a key is typed, and is no order."""
 SILENT_S: Final = 3.0
 UNITS: Final = {"metric": "m", "imperial": "mi", "aviation": "kt"}
 THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """One view of the page."""
-
-    key: str
-    """Its part of the page's address, behind the hash."""
-    title: str
-    icon: str
-    """Name of a Material icon, which NiceGUI includes."""
-    build: Callable[[ViewContext], None]
 
 
 VIEWS: Final = (
@@ -54,7 +47,7 @@ VIEWS: Final = (
     View("plots", "Plots", "show_chart", plots_view.build),
     View("events", "Events", "notifications", events_view.build),
 )
-"""In the order of the rail, and of the keys 1 to 9."""
+"""In the order of the rail, and of the keys 1 to 9, which added views follow."""
 
 
 def build_page(parts: PanelParts, role: Role, version: str) -> None:
@@ -82,6 +75,7 @@ class _Page:
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
+        self._views = {view.key: view for view in (*VIEWS, *ADDED_VIEWS.values())}
         self._built: set[str] = set()
         self._panels: dict[str, ui.element] = {}
         self._buttons: dict[str, ui.button] = {}
@@ -95,14 +89,17 @@ class _Page:
             self._build_head()
             events_view.build_banner(self._context)
             with ui.element("nav").classes("rail").props('aria-label="Views"'):
-                for number, view in enumerate(VIEWS, 1):
+                for number, view in enumerate(self._views.values(), 1):
                     self._build_button(view, number)
-            with ui.element("main").classes("stage"):
-                for view in VIEWS:
-                    panel = ui.element("section").classes("view").props(f"data-view={view.key}")
+            with ui.element("div").classes("stage"):
+                for view in self._views.values():
+                    panel = ui.element("section").classes("view")
+                    panel.props(f'data-view={view.key} aria-label="{view.title}"')
                     panel.set_visibility(False)
                     self._panels[view.key] = panel
-        ui.keyboard(on_key=self._on_key)
+        ui.keyboard(on_key=self._on_key, ignore=TYPING)
+        # On a button, the space bar presses it.
+        ui.keyboard(on_key=self._on_space, ignore=[*TYPING, "button"])
         ui.timer(STATE_S, self._refresh)
         self._refresh()
         self.show(VIEWS[0].key)
@@ -111,8 +108,7 @@ class _Page:
 
     def show(self, key: str) -> None:
         """Show one view."""
-        views = {view.key: view for view in VIEWS}
-        if key not in views:
+        if key not in self._views:
             return
         for other, panel in self._panels.items():
             panel.set_visibility(other == key)
@@ -122,11 +118,11 @@ class _Page:
             self._built.add(key)
             self._context.building(key)
             with self._panels[key]:
-                views[key].build(self._context)
+                self._views[key].build(self._context)
 
     def _build_head(self) -> None:
         with ui.element("header").classes("head"):
-            ui.html('<span class="brand">mavgate</span>', sanitize=False)
+            ui.html('<h1 class="brand">mavgate</h1>', sanitize=False)
             self._choice = ui.select({}, on_change=self._on_choice).classes("choice")
             self._choice.props('dense options-dense borderless aria-label="Aircraft"')
             self._state = ui.element("div").classes("chips").props("role=status")
@@ -151,18 +147,19 @@ class _Page:
             ui.label(view.title)
         self._buttons[view.key] = button
 
-    async def _on_key(self, event: KeyEventArguments) -> None:
+    def _on_key(self, event: KeyEventArguments) -> None:
         if not event.action.keydown or event.action.repeat or event.modifiers.ctrl:
             return
         key = event.key.name
-        if key.isdecimal() and 0 < int(key) <= len(VIEWS):
-            self.show(VIEWS[int(key) - 1].key)
+        if key.isdecimal() and 0 < int(key) <= len(self._views):
+            self.show([*self._views][int(key) - 1])
         elif key == "t":
             self._next_theme()
-        elif event.key.space and self._context.parts.playback.name:
-            await self._toggle_playback()
 
-    async def _toggle_playback(self) -> None:
+    async def _on_space(self, event: KeyEventArguments) -> None:
+        pressed = event.action.keydown and not event.action.repeat and event.key.space
+        if not pressed or not self._context.parts.playback.name:
+            return
         with notify_failure(self._context):
             self._context.check_may_change()
             await self._context.parts.playback.toggle()

@@ -150,6 +150,10 @@ class TestFlightDisplay:
         vehicle.airspeed_mps = 0.0
         until_drawn(page, "GS  m/s", "19.3")
         expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"speed 19.3 m/s"))
+        vehicle.airspeed_mps = 18.2
+        until_drawn(page, "AS  m/s", "18.2", "GS 19.3")
+        vehicle.airspeed_mps = vehicle.groundspeed_mps
+        until_drawn(page, "GS  m/s", "19.3")
 
     def test_row_roll_pitch_and_yaw(self, told: tuple[ToldVehicle, Page]) -> None:
         vehicle, page = told

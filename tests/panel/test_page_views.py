@@ -265,7 +265,7 @@ def test_every_view_fits_every_width(desk: Desk, scheme: Literal["light", "dark"
     page = desk.page
     page.emulate_media(color_scheme=scheme)
     expect(page.locator("body")).to_have_class(re.compile(f"body--{scheme}"))
-    for width in (1440, 1024, 390):
+    for width in (1440, 1024, 360):
         page.set_viewport_size({"width": width, "height": 844})
         for number, key in enumerate(VIEWS, 1):
             page.keyboard.press(str(number))
@@ -278,7 +278,43 @@ def test_every_view_fits_every_width(desk: Desk, scheme: Literal["light", "dark"
                 ".every((element) => element.scrollWidth <= width)",
                 arg=[key, width],
             )
+            names_fit = "(all) => all.every((button) => button.scrollWidth <= button.clientWidth)"
+            assert page.locator(".rail button").evaluate_all(names_fit)
     page.set_viewport_size(DESKTOP)
+
+
+def test_keys_choose_a_view_wherever_the_keyboard_has_led(desk: Desk) -> None:
+    view = desk.view("events")
+    desk.page.locator(".rail button[data-view='link']").focus()
+    desk.page.keyboard.press("Enter")
+    expect(view).to_be_hidden()
+    desk.page.keyboard.press("8")
+    expect(view).to_be_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_of_filled_buttons_is_told_from_them(
+    desk: Desk, scheme: Literal["light", "dark"]
+) -> None:
+    desk.page.emulate_media(color_scheme=scheme)
+    expect(desk.page.locator("body")).to_have_class(re.compile(f"body--{scheme}"))
+    filled = desk.view("plots").locator(".q-btn.bg-primary, .q-btn[aria-pressed=true]")
+    expect(filled).to_have_count(2)
+    for colours in filled.evaluate_all(
+        "(all) => all.map((button) => [getComputedStyle(button).color,"
+        " getComputedStyle(button).backgroundColor])"
+    ):
+        text, ground = sorted(map(luminance, colours))
+        assert (ground + 0.05) / (text + 0.05) >= 4.5, colours
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of `rgb(r, g, b)`, as WCAG 2.2 defines it."""
+    parts = [int(part) / 255 for part in re.findall(r"\d+", colour)]
+    red, green, blue = (
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def test_units_are_those_that_were_chosen(desk: Desk) -> None:

@@ -47,6 +47,8 @@ def test_without_a_catalogue_names_are_searched_all_the_same(tmp_path: Path) -> 
     facts.look(tmp_path, "x")
     assert facts.of("x1") is None
     assert facts.shows("x1", "x")
+    assert "mavgate hangar" in facts.trouble
     catalogue(tmp_path, x1=5.0)
     facts.look(tmp_path, "x")
+    assert facts.trouble == ""
     assert facts.of("x1") is not None

@@ -9,6 +9,8 @@ from gateway.season.hangar.hangar_file import HANGAR_NAME, HangarError, Row, fin
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""
 
+NO_CATALOGUE: Final = "`mavgate hangar` fills in duration, distance, height and loss."
+
 
 class RecordingFacts:
     """The rows of a folder's catalogue by recording, if it has one."""
@@ -18,7 +20,7 @@ class RecordingFacts:
         self._rows: dict[str, Row] = {}
         self._found: frozenset[str] | None = None
         self.trouble = ""
-        """Why a search found nothing."""
+        """Why a search found nothing, or why nothing is known of the recordings."""
 
     def look(self, folder: Path, search: str = "") -> None:
         """Reload the catalogue if it changed, and search; some tens of ms for thousands of rows.
@@ -33,7 +35,7 @@ class RecordingFacts:
         stamp = _stamp(folder)
         if self._asked == (folder, stamp, search):
             return
-        self._asked, self.trouble = (folder, stamp, search), ""
+        self._asked, self.trouble = (folder, stamp, search), "" if stamp else NO_CATALOGUE
         is_condition = not OPERATORS.isdisjoint(search)
         try:
             self._rows = {} if stamp is None else _by_name(find_flights(folder))

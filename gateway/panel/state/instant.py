@@ -44,6 +44,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     vel_n_mps: tuple[float, float, float]
     groundspeed_mps: float
     airspeed_mps: float
+    """Unknown where the vehicle sends its ground speed for want of a sensor."""
     climb_mps: float
     heading_deg: float
     pos_std_m: float

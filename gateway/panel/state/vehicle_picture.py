@@ -157,7 +157,7 @@ class VehiclePicture:
             alt_home_m=place.relative_alt / MM if place else NAN,
             vel_n_mps=(place.vx / CM, place.vy / CM, place.vz / CM) if place else UNKNOWN_VEC3,
             groundspeed_mps=hud.groundspeed if hud else NAN,
-            airspeed_mps=hud.airspeed if hud else NAN,
+            airspeed_mps=_airspeed_mps(hud),
             climb_mps=hud.climb if hud else NAN,
             heading_deg=_heading_deg(place, hud),
             pos_std_m=self._pos_std_m(),
@@ -241,6 +241,11 @@ def _rates(message: Any) -> tuple[float, float, float]:
 
 def _known(value: float | None, unknown: int) -> float:
     return NAN if value is None or value == unknown else float(value)
+
+
+def _airspeed_mps(hud: Any) -> float:
+    """Return the airspeed; unknown where the field repeats the ground speed: there is no sensor."""
+    return NAN if hud is None or hud.airspeed == hud.groundspeed else float(hud.airspeed)
 
 
 def _heading_deg(place: Any, hud: Any) -> float:

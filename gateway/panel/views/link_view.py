@@ -6,7 +6,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.panel.live_table import Cells, LiveTable, RowButton
-from gateway.panel.page_prompts import confirm, notify_failure
+from gateway.panel.page_prompts import confirm, heading, notify_failure
 from gateway.panel.view_context import ViewContext
 from gateway.units import US_PER_S
 
@@ -33,20 +33,20 @@ class LinkView:
         self._context = context
         with ui.element("div").classes("cards"):
             with ui.element("div").classes("card padded"):
-                ui.label("Receiver").classes("title")
+                heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
                 self._nodes = LiveTable(
                     ("Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age"),
                     "No node was heard.",
                 )
             with ui.element("div").classes("card padded wide"):
-                ui.label("Clients").classes("title")
+                heading("Clients")
                 self._build_clients()
             with ui.element("div").classes("card padded"):
-                ui.label("Listening").classes("title")
+                heading("Listening")
                 self._ports = LiveTable(("Port", "State", "Clients", "Turned away"), "No port.")
             with ui.element("div").classes("card padded"):
-                ui.label("Aircraft over MAVLink").classes("title")
+                heading("Aircraft over MAVLink")
                 self._vehicles = LiveTable(
                     ("Aircraft", "Heartbeat", "Attitude", "Position", "Messages"),
                     "No aircraft was heard.",

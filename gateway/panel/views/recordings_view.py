@@ -1,7 +1,7 @@
 """View 4: recordings, and a flight that is played again."""
 
 import asyncio
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +13,7 @@ from nicegui.events import GenericEventArguments
 
 from gateway.edges.disk.recordings import delete_recording, list_recordings
 from gateway.panel.live_table import Cells, LiveTable, RowButton
-from gateway.panel.page_prompts import confirm, notify_failure
+from gateway.panel.page_prompts import confirm, heading, notify_failure
 from gateway.panel.recorded_aircraft import Profile
 from gateway.panel.recording_player import SPEEDS, Playback
 from gateway.panel.serving.recording_facts import RecordingFacts
@@ -24,6 +24,7 @@ REFRESH_S: Final = 1.0
 PLACE_S: Final = 0.25
 MUCH_LOST: Final = 0.05
 """A share of lost samples that a pilot should see."""
+FACTS: Final = ("Duration", "Distance", "Height", "Loss")
 IDLE: Final = "idle"
 STATES: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
 
@@ -56,7 +57,7 @@ class RecordingsView:
                 self._build_recorder()
             with ui.element("div").classes("card padded"):
                 with ui.element("div").classes("line"):
-                    ui.label("Recordings").classes("title spring")
+                    heading("Recordings").classes("spring")
                     self._search = ui.input(placeholder="Name, or duration > 300 and loss > 0.05")
                     self._search.props('dense outlined clearable aria-label="Search recordings"')
                     if context.may_change:
@@ -65,7 +66,7 @@ class RecordingsView:
                         upload.on("uploaded", self._on_upload)
                 self._trouble = ui.label().classes("soft")
                 self._table = LiveTable(
-                    ("Name", "Last written (UTC)", "Size", "Files", "s", "km", "m up", "Loss"),
+                    ("Name", "Last written (UTC)", "Size", "Files", *FACTS),
                     "Nothing was recorded yet.",
                     buttons=self._buttons(),
                 )
@@ -132,8 +133,8 @@ class RecordingsView:
         # Querying a catalogue of thousands would block the page too long.
         await asyncio.to_thread(facts.look, folder, search)
         self._trouble.set_text(facts.trouble)
-        self._trouble.set_visibility(bool(facts.trouble))
         recordings = list_recordings(folder)
+        self._trouble.set_visibility(bool(facts.trouble and recordings))
         shown = [entry for entry in reversed(recordings) if facts.shows(entry.name, search)]
         self._table.show({entry.name: _row(entry, facts.of(entry.name)) for entry in shown})
 
@@ -270,15 +271,15 @@ def _row(recording: Any, facts: Row | None) -> Cells:
 def _facts_cells(facts: Row | None) -> Cells:
     """Return the catalogue's cells; blank where unknown."""
     if facts is None:
-        return (("", ""),) * 4
+        return (("", ""),) * len(FACTS)
     if facts["error"] is not None:
         return (("broken", "bad"), ("", ""), ("", ""), ("", ""))
     duration, distance, highest, loss = (
         facts[key] for key in ("duration", "distance", "highest", "loss")
     )
     return (
-        ("" if duration is None else f"{duration:.0f}", ""),
-        ("" if distance is None else f"{distance / 1000.0:.2f}", ""),
-        ("" if highest is None else f"{highest:.0f}", ""),
+        ("" if duration is None else str(timedelta(seconds=round(duration))), ""),
+        ("" if distance is None else f"{distance / 1000.0:.2f} km", ""),
+        ("" if highest is None else f"{highest:.0f} m", ""),
         ("" if loss is None else f"{loss:.1%}", "warn" if (loss or 0.0) > MUCH_LOST else ""),
     )

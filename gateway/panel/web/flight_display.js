@@ -274,7 +274,7 @@ export default {
     },
     tape({ g, u, w, h, font }, left, value, [factor, unit], name, second) {
       const width = 15 * u;
-      const x = left ? 0 : w - width - 5 * u;
+      const x = left ? 0 : w - width - climbWidth(u);
       const ribbonTop = h - 9 * u;
       const top = 5 * u;
       const middle = h / 2;
@@ -319,7 +319,7 @@ export default {
       g.fillStyle = "#b9c6d2";
       const other = left ? "GS" : "AMSL";
       const text = known(second) ? (second * factor).toFixed(left ? 1 : 0) : "––";
-      g.fillText(`${other} ${text}`, x + width / 2, ribbonTop - 2.2 * u);
+      if (name !== other) g.fillText(`${other} ${text}`, x + width / 2, ribbonTop - 2.2 * u);
     },
     readout({ g, u, font }, left, x, middle, width, shown) {
       const half = 3.3 * u;
@@ -348,13 +348,13 @@ export default {
       g.fillText(known(shown) ? plain(shown, digits) : "––", x + width / 2, middle + 0.2 * u);
     },
     climb({ g, u, w, h, font }, value, [factor, unit]) {
-      const width = 5 * u;
+      const width = climbWidth(u);
       const x = w - width;
       const bottom = h - 9 * u;
       const top = 5 * u;
       const middle = h / 2;
       const full = FULL_CLIMB[this.units] || FULL_CLIMB.metric;
-      const reach = Math.min(middle - top, bottom - middle) - 3 * u;
+      const reach = Math.min(middle - top, bottom - middle) - Math.max(5.2 * u, 12);
       // A root scale: small rates are those that are flown by.
       const at = (v) => -Math.sign(v) * Math.sqrt(Math.min(Math.abs(v) / full, 1)) * reach;
       g.fillStyle = "rgba(9,15,22,0.72)";
@@ -374,6 +374,8 @@ export default {
         const mark = Math.abs(share * full) / (full > 100 ? 100 : 1);
         if (share) g.fillText(mark.toFixed(0), x + 1.6 * u, y);
       }
+      g.textAlign = "center";
+      g.fillText(unit, x + width / 2, 2.6 * u, width);
       if (!known(value)) return;
       const shown = value * factor;
       const y = at(shown);
@@ -381,9 +383,8 @@ export default {
       g.fillRect(x + 0.1 * u, Math.min(middle, middle + y), 1.2 * u, Math.abs(y));
       g.font = font(2.2);
       g.fillStyle = INK;
-      g.textAlign = "center";
       const text = full > 100 ? (Math.round(shown / 10) * 10).toFixed(0) : shown.toFixed(1);
-      g.fillText(text, x + width / 2, shown >= 0 ? top - 2.4 * u : bottom - 2.2 * u);
+      g.fillText(text, x + width / 2, bottom - Math.max(2.2 * u, 5), width);
     },
     ribbon({ g, u, w, h, font }, angles) {
       const height = 9 * u;
@@ -491,6 +492,9 @@ function triangle(g, x, y, half, height) {
   g.closePath();
   g.fill();
 }
+
+// Of the scale of climb; the smallest letters need 22 pixels.
+const climbWidth = (u) => Math.max(5 * u, 22);
 
 // How much of a tape is seen, and its ticks: read at a glance in every unit.
 function niceSpan(factor, isSpeed) {
