@@ -327,7 +327,9 @@ def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
 
 
 def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationError) -> str:
-    text = f"{path} = {tomlkit.item(value).as_string()}: {_uncapital(str(error))}"
+    bounds = field.range if "=" in str(error) else ""
+    reason = f"must be {bounds} {field.unit}".rstrip() if bounds else _uncapital(str(error))
+    text = f"{path} = {tomlkit.item(value).as_string()}: {reason}"
     hint = "; ".join(filter(None, (_choice_hint(value, field), _uncapital(field.meaning))))
     return f"{text} ({hint})" if hint else text
 
@@ -342,7 +344,8 @@ def _choice_hint(value: Any, field: Field) -> str:
 
 
 def _uncapital(text: str) -> str:
-    return text[:1].lower() + text[1:].rstrip(".")
+    # The name of a message stays as it is.
+    return (text[:1] if text[:2].isupper() else text[:1].lower()) + text[1:].rstrip(".")
 
 
 def _render_section(settings: Settings, prefix: str) -> Iterator[str]:
@@ -380,15 +383,9 @@ def _in_toml(value: Any) -> str:
 
 
 def _allowed(field: Field) -> str:
-    low, high = field.bounds
+    allowed = field.range
     if field.choices:
         allowed = "one of " + ", ".join(f'"{choice}"' for choice in field.choices)
-    elif low is not None and high is not None:
-        allowed = f"{low:.12g} to {high:.12g}"
-    elif low is not None:
-        allowed = f"{low:.12g} or more"
-    else:
-        allowed = "" if high is None else f"at most {high:.12g}"
     unit = f"Unit: {field.unit}." if field.unit else ""
     return f"{unit} {f'Allowed: {allowed}.' if allowed else ''}".strip()
 

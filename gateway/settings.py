@@ -87,6 +87,16 @@ class Field:
     """Least and greatest allowed number, of a vector of each of its components; None where there
     is no bound."""
 
+    @property
+    def range(self) -> str:
+        """The bounds as text, such as `0 to 1000`; empty without any."""
+        low, high = self.bounds
+        if low is not None and high is not None:
+            return f"{low:.12g} to {high:.12g}"
+        if low is not None:
+            return f"{low:.12g} or more"
+        return "" if high is None else f"at most {high:.12g}"
+
 
 def fields_of(kind: type[Settings]) -> list[Field]:
     """List the keys of a settings class, plain keys before sections as TOML requires."""

@@ -135,7 +135,27 @@ def load_command(name: str) -> Any:
     import_module(f"gateway.cli.{COMMANDS[name].module}").register(part)
     group = typer.main.get_group(part)
     gc.enable()
-    return group.commands[name]
+    return tidied(group.commands[name])
+
+
+def tidied(command: Any) -> Any:
+    """Return a command whose help flows at any width, and names a type only where one is typed.
+
+    Parameters
+    ----------
+    command : typer.core.TyperCommand or TyperGroup
+        Changed in place, with all commands below it.
+    """
+    if command.help:
+        paragraphs = command.help.split("\n\n")
+        command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    with command.make_context("", [], resilient_parsing=True) as context:
+        for parameter in command.get_params(context):
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+    for below in getattr(command, "commands", {}).values():
+        tidied(below)
+    return command
 
 
 @cache
@@ -171,6 +191,7 @@ class LazyGroup(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands without importing them."""
         self._listing = True
+        tidied(self)
         super().format_help(ctx, formatter)
         self._listing = False
 

@@ -221,7 +221,10 @@ def _packaged(module: str, name: str) -> Write:
 
 NOT_FUSED: Final = "raw samples, settings and the states' digits"
 NOT_IN_TABLE: Final = "what is no sample, fix or state of one vehicle"
-NOT_DRAWN: Final = "samples, velocities and settings", "messages but positions, attitude and texts"
+NOT_DRAWN: Final = (
+    "samples, velocities and settings",
+    "MAVLink messages, only positions, attitude and texts",
+)
 
 add_writer(".tlog", _write_tlog, Lacks(of_tables=NOT_FUSED))
 add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,17 @@ def test_every_command_of_every_file_is_listed() -> None:
         sys.modules[f"gateway.cli.{module}"].register(part)
         listed = {name for name, entry in COMMANDS.items() if entry.module == module}
         assert set(typer.main.get_group(part).commands) == listed
+
+
+@pytest.mark.parametrize("words", [["play"], ["sweep"], ["clients", "add"], []], ids=" ".join)
+def test_help_flows_to_the_width_and_names_no_type_of_a_flag(words: list[str]) -> None:
+    found = CliRunner().invoke(app, [*words, "--help"], terminal_width=80, env={"COLUMNS": "80"})
+    above = found.output.partition("╭")[0].splitlines()
+    text = [line.strip() for line in above if line.strip() and "Usage" not in line]
+    # A line ends early only where the next word does not fit, or a paragraph ends.
+    for line, after in pairwise(text):
+        assert line.endswith(".") or len(f"{line} {after.split()[0]}") > 70, line
+    assert "<bool>" not in found.output
 
 
 def test_help_lists_every_command() -> None:

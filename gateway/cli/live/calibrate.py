@@ -24,7 +24,12 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.edges.clock import GatewayClock
-from gateway.edges.receiver.serial_port import SerialPort, SerialSettings
+from gateway.edges.receiver.serial_port import (
+    PortNotFoundError,
+    SerialPort,
+    SerialSettings,
+    open_port,
+)
 from gateway.flights.reading import ReadOptions, open_rows
 from gateway.pipeline import PipelineSettings
 from gateway.records import GpsFix, ImuRaw
@@ -241,6 +246,11 @@ def _speed_mps(fix: GpsFix) -> float:
 
 
 def _capture_from(serial: SerialSettings, vehicle: int) -> Capture:
+    try:
+        # Nobody shall lay an aircraft on its sides for a port that is not there.
+        open_port(serial).close()
+    except PortNotFoundError as error:
+        refuse(str(error))
     return lambda seconds: node_samples(asyncio.run(_Listening(serial, vehicle).listen(seconds)))
 
 

@@ -126,14 +126,18 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
             for recording, look in _looked_at(found)
         ]
         print(msgspec.json.encode(listed).decode())
-    else:
+    elif found:
         _list(found)
+    else:
+        running = config is None and is_running()
+        folder = ask("record.status")["folder"] if running else _folder(config)
+        console_of().print(f"no recordings in {folder}", markup=False)
 
 
 @group.command()
 def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
     """Add a remark to the recording at this moment, and send it to the ground stations."""
-    ask("record.note", {"text": text})
+    _show(ask("record.note", {"text": text}))
 
 
 def _recording(fields: dict[str, Any]) -> Recording:

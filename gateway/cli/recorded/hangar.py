@@ -160,7 +160,7 @@ def _asking() -> Iterator[None]:
 
 def _show_table(rows: list[Row]) -> None:
     grid = table_of(
-        "recording", "kind", "began (UTC)", "aircraft", "s", "km", "m up", "m/s", "GPS lost",
+        "recording", "kind", "began (UTC)", "aircraft", "s", "km", "max m", "max m/s", "GPS lost",
         "faults", "loss", left=3,
     )  # fmt: skip
     for row in rows:

@@ -24,7 +24,8 @@ def summary_line(snapshot: Snapshot) -> str:
             f"aircraft {vehicle_id} at {place} {figure_of(state.alt_amsl_m, '.1f')} m, "
             f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
         )
-    parts.append(f"{len(snapshot.clients)} clients")
+    count = len(snapshot.clients)
+    parts.append(f"{count} client{'' if count == 1 else 's'}")
     return "; ".join(parts)
 
 

@@ -65,7 +65,7 @@ class SerialSettings(Settings, frozen=True):
 
 
 class PortNotFoundError(Exception):
-    """No port fits the setting; the text says what was looked for and what is there."""
+    """No port fits the setting, or it cannot be opened; the text says why, and what is there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +160,22 @@ def why_not_open(error: Exception, ports: list[Port]) -> str:
     return "; ".join([reason_of(error), *others])
 
 
+def open_port(settings: SerialSettings) -> serial.Serial:
+    """Open the receiver's port, for this program alone.
+
+    Raises
+    ------
+    PortNotFoundError
+        If there is none, or it cannot be opened.
+    """
+    ports = list_serial_ports()
+    device = find_port(settings.port, ports)
+    try:
+        return serial.Serial(device, settings.baud, timeout=0, write_timeout=0, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise PortNotFoundError(f"receiver {device}: {why_not_open(error, ports)}") from error
+
+
 class SerialPort:
     """Keep one serial port open and pass on its bytes.
 
@@ -220,20 +236,13 @@ class SerialPort:
 
     def _open(self) -> None:
         self._retry = None
-        device, ports = self._settings.port, list_serial_ports()
         try:
-            device = find_port(device, ports)
-            self._port = serial.Serial(
-                device, self._settings.baud, timeout=0, write_timeout=0, exclusive=True
-            )
+            self._port = open_port(self._settings)
         except PortNotFoundError as error:
             self._complain(str(error))
             self._try_later()
             return
-        except (OSError, ValueError) as error:
-            self._complain(f"receiver {device}: {why_not_open(error, ports)}")
-            self._try_later()
-            return
+        device = self._port.port
         with contextlib.suppress(OSError, ValueError):
             # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
             self._port.set_low_latency_mode(True)

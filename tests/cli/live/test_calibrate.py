@@ -80,6 +80,15 @@ def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None
 
 
 @pytest.mark.io
+def test_a_port_that_is_not_there_is_said_before_anything_is_asked(tmp_path: Path) -> None:
+    command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
+    result = CliRunner().invoke(app, command, input="\n")
+    assert result.exit_code == 2
+    assert "none: No such file or directory" in result.output
+    assert "Lay the aircraft down" not in result.output
+
+
+@pytest.mark.io
 def test_dry_run_saves_nothing(config: Path) -> None:
     run(config, "gyro", "--dry-run")
     assert not load_aircraft(load(config))

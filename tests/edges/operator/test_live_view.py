@@ -165,7 +165,7 @@ def test_the_newest_log_lines_are_on_the_screen() -> None:
 def test_summary_line() -> None:
     assert summary_line(SNAPSHOT) == (
         "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
-        "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 clients"
+        "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
     )
 
 
