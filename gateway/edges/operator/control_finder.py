@@ -49,8 +49,7 @@ def find_socket(name: str) -> Path:
         text = f"the service's socket {service} is for the group {GROUP}: "
         raise ControlError(text + f"`sudo usermod -aG {GROUP} $USER`, then log in again")
     starter = STARTERS[name]
-    text = f"nothing runs that could do this: start {starter} first (no socket {socket_path(name)})"
-    raise ControlError(text)
+    raise ControlError(f"nothing runs here: start {starter} first (no socket {socket_path(name)})")
 
 
 def live_sockets(name: str) -> list[Path]:

@@ -9,7 +9,7 @@ from gateway.season.hangar.hangar_file import HANGAR_NAME, HangarError, Row, fin
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""
 
-NO_CATALOGUE: Final = "`mavgate hangar` fills in duration, distance, height and loss."
+NO_CATALOGUE: Final = "Run mavgate hangar to fill in duration, distance, height and loss."
 
 
 class RecordingFacts:

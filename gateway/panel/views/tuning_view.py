@@ -96,7 +96,7 @@ class _TuningView:
     def _refresh(self) -> None:
         dialogue = self._dialogue
         if dialogue is None:
-            self._state.set_text("No aircraft is heard.")
+            self._state.set_text("")
             return
         system_id = dialogue.parameters.system_id
         if self._asked != system_id:
@@ -129,6 +129,8 @@ class _TuningView:
         self._list.clear()
         self._rows = {}
         if dialogue is None:
+            with self._list:
+                ui.label("No aircraft is heard.").classes("empty")
             return
         last = ""
         with self._list:
