@@ -5,8 +5,8 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final
 
+from gateway.flightlog.damaged_times import is_damaged
 from gateway.flightlog.table.row import COLUMNS, TableRow, check_times
-from gateway.flightlog.tlog.tlog import DAY_US, ORDER_US
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -108,7 +108,11 @@ class ForeignReader:
         before: TableRow | None = None
         held: TableRow | None = None
         for row in self._readable(table):
-            if held is not None and before is not None and _is_odd(before, held, row):
+            if (
+                held is not None
+                and before is not None
+                and is_damaged(before.time_us, held.time_us, row.time_us)
+            ):
                 self.faults += 1
             elif held is not None:
                 yield held
@@ -206,13 +210,6 @@ class ForeignReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
-
-
-def _is_odd(before: TableRow, row: TableRow, after: TableRow) -> bool:
-    """Return whether a row's time is damaged: not between those beside it, which are in order."""
-    is_in_order = -ORDER_US <= after.time_us - before.time_us <= DAY_US
-    is_between = before.time_us - ORDER_US <= row.time_us <= after.time_us + ORDER_US
-    return is_in_order and not is_between
 
 
 def _measured_us(own_us: float, row_us: int) -> int:

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.flightlog.damaged_times import DAY_US, is_damaged
 from gateway.flightlog.tlog.tlog_scan import (
     COLUMNS,
     LARGEST_RECORD,
@@ -17,13 +18,8 @@ from gateway.flightlog.tlog.tlog_scan import (
     crc_extra_table,
     scan,
 )
-from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_station_heartbeat
 
-DAY_US: Final = 86_400 * US_PER_S
-"""Records that lie further apart are of different days: nothing is said of what is between."""
-ORDER_US: Final = 2 * US_PER_S
-"""A time that is further before the record before, or behind the next one, is damaged."""
 STRIDE: Final = 256
 """Records between two entries of the index: a seek scans at most this many, some 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
@@ -203,11 +199,9 @@ class TlogScanner:
             before[0] = after[0]
         if not is_known and abs(int(before[-1]) - next_us) > DAY_US:
             after[-1] = before[-1]
-        gap = after - before
-        odd = (times < before - ORDER_US) | (times > after + ORDER_US)
         mended = -2
         count = 0
-        for i in np.flatnonzero(odd & (gap >= -ORDER_US) & (gap <= DAY_US)).tolist():
+        for i in np.flatnonzero(is_damaged(before, times, after)).tolist():
             # Behind a record that was damaged the order is as it should be.
             if i != mended + 1:
                 times[i] = before[i]
