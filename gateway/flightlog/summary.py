@@ -8,10 +8,12 @@ from typing import Final
 
 import numpy as np
 
+from gateway.flightlog.damaged_times import DAY_US
 from gateway.flightlog.table.cells import FIX_LAT, FIX_LON, FIX_OK, FloatArray, has_group
 from gateway.flightlog.table.row import BARO, GPS, MAG, NAV, RAW, SI
 from gateway.flightlog.table.table import TableBlock, TableFault, TableHeader, TableMark
 from gateway.flightlog.tlog.tlog import Batch, TlogIndex
+from gateway.flightlog.tlog.tlog_scan import IntArray
 from gateway.geometry.geodesy import displacement_m
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -71,6 +73,7 @@ class FileInfo:
     """In µs since 1970 for a tlog, on the gateway clock for a table."""
     last_us: int | None
     duration_s: float
+    """From the first record to the last; where its clock leaped by days, without that."""
     vehicles: tuple[VehicleInfo, ...]
     gaps: tuple[Gap, ...]
     damaged_bytes: int
@@ -101,19 +104,52 @@ class GroundWay:
 
 
 @dataclass(slots=True)
+class TimesSpan:
+    """Sum up how long records last; a clock that leaps by days adds nothing."""
+
+    first_us: int | None = None
+    _begin_us: int = 0
+    """Of what is between two leaps."""
+    _newest_us: int = 0
+    _last_us: int = 0
+    _before_us: int = 0
+    """Length of what was before that."""
+
+    @property
+    def length_us(self) -> int:
+        """From the first record to the last, without leaps."""
+        return self._before_us + self._newest_us - self._begin_us
+
+    def add(self, time_us: int) -> None:
+        """Take in the time of the next record."""
+        if self.first_us is None:
+            self.first_us = self._begin_us = self._newest_us = time_us
+        elif abs(time_us - self._last_us) > DAY_US:
+            self._before_us = self.length_us
+            self._begin_us = self._newest_us = time_us
+        elif time_us > self._newest_us:
+            self._newest_us = time_us
+        self._last_us = time_us
+
+    def add_all(self, times_us: IntArray) -> None:
+        """Take in the times of the next records, at least one."""
+        leaps = np.flatnonzero(np.abs(np.diff(times_us)) > DAY_US) + 1
+        for between in np.split(times_us, leaps):
+            self.add(int(between[0]))
+            self._newest_us = max(self._newest_us, int(between.max()))
+            self._last_us = int(between[-1])
+
+
+@dataclass(slots=True)
 class _Gaps:
     """Find gaps."""
 
     last_us: int | None = None
     found: list[Gap] = field(default_factory=list)
 
-    def add(self, time_us: int) -> None:
-        if self.last_us is not None and time_us - self.last_us > GAP_US:
-            self._note(self.last_us, time_us - self.last_us)
-        self.last_us = time_us
-
-    def add_all(self, times_us: np.ndarray[tuple[int], np.dtype[np.int64]]) -> None:
-        self.add(int(times_us[0]))
+    def add_all(self, times_us: IntArray) -> None:
+        if self.last_us is not None:
+            times_us = np.insert(times_us, 0, self.last_us)
         steps = np.diff(times_us)
         for i in np.flatnonzero(steps > GAP_US).tolist():
             self._note(int(times_us[i]), int(steps[i]))
@@ -132,13 +168,14 @@ class TlogSummary:
         self._counts: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[int, tuple[int, int]] = {}
         self._ways: dict[int, GroundWay] = {}
-        self._gaps = _Gaps()
+        self._span, self._gaps = TimesSpan(), _Gaps()
 
     def add(self, batch: Batch) -> None:
         """Take in the next batch of the file."""
         self._index.add(batch)
         if not len(batch):
             return
+        self._span.add_all(batch.time_us)
         self._gaps.add_all(batch.time_us)
         keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
         for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
@@ -154,7 +191,7 @@ class TlogSummary:
     def result(self, size: int) -> FileInfo:
         """Return the summary of a file of that size."""
         index = self._index
-        duration_s = ((index.last_us or 0) - (index.first_us or 0)) / US_PER_S
+        duration_s = self._span.length_us / US_PER_S
         return FileInfo(
             kind="tlog",
             size=size,
@@ -204,10 +241,9 @@ class TableSummary:
         self._marks: list[TableMark] = []
         self._counts: Counter[str] = Counter()
         self._damaged_bytes = 0
-        self._first_us: int | None = None
         self._last_us: int | None = None
         self._way = GroundWay()
-        self._gaps = _Gaps()
+        self._span, self._gaps = TimesSpan(), _Gaps()
 
     def add(self, block: TableBlock, header: TableHeader | None) -> None:
         """Take in the next block of the file."""
@@ -223,7 +259,7 @@ class TableSummary:
 
     def result(self, size: int) -> FileInfo:
         """Return the summary of a file of that size."""
-        duration_s = ((self._last_us or 0) - (self._first_us or 0)) / US_PER_S
+        duration_s = self._span.length_us / US_PER_S
         vehicle = VehicleInfo(
             system_id=self._header.vehicle_id if self._header else 1,
             mav_type=None,
@@ -239,7 +275,7 @@ class TableSummary:
             kind="table",
             size=size,
             records=self._counts["row"],
-            first_us=self._first_us,
+            first_us=self._span.first_us,
             last_us=self._last_us,
             duration_s=duration_s,
             vehicles=(vehicle,),
@@ -259,9 +295,8 @@ class TableSummary:
         for name, group in (("baro", BARO), ("gps", GPS), ("state", NAV)):
             counts[name] += int(has_group(cells, group).sum())
         times_us = cells[:, 0].astype(np.int64)
-        if self._first_us is None:
-            self._first_us = int(times_us[0])
         self._last_us = max(int(times_us.max()), self._last_us or 0)
+        self._span.add_all(times_us)
         self._gaps.add_all(times_us)
         fixed = cells[:, FIX_OK] == 1.0
         for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():

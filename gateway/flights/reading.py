@@ -2,6 +2,7 @@
 
 import codecs
 import heapq
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
+import numpy as np
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import (
@@ -25,7 +27,9 @@ from gateway.edges.disk.recording_streams import (
     read_blocks,
     read_chunks,
 )
+from gateway.flightlog.damaged_times import ORDER_US
 from gateway.flightlog.table.autopilot import AutopilotReader
+from gateway.flightlog.table.cells import TIMES
 from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import (
@@ -266,7 +270,28 @@ def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
             table.remarks.append(f"{path}: {reader.faults} lines cannot be read and were left out")
 
     table = table_of_rows(chain([first], told()), options, options.system_id or 1)
+    table.blocks = _going_on(table.blocks, path, table.remarks)
     return table
+
+
+def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
+    """Let a clock that goes back, as one that starts anew, go on from where it was."""
+    last_us, shift_us, restarts = -math.inf, 0.0, 0
+    for block in blocks:
+        times_us = block.cells[:, 0]
+        steps_us = np.diff(times_us, prepend=last_us)
+        back_us = np.where(steps_us < -ORDER_US, -steps_us, 0.0)
+        last_us = times_us[-1]
+        restarts += int(np.count_nonzero(back_us))
+        shifts_us = shift_us + np.cumsum(back_us)
+        shift_us = shifts_us[-1]
+        if shift_us:
+            block.cells[:, TIMES] += shifts_us[:, None]
+        yield block
+    if restarts:
+        remarks.append(
+            f"{path}: its clock went back {restarts} times; what follows goes on from there"
+        )
 
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:

@@ -68,6 +68,20 @@ def test_gaps_and_damage_are_found(chunk: int) -> None:
     assert info.damaged_bytes >= 40
 
 
+@pytest.mark.parametrize("chunk", [50, 100_000])
+@pytest.mark.parametrize("years", [56, -30])
+def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(years: int, chunk: int) -> None:
+    leap_us = years * 31_556_952 * SECOND_US
+    records = [
+        TlogRecord(record.time_us + (leap_us if number >= 40 else 0), record.frame)
+        for number, record in enumerate(make_flight(101, 1))
+    ]
+    info = sum_up(make_tlog(records), chunk)
+    assert info.duration_s == 99.0
+    assert info.vehicles[0].rates[0].rate_hz == pytest.approx(1.0, abs=0.03)
+    assert [gap.duration_s for gap in info.gaps] == ([leap_us / 1e6 + 1.0] if years > 0 else [])
+
+
 def test_vehicles_are_told_apart() -> None:
     records = [r for pair in zip(make_flight(9, 1), make_flight(9, 2), strict=True) for r in pair]
     info = sum_up(make_tlog(records))

@@ -1,3 +1,4 @@
+import gzip
 import json
 import os
 import sqlite3
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
-from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
+from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
 from gateway.season.executors import LocalProcesses
@@ -24,7 +25,7 @@ from gateway.season.hangar.hangar_file import (
     find_flights,
     geojson_of,
 )
-from gateway.season.hangar.indexing import index_folder, read_file
+from gateway.season.hangar.indexing import index_folder, read_file, recordings_below
 from gateway.season.statistics.flight_facts import FlightFacts, lost_share
 from gateway.season.statistics.track_shape import feature, simplified
 from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
@@ -132,6 +133,34 @@ def test_a_tlog_tells_each_of_its_vehicles(folder: Path) -> None:
     assert (first["faults"], first["loss"]) == (1, 0.02)
     assert first["takeoff_lat"] == pytest.approx(47.0 + 20 * 3.5 / 111_319.0, abs=1e-5)
     assert second["distance"] is None
+
+
+def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(tmp_path: Path) -> None:
+    scanner = TlogScanner()
+    batch = scanner.feed(write_tlog(tmp_path / "a.tlog").read_bytes(), final=True)
+    leap_us = 30 * 31_556_952_000_000
+    (tmp_path / "a.tlog").write_bytes(
+        b"".join(
+            encode_record(record.time_us - leap_us * (number < 1000), record.frame)
+            for number, record in enumerate(batch.records())
+        )
+    )
+    found = read_file(tmp_path, OPTIONS, ("a.tlog", ""))
+    (facts, _), (other, _) = found.flights
+    assert 590 < facts.duration < 600
+    assert 590 < other.duration < 600
+    assert facts.gps_lost == pytest.approx(11.0, abs=1.5)
+
+
+@pytest.mark.parametrize("name", ["a.tlog.gz", "packed.tlog"])
+def test_a_packed_file_is_known_by_its_first_bytes(tmp_path: Path, name: str) -> None:
+    plain = write_tlog(tmp_path / "a.tlog").read_bytes()
+    (tmp_path / name).write_bytes(gzip.compress(plain))
+    found = read_file(tmp_path, OPTIONS, (name, ""))
+    assert (found.kind, found.error, len(found.flights)) == ("tlog", None, 2)
+    log = tmp_path / "log.bin.gz"
+    log.write_bytes(gzip.compress(b"\xa3\x95"))
+    assert log in [*recordings_below(tmp_path)]
 
 
 def test_a_broken_file_has_a_row_that_says_why(folder: Path) -> None:

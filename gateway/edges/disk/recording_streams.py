@@ -3,6 +3,7 @@
 import codecs
 import errno
 import gzip
+import io
 import os
 import stat
 import zlib
@@ -22,6 +23,8 @@ TAIL: Final = 1 << 14
 MAX_HEAD: Final = 4 * MAX_LINE
 """Before the first row; a few kilobytes pack any number of zeros."""
 GZIP: Final = ".gz"
+GZIP_MAGIC: Final = b"\x1f\x8b"
+"""The first bytes tell that a file is packed, whatever its name."""
 
 Progress = Callable[[int], None]
 """Called with how many more bytes were read."""
@@ -53,7 +56,7 @@ OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
 
 def kind_of(path: Path) -> FileKind:
     """Recognise a file by its first bytes; raises OSError if it cannot be read."""
-    head = _head(path)
+    head = first_bytes(path)
     if any(knows(head) for knows in OTHER_FORMATS.values()):
         return FileKind.OTHER
     if head.startswith((b"# mavgate table", b"time_us,")):
@@ -64,19 +67,47 @@ def kind_of(path: Path) -> FileKind:
 
 def other_format(path: Path) -> str:
     """Return which of `OTHER_FORMATS` a file has; raises KeyError if none."""
-    head = _head(path)
+    head = first_bytes(path)
     for name, knows in OTHER_FORMATS.items():
         if knows(head):
             return name
     raise KeyError(path)
 
 
-def _head(path: Path) -> bytes:
-    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
+def first_bytes(path: Path) -> bytes:
+    """Return the begin of a file, unpacked, by which its format is known; raises OSError."""
+    with open_unpacked(path) as (file, _):
         return file.read(SNIFF).removeprefix(codecs.BOM_UTF8)
 
 
-def open_recording(path: Path) -> BinaryIO:
+def is_packed(path: Path) -> bool:
+    """Return whether a file is gzipped, by its first bytes; raises OSError."""
+    with open_recording(path) as raw:
+        return raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+
+
+@contextmanager
+def open_unpacked(path: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
+    """Open a file, gzipped or not, to read it to its end.
+
+    Yields
+    ------
+    file : BinaryIO
+        Gives its bytes unpacked.
+    raw : BinaryIO
+        The file on the disk.
+
+    Raises
+    ------
+    OSError
+        As `open_descriptor`, or if it is a damaged gzip file.
+    """
+    with _readable(path), open_recording(path) as raw:
+        packed = raw.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC)
+        yield (cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if packed else raw), raw
+
+
+def open_recording(path: Path) -> io.BufferedReader:
     """Open a file to read it to its end; raises OSError as `open_descriptor`."""
     return os.fdopen(open_descriptor(path), "rb")
 
@@ -102,7 +133,7 @@ def open_descriptor(path: Path) -> int:
 
 
 @contextmanager
-def readable(path: Path) -> Iterator[None]:
+def _readable(path: Path) -> Iterator[None]:
     """Raise a clear OSError for a damaged gzip file, and one with a name for what fails later."""
     try:
         yield
@@ -120,7 +151,7 @@ def readable(path: Path) -> Iterator[None]:
 def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:
     """Read a file, gzipped or not, piece by piece; progress counts bytes on the disk."""
     done = 0
-    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
+    with open_unpacked(path) as (file, raw):
         while data := file.read(CHUNK):
             yield data
             if progress is not None:
@@ -139,22 +170,18 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
         The last lines, the first of them whole.
     """
     head = tail = b""
-    with readable(path), open_recording(path) as raw, _unpacked(path, raw) as file:
+    with open_unpacked(path) as (file, raw):
         while line := file.readline(MAX_LINE):
             head += line
             if not line.startswith(b"#") or len(head) > MAX_HEAD:
                 break
-        if path.suffix == GZIP:
-            while data := file.read(CHUNK):
-                tail = tail[-TAIL:] + data
-        else:
+        if file is raw:
             file.seek(max(len(head), path.stat().st_size - TAIL))
             tail = file.read()
+        else:
+            while data := file.read(CHUNK):
+                tail = tail[-TAIL:] + data
     return head, tail[-TAIL:].partition(b"\n")[2]
-
-
-def _unpacked(path: Path, raw: BinaryIO) -> BinaryIO:
-    return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if path.suffix == GZIP else raw
 
 
 def read_batches(

@@ -1,22 +1,19 @@
 """Read a tracker's log from a CSV file, plain or gzipped."""
 
 import csv
-import gzip
 import io
 import math
 import re
-import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, Final, cast
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.edges.disk.recording_streams import open_recording
+from gateway.edges.disk.recording_streams import open_unpacked
 from gateway.simulator.recorded import RecordedFlight
 
-GZIP_MAGIC: Final = b"\x1f\x8b"
 DEFAULT_LATENCY_S: Final = 0.2
 _KEY_VALUE: Final = re.compile(r"(\w+)=(\S+)")
 
@@ -46,10 +43,7 @@ def read_flight(path: Path) -> RecordedFlight:
     """
     try:
         metadata: dict[str, str] = {}
-        with open_recording(path) as raw:
-            is_packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
-            raw.seek(0)
-            plain = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
+        with open_unpacked(path) as (plain, _):
             lines = io.TextIOWrapper(plain, encoding="utf-8")
             columns = _columns(csv.reader(_without_comments(lines, metadata)))
         latency_s = float(metadata.get("gps_latency_s", DEFAULT_LATENCY_S))
@@ -58,7 +52,7 @@ def read_flight(path: Path) -> RecordedFlight:
         raise FlightFileError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise FlightFileError(f"{path}: is no CSV: it holds bytes that are no text") from error
-    except (EOFError, zlib.error, csv.Error, ValueError) as error:
+    except (csv.Error, ValueError) as error:
         raise FlightFileError(f"{path}: {error}") from error
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-from gateway.edges.disk.recording_streams import GZIP, read_chunks
+from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
@@ -73,24 +73,24 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
-    """Open a log; a packed one, or text, is copied unpacked to a temporary file."""
+    """Open a temporary copy of a log, unpacked.
+
+    pymavlink maps a log into the memory, where one that shrinks would end the process.
+    """
     content = read_chunks(path, options.progress)
     first = next(content, b"")
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text
     with tempfile.NamedTemporaryFile() as plain:
-        file = path
-        if path.suffix == GZIP or not is_binary:
-            for data in chain([first], content):
-                # A byte that is not text must not stop the reading.
-                plain.write(data if is_binary else data.translate(_AS_TEXT))
-            plain.flush()
-            file = Path(plain.name)
+        for data in chain([first], content):
+            # A byte that is not text must not stop the reading.
+            plain.write(data if is_binary else data.translate(_AS_TEXT))
+        plain.flush()
         log = kind.__new__(kind)
         # The fast indexer prints to the terminal directly, not through Python.
         log.init_arrays_fast = log.init_arrays
         try:
-            heard.quietly(lambda: kind.__init__(log, str(file)))
+            heard.quietly(lambda: kind.__init__(log, plain.name))
         except Exception as error:
             # Damage makes pymavlink raise anything, bare exceptions included.
             log.close()
@@ -109,19 +109,31 @@ def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[
         return log.recv_match(type=reader.names, strict=True)
 
     take = log.recv_msg if heard.spoken else wanted
+    lines, end = 0, -1
     while True:
         begin = log.offset
         try:
             message = heard.quietly(take)
-            found = [] if message is None else reader.feed(message.get_type(), message)
+            # For a line that is no message it gives the next one, and that again in its turn.
+            is_again, end = log.offset == end, log.offset
+            found = [] if message is None or is_again else reader.feed(message.get_type(), message)
         except Exception:  # noqa: BLE001 - as above
             heard.messages += 1
             log.offset = max(log.offset, begin + 1)
             continue
         if message is None:
             yield from reader.flush()
-            return
+            break
+        lines += not is_again
         yield from found
+    if isinstance(log, DFReader_text):
+        heard.messages = _lines_of(log, reader.names) - lines
+
+
+def _lines_of(log: Any, names: set[str]) -> int:
+    """Count the lines of a text log that should be such messages, or are of no known format."""
+    odd = {name for name in log.counts if name.strip() and name not in log.formats}
+    return sum(log.counts.get(name, 0) for name in names | odd)
 
 
 def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:

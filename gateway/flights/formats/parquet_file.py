@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.disk.recording_streams import GZIP, read_chunks
+from gateway.edges.disk.recording_streams import is_packed, read_chunks
 from gateway.flightlog.table.row import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
 from gateway.flightlog.table.table import (
     FORMAT_LINE,
@@ -140,7 +140,7 @@ def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
 
 def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
     """Yield the lines of the CSV that the file was made of, many at once."""
-    packed = io.BytesIO(b"".join(read_chunks(path))) if path.suffix == GZIP else path
+    packed = io.BytesIO(b"".join(read_chunks(path))) if is_packed(path) else path
     with pq.ParquetFile(packed, page_checksum_verification=True) as file:
         known = file.schema_arrow.metadata or {}
         names = [name for name in COLUMNS if name in file.schema_arrow.names]

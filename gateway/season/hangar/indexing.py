@@ -14,6 +14,7 @@ from gateway.edges.disk.recording_streams import (
     GZIP,
     OTHER_FORMATS,
     FileKind,
+    first_bytes,
     kind_of,
     open_recording,
     other_format,
@@ -197,15 +198,11 @@ def _stamp(path: Path) -> tuple[int, int]:
 def _may_be_recording(path: Path) -> bool:
     if path.name.removesuffix(GZIP).endswith(ENDINGS):
         return True
-    return any(knows(_first_bytes(path)) for knows in OTHER_FORMATS.values())
-
-
-def _first_bytes(path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
-            return file.read(512)
+        begin = first_bytes(path)
     except OSError:
-        return b""
+        return False
+    return any(knows(begin) for knows in OTHER_FORMATS.values())
 
 
 def _kind_name(path: Path) -> str:

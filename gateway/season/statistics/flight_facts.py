@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
+from gateway.flightlog.damaged_times import DAY_US
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import GroundWay
 from gateway.season.statistics.track_shape import Place, simplified
@@ -135,7 +136,8 @@ class FlightTally:
         longest_s = max(OUTAGE_S, SILENCE_STEPS * usual_s)
         last_us = max(end_us or 0, int(fixed[-1]))
         silences_s = np.diff(np.append(fixed, last_us)) / US_PER_S
-        outages = silences_s[silences_s > longest_s]
+        # A clock that leaps by days is no silence.
+        outages = silences_s[(silences_s > longest_s) & (silences_s <= DAY_US / US_PER_S)]
         return len(outages), float(outages.sum())
 
 

@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from gateway.flightlog.summary import GLOBAL_POSITION_INT_ID, HEARTBEAT_ID, payload_of
+from gateway.flightlog.summary import GLOBAL_POSITION_INT_ID, HEARTBEAT_ID, TimesSpan, payload_of
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, TableReader
 from gateway.flightlog.tlog.recorded_commands import is_station
@@ -25,7 +25,7 @@ AUTOPILOT_VERSION_ID: Final = 148
 STATUSTEXT_ID: Final = 253
 LOOKED_AT: Final = np.array(
     [
-        SYS_STATUS_ID, PARAM_VALUE_ID, GPS_RAW_INT_ID, GLOBAL_POSITION_INT_ID,
+        HEARTBEAT_ID, SYS_STATUS_ID, PARAM_VALUE_ID, GPS_RAW_INT_ID, GLOBAL_POSITION_INT_ID,
         AUTOPILOT_VERSION_ID, STATUSTEXT_ID,
     ]
 )  # fmt: skip
@@ -50,15 +50,14 @@ class RowsTally:
 
     def __init__(self) -> None:
         self._tally = FlightTally()
-        self._first_us: int | None = None
-        self._last_us: int | None = None
+        self._span = TimesSpan()
+        self._last_us = 0
         self._nodes: dict[int, NodeStatus] = {}
 
     def add_time(self, time_us: int) -> None:
         """Take in that there is a row of this time."""
-        if self._first_us is None:
-            self._first_us = time_us
-        self._last_us = max(time_us, self._last_us or time_us)
+        self._span.add(time_us)
+        self._last_us = max(time_us, self._last_us)
 
     def add(self, row: TableRow) -> None:
         """Take a whole row in: its fix, or else its state."""
@@ -85,15 +84,16 @@ class RowsTally:
 
     def flown(self, header: TableHeader | None, node_us: list[int], damaged: int) -> list[Flown]:
         """Return the one flight of the table; none if it holds no row."""
-        if self._first_us is None or self._last_us is None:
+        first_us = self._span.first_us
+        if first_us is None:
             return []
         head = header or TableHeader()
         zero_us = head.unix_us_at_zero
         known = msgspec.structs.replace(
             self._tally.facts(self._last_us),
             vehicle=head.vehicle_id,
-            began=began_text(None if zero_us is None else zero_us + self._first_us),
-            duration=(self._last_us - self._first_us) / US_PER_S,
+            began=began_text(None if zero_us is None else zero_us + first_us),
+            duration=self._span.length_us / US_PER_S,
             loss=lost_share(np.array(node_us, np.int64)),
             damaged=damaged,
             version=head.mavgate_version or None,
@@ -189,16 +189,14 @@ class TlogTally:
     """Sums up a tlog batch by batch, a flight a vehicle."""
 
     def __init__(self) -> None:
-        self._index = TlogIndex()
+        self._index, self._span = TlogIndex(), TimesSpan()
         self._vehicles: dict[int, _Told] = {}
 
     def add(self, batch: Batch) -> None:
         """Take in the next batch of the file."""
         self._index.add(batch)
-        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
-            origin = int(batch.origins[i])
-            if not is_station(origin, self._index.stations):
-                self._vehicles.setdefault(origin >> 8, _Told()).see(int(batch.time_us[i]))
+        if len(batch):
+            self._span.add_all(batch.time_us)
         for i in np.flatnonzero(np.isin(batch.message_ids, LOOKED_AT)).tolist():
             origin = int(batch.origins[i])
             if is_station(origin, self._index.stations):
@@ -214,11 +212,12 @@ class TlogTally:
         if not index.count:
             return []
         if not self._vehicles:
-            first_us, last_us = index.first_us or 0, index.last_us or 0
             known = FlightFacts(
-                began=began_text(first_us), duration=(last_us - first_us) / US_PER_S
+                began=began_text(index.first_us),
+                duration=self._span.length_us / US_PER_S,
+                damaged=index.damaged_bytes,
             )
-            return [(msgspec.structs.replace(known, damaged=index.damaged_bytes), [])]
+            return [(known, [])]
         return [
             told.flown(system, index.damaged_bytes)
             for system, told in sorted(self._vehicles.items())
@@ -230,15 +229,15 @@ class _Told:
 
     def __init__(self) -> None:
         self._tally = FlightTally()
-        self._first_us: int | None = None
-        self._last_us: int | None = None
+        self._span = TimesSpan()
+        self._last_us = 0
         self._drops: list[int] = []
         self._firmware: str | None = None
         self._parameters: dict[bytes, bytes] = {}
 
     def see(self, time_us: int) -> None:
-        self._first_us = min(time_us, self._first_us if self._first_us is not None else time_us)
-        self._last_us = max(time_us, self._last_us or 0)
+        self._span.add(time_us)
+        self._last_us = max(time_us, self._last_us)
 
     def take(self, message_id: int, time_us: int, frame: bytes) -> None:
         if message_id == GLOBAL_POSITION_INT_ID:
@@ -261,14 +260,13 @@ class _Told:
             self._parameters[name] = value
 
     def flown(self, system_id: int, damaged: int) -> Flown:
-        first_us, last_us = self._first_us or 0, self._last_us or 0
         drops = [drop for drop in self._drops if drop <= 10_000]
         told = sorted(self._parameters.items())
         known = msgspec.structs.replace(
             self._tally.facts(self._last_us),
             vehicle=system_id,
-            began=began_text(first_us),
-            duration=(last_us - first_us) / US_PER_S,
+            began=began_text(self._span.first_us),
+            duration=self._span.length_us / US_PER_S,
             loss=float(np.mean(drops)) / 10_000.0 if drops else None,
             damaged=damaged,
             version=self._firmware,

@@ -117,17 +117,27 @@ def test_what_has_no_end_is_not_read(tmp_path: Path, command: str, kind: str) ->
 
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover"])
-@pytest.mark.parametrize("how", ["cut", "false", "checksum"])
+@pytest.mark.parametrize("how", ["cut", "checksum"])
 def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> None:
     whole = gzip.compress(log(tmp_path / "log.csv").read_bytes())
     path = tmp_path / "log.csv.gz"
-    damaged = {"cut": whole[:-100], "false": b"time_s,ax\n", "checksum": whole[:-8] + bytes(8)}
+    damaged = {"cut": whole[:-100], "checksum": whole[:-8] + bytes(8)}
     path.write_bytes(damaged[how])
     words = ["-o", tmp_path / "out.csv"] if command != "info" else []
     told = run(command, path, *words, code=2)
     assert "log.csv.gz: is a damaged gzip file" in told
     assert "gzip -dc" in told
     assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_first_bytes_tell_whether_a_file_is_packed_and_not_its_name(
+    tmp_path: Path, packed: bool
+) -> None:
+    data = log(tmp_path / "plain").read_bytes()
+    path = tmp_path / ("log.csv" if packed else "log.csv.gz")
+    path.write_bytes(gzip.compress(data) if packed else data)
+    assert "100 records in 0:00.990" in run("info", path)
 
 
 def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
@@ -230,6 +240,27 @@ def test_settings_with_a_byte_order_mark_are_settings(tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
     file.write_bytes(b"\xef\xbb\xbf[recording]\nmode = 'always'\n")
     assert "all settings are right" in run("check-config", file)
+
+
+def test_a_log_whose_clock_begins_anew_goes_on(tmp_path: Path) -> None:
+    path = log(tmp_path / "log.csv")
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *rows, *rows[:50], *rows, ""]))
+    once, told = tmp_path / "once.csv", run("info", path)
+    assert "250 records in 0:02.480" not in told
+    assert "its clock went back" not in told
+    late = [f"{float(row.partition(',')[0]) + 60:.2f},{row.partition(',')[2]}" for row in rows]
+    path.write_text("\n".join([head, *late, *rows, *late, ""]))
+    told = run("info", path)
+    assert "300 records in 1:01.980" in told
+    assert "its clock went back 1 times" in told
+    run("convert", path, "-o", once)
+    times_us = [
+        int(line.partition(",")[0])
+        for line in once.read_text().splitlines()[2:]
+        if line[:1].isdigit()
+    ]
+    assert times_us == sorted(times_us)
 
 
 def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:

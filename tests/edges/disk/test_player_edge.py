@@ -1,6 +1,7 @@
 """The player on the event loop, with files on the disk."""
 
 import asyncio
+import gzip
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -106,3 +107,14 @@ def test_a_file_that_shrinks_while_it_plays_just_ends(tlog: Path) -> None:
     assert found == RECORDS[:10]
     file.close()
     assert file.read(0, 10) == b""
+
+
+def test_a_packed_tlog_is_played_from_an_unpacked_copy(tlog: Path) -> None:
+    plain = TlogFile(tlog)
+    packed = tlog.with_name("packed.tlog")
+    packed.write_bytes(gzip.compress(tlog.read_bytes()))
+    file = TlogFile(packed)
+    assert file.index.count == plain.index.count > 0
+    assert file.read(100, 500) == plain.read(100, 500)
+    for each in (file, plain):
+        each.close()

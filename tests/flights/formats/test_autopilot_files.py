@@ -4,6 +4,7 @@ import gzip
 import itertools
 import json
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -275,3 +276,38 @@ def test_a_dataflash_log_with_an_unknown_kind_of_value_is_refused(
     path = flown.write(tmp_path / "odd.bin", data[:89] + layout + data[89:])
     with pytest.raises(FlightError, match=r"odd.bin: its list of formats is damaged"):
         rows_of(path)
+
+
+def test_odd_lines_of_a_text_log_are_counted_and_nothing_is_read_twice(
+    folder: Path, tmp_path: Path
+) -> None:
+    lines = (folder / "flight.log").read_bytes().splitlines(keepends=True)
+    _, all_rows = whole(folder / "flight.log")
+    places = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
+    short, wrong, nameless = places[50], places[70], places[90]
+    lines[short] = lines[short][:20] + b"\n"
+    lines[wrong] = lines[wrong].replace(b".", b"x")
+    lines[nameless] = lines[nameless].replace(b"IMU", b"I%U")
+    table, rows = rows_of(flown.write(tmp_path / "odd.log", b"".join(lines)))
+    times_us = [row.time_us for row in rows if row.imu is not None]
+    assert len(times_us) == len(set(times_us)) == sum(r.imu is not None for r in all_rows) - 3
+    assert [r for r in table.remarks if "3 messages cannot be understood" in r]
+    assert not any("cannot be understood" in r for r in whole(folder / "flight.log")[0].remarks)
+
+
+@pytest.mark.parametrize("name", ["flight.bin", "flight.log"])
+def test_a_log_that_shrinks_while_it_is_read_ends_nothing(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    log = flown.write(tmp_path / name, (folder / name).read_bytes())
+    table = open_rows(log, OPTIONS)
+    rows = table.plain_rows
+    first = next(rows)
+    os.truncate(log, 0)
+    assert repr([first, *rows]) == repr(whole(folder / name)[1])
+
+
+@pytest.mark.parametrize("name", ["flight.bin", "new.ulg"])
+def test_a_packed_log_needs_no_ending(folder: Path, tmp_path: Path, name: str) -> None:
+    packed = flown.write(tmp_path / "log", gzip.compress((folder / name).read_bytes()))
+    assert repr(rows_of(packed)[1]) == repr(whole(folder / name)[1])
