@@ -39,7 +39,7 @@ class Listener(Generic[Peer]):
         self._clients: dict[int, Peer] = {}
         self._socket: socket.socket | None = None
         self._retry_us = 0
-        self._told = ""
+        self._logged = ""
 
     @property
     def port(self) -> int:
@@ -47,21 +47,17 @@ class Listener(Generic[Peer]):
         return self._socket.getsockname()[1] if self._socket else 0
 
     def tick(self, now_us: int) -> None:
-        """Bind or accept again if that failed; called a few times a second."""
-        if now_us < self._retry_us or (self._socket and not self.reason):
+        """Bind if that failed; called a few times a second."""
+        if now_us < self._retry_us or self._socket is not None:
             return
         self._retry_us = now_us + RETRY_US
-        if self._socket is None:
-            try:
-                self._socket = self._bind()
-            except OSError as error:
-                self._complain(error)
-                return
-            if self._told:
-                log.info("%s is open", self.endpoint.name)
-                self._told = ""
-        self.reason = ""
-        self._loop.add_reader(self._socket, self._on_readable, self._socket)
+        try:
+            self._socket = self._bind()
+        except OSError as error:
+            self._report(error)
+            return
+        self._report(None)
+        self._watch(self._socket)
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Apply changed options of the same endpoint, to its clients too."""
@@ -77,7 +73,7 @@ class Listener(Generic[Peer]):
 
     def fail(self, error: Exception) -> None:
         """Close the port after an unexpected error; `tick` reopens it."""
-        self._complain(error)
+        self._report(error)
         self._shut()
 
     def leave(self, client: Peer) -> None:
@@ -107,11 +103,17 @@ class Listener(Generic[Peer]):
         """Open the port or raise OSError."""
         raise NotImplementedError
 
-    def _on_readable(self, sock: socket.socket) -> None:
+    def _watch(self, sock: socket.socket) -> None:
+        """Take what comes to the port from now on."""
         raise NotImplementedError
 
-    def _complain(self, error: Exception) -> None:
-        self.reason = reason_of(error)
-        if self.reason != self._told:
+    def _report(self, error: Exception | None) -> None:
+        """Note why nobody can come in, or that one could; a change is logged."""
+        self.reason = "" if error is None else reason_of(error)
+        if self.reason == self._logged:
+            return
+        self._logged = self.reason
+        if self.reason:
             log.warning("%s: %s; trying again until it works", self.endpoint.name, self.reason)
-            self._told = self.reason
+        else:
+            log.info("%s is open", self.endpoint.name)

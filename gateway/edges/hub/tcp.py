@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from gateway.edges.accepting import accept_each
 from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US, Listener, Peer
 from gateway.routing.client_table import Presence, who_leaves
@@ -236,17 +237,10 @@ class StreamListener(Listener[Peer]):
             raise
         return sock
 
-    def _on_readable(self, sock: socket.socket) -> None:
-        # One at a wake-up: admitting it takes as long as serving the others several times.
-        try:
-            connection, address = sock.accept()
-        except BlockingIOError:
-            return
-        except OSError as error:
-            # Out of descriptors: the waiting client would wake us for ever.
-            self._complain(error)
-            self._loop.remove_reader(sock)
-            return
+    def _watch(self, sock: socket.socket) -> None:
+        accept_each(sock, self._on_connection, self._report)
+
+    def _on_connection(self, connection: socket.socket, address: tuple[Any, ...]) -> None:
         if self._has_room(str(address[0])):
             self._admit(connection, host_and_port(*address[:2]))
         else:

@@ -77,6 +77,9 @@ class UdpListener(Listener[UdpPeer]):
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
         super().tick(now_us)
+        if self._socket is not None and now_us >= self._retry_us:
+            # Whether the next one can be admitted shows only when it comes.
+            self.reason = ""
         settings = self._context.settings
         self.table.max_clients = settings.max_clients
         self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
@@ -95,6 +98,9 @@ class UdpListener(Listener[UdpPeer]):
         else:
             sock.setsockopt(socket.IPPROTO_IP, IP_PKTINFO, 1)
         return sock
+
+    def _watch(self, sock: socket.socket) -> None:
+        self._loop.add_reader(sock, self._on_readable, sock)
 
     def _on_readable(self, sock: socket.socket) -> None:
         # One at a wake-up: admitting a stranger takes as long as serving the others several times.
@@ -131,7 +137,8 @@ class UdpListener(Listener[UdpPeer]):
         try:
             sock = _bound((local_host, self.port), shared=True)
         except OSError as error:
-            self._complain(error)
+            self._report(error)
+            self._retry_us = now_us + RETRY_US
             self.table.remove(presence)
             return None
         try:
@@ -141,6 +148,7 @@ class UdpListener(Listener[UdpPeer]):
             sock.close()
             self.table.remove(presence)
             return None
+        self._report(None)
         presence.identity = origin_of(first)
         peer = host_and_port(host, port)
         client = UdpPeer(

@@ -38,8 +38,6 @@ GROUP: Final = "mavgate"
 MOST_GATEWAYS: Final = 9
 """Gateways of one user: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
-ACCEPT_AGAIN_S: Final = 1.0
-"""After which a connection is accepted that came while there were no file descriptors left."""
 STARTERS: Final = {
     "run": "`mavgate run` or `mavgate demo`",
     "play": "`mavgate play`",
@@ -90,8 +88,6 @@ class ControlServer:
         self._socket: socket.socket | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
-        self._is_short = False
-        """Whether there were no file descriptors for the last connection."""
         self._writers: set[asyncio.StreamWriter] = set()
         self.register("verbs", NoParams, lambda _: sorted(self._verbs))
 
@@ -130,13 +126,15 @@ class ControlServer:
             self._socket = self._bound()
         except OSError as error:
             raise ControlError(f"control socket {self.path}: {error.strerror}") from error
-        self._watch(self._socket)
+        # Imported here and below: clients do not need it, and it is half of a command's start-up.
+        from gateway.edges.accepting import accept_each
+
+        accept_each(self._socket, self._on_connection, self._report)
 
     def close(self) -> None:
         """Stop listening and end all connections."""
         if self._socket is None:
             return
-        # Imported here and below: clients do not need it, and it is half of a command's start-up.
         import asyncio
 
         asyncio.get_running_loop().remove_reader(self._socket)
@@ -181,31 +179,15 @@ class ControlServer:
             raise
         return sock
 
-    def _watch(self, sock: socket.socket) -> None:
+    def _report(self, error: OSError | None) -> None:
+        if error is not None:
+            log.warning("control socket: %s; it is tried again", error.strerror)
+
+    def _on_connection(self, connection: socket.socket, _: object) -> None:
         import asyncio
 
-        if sock.fileno() >= 0:
-            asyncio.get_running_loop().add_reader(sock, self._on_readable, sock)
-
-    def _on_readable(self, sock: socket.socket) -> None:
-        import asyncio
-
-        loop = asyncio.get_running_loop()
-        try:
-            connection, _ = sock.accept()
-        except BlockingIOError:
-            return
-        except OSError as error:
-            # Out of descriptors: the waiting connection would wake us for ever.
-            if not self._is_short:
-                log.warning("control socket: %s; it is tried again", error.strerror)
-            self._is_short = True
-            loop.remove_reader(sock)
-            loop.call_later(ACCEPT_AGAIN_S, self._watch, sock)
-            return
-        self._is_short = False
         connection.setblocking(False)
-        task = loop.create_task(self._admit(connection))
+        task = asyncio.get_running_loop().create_task(self._admit(connection))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 

@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from gateway.edges.accepting import accept_each
 from gateway.edges.reasons import reason_of
 from gateway.routing.client_table import ListenerStats
 from gateway.routing.page_origin import names_loopback
@@ -58,7 +59,10 @@ class MetricsServer:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
-        self._release()
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
 
     def listeners(self) -> tuple[ListenerStats, ...]:
         """Return the port's state, if one is configured."""
@@ -73,36 +77,20 @@ class MetricsServer:
         try:
             self._socket = socket.create_server(("127.0.0.1", self._wanted))
         except OSError as error:
-            self._fail(error)
+            self._report(error)
+            self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._bind)
             return
-        self._reason = ""
+        self._report(None)
         self._socket.setblocking(False)
-        asyncio.get_running_loop().add_reader(self._socket, self._on_readable, self._socket)
+        accept_each(self._socket, self._on_connection, self._report)
 
-    def _fail(self, error: OSError) -> None:
-        """Retry later."""
-        reason = reason_of(error)
-        if reason != self._reason:
+    def _report(self, error: OSError | None) -> None:
+        reason = "" if error is None else reason_of(error)
+        if reason and reason != self._reason:
             log.warning("no metrics on port %d yet: %s", self._wanted, reason)
         self._reason = reason
-        self._release()
-        self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._bind)
 
-    def _release(self) -> None:
-        if self._socket is not None:
-            asyncio.get_running_loop().remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def _on_readable(self, sock: socket.socket) -> None:
-        try:
-            connection, _ = sock.accept()
-        except BlockingIOError:
-            return
-        except OSError as error:
-            # Out of descriptors: the waiting connection would wake us for ever.
-            self._fail(error)
-            return
+    def _on_connection(self, connection: socket.socket, _: tuple[str, int]) -> None:
         if len(self._tasks) >= MAX_CONNECTIONS:
             connection.close()
             return

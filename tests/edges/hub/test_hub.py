@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.edges import accepting
+
 pytestmark = pytest.mark.io
 
 
@@ -372,8 +374,9 @@ class TestListeningPorts:
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
     async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(
-        self, rig: Any, kind: str
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", 0.001)
         hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
         (place,) = hub.listening_ports()
         caller = rig.station(place, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
@@ -385,6 +388,8 @@ class TestListeningPorts:
             else:
                 caller.say(caller.sender.heartbeat())
             await rig.until(lambda: hub.listeners()[0].reason == "Too many open files")
+            rig.tick(hub)
+            assert hub.listeners()[0].reason == "Too many open files", "no tick hides it"
             assert hub.clients() == ()
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

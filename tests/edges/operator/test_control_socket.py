@@ -1,14 +1,12 @@
 """The control socket: its rights, its words, and what it says to nonsense."""
 
 import asyncio
-import errno
 import os
 import socket
 import stat
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 
 import msgspec
 import pytest
@@ -146,27 +144,6 @@ async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Pat
         assert await reader.read() == b""
     writer.close()
     await writer.wait_closed()
-
-
-async def test_without_file_descriptors_a_connection_waits_and_is_told_once(
-    server: ControlServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    loop, listening = asyncio.get_running_loop(), server._socket
-    assert listening is not None
-    later: list[Any] = []
-    monkeypatch.setattr(loop, "call_later", lambda _, *work: later.append(work))
-    none_left = MagicMock(side_effect=OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
-    for _ in range(3):
-        server._on_readable(MagicMock(wraps=listening, accept=none_left))
-        assert not loop.remove_reader(listening), "nothing wakes the loop meanwhile"
-        ((again, _),) = later
-        later.clear()
-        again(listening)
-    monkeypatch.undo()
-    assert [record.getMessage() for record in caplog.records] == [
-        "control socket: Too many open files; it is tried again"
-    ]
-    assert await ask(server, "verbs")
 
 
 async def test_a_path_that_is_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
