@@ -8,7 +8,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -101,18 +102,8 @@ def test_without_a_compiler_it_goes_on_as_python(
     assert quotient(points["paper"], 7.0, 2.0) == 3.5
 
 
-async def test_what_cannot_be_loaded_now_is_loaded_later_and_told_once(
-    points: dict[str, EntryPoint[int]],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """At the limit of file descriptors."""
-    later: list[Callable[[], None]] = []
-    monkeypatch.setattr(
-        asyncio.get_running_loop(), "call_later", lambda _, work: later.append(work)
-    )
-    compiling = make_ready("eskf")
-    assert compiling is not None
+@contextmanager
+def no_descriptors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with monkeypatch.context() as short:
         none_left = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
         short.setattr(machine_code.tempfile, "NamedTemporaryFile", Mock(side_effect=none_left))
@@ -121,15 +112,41 @@ async def test_what_cannot_be_loaded_now_is_loaded_later_and_told_once(
         with pytest.raises(OSError, match="Too many"):
             machine_code.load_code(machine_code.MachineCode(b"", b"library"))
         by_llvm.assert_not_called()
+        yield
+
+
+def test_what_cannot_be_loaded_now_goes_on_as_python_and_is_reported_once(
+    points: dict[str, EntryPoint[int]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Without an event loop, too, which tries again."""
+    compiling = make_ready("eskf")
+    assert compiling is not None
+    with no_descriptors(monkeypatch):
         while compiling.take_one():
             pass
-        later.pop()()
+    assert all(quotient(point, 1.0, 0.0) == 1.0 for point in points.values()), "as Python"
     assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING] == [
         "machine code is loaded later: [Errno 24] Too many open files"
     ]
+
+
+async def test_what_cannot_be_loaded_now_is_loaded_later(
+    points: dict[str, EntryPoint[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later: list[Callable[[], None]] = []
+    loop = asyncio.get_running_loop()
+    compiling = make_ready("eskf")
+    assert compiling is not None
+    monkeypatch.setattr(loop, "call_later", lambda _, work: later.append(work))
+    with no_descriptors(monkeypatch):
+        while compiling.take_one():
+            pass
+        compiling.watch()
+        later.pop()()
     assert all(quotient(point, 1.0, 0.0) == 1.0 for point in points.values()), "as Python"
-    (load,) = later
-    load()
+    later.pop()()
     assert all(quotient(point, 1.0, 0.0) == math.inf for point in points.values())
 
 

@@ -91,7 +91,7 @@ class Compilation:
         self._missing = {(name, k) for name in names for k in range(len(ENTRY_POINTS[name]))}
         self._received: deque[tuple[str, int, MachineCode]] = deque()
         """What is not loaded yet."""
-        self._is_told = False
+        self._has_failed = False
         self._receiver = begin_copy(_compile, names)
 
     def watch(self) -> None:
@@ -103,31 +103,36 @@ class Compilation:
                 loop.remove_reader(self._receiver)
                 self._receiver.close()
 
+        def load_again() -> None:
+            self._load()
+            if self._received or not self._receiver.closed:
+                loop.call_later(LOAD_AGAIN_S, load_again)
+
         loop.add_reader(self._receiver, take)
+        load_again()
 
     def take_one(self) -> bool:
-        """Wait for the next function and load it; return whether there was one."""
+        """Wait for the next function, and load it if it can be; return whether there was one."""
         try:
             self._received.append(self._receiver.recv())
         except EOFError:
+            self._load()
             if len(self._missing) > len(self._received):
                 log.warning("the compiler has failed: estimates go on costing more computing")
             return False
-        if len(self._received) == 1:
-            self._load()
+        self._load()
         return True
 
     def _load(self) -> None:
-        """Load what has been received; what cannot be loaded now is tried again."""
+        """Load what has been received, as far as that is possible now."""
         while self._received:
             name, place, code = self._received[0]
             try:
                 ENTRY_POINTS[name][place].take(code)
             except (OSError, ImportError) as error:
-                if not self._is_told:
+                if not self._has_failed:
                     log.warning("machine code is loaded later: %s", error)
-                self._is_told = True
-                asyncio.get_running_loop().call_later(LOAD_AGAIN_S, self._load)
+                self._has_failed = True
                 return
             self._received.popleft()
             self._missing.discard((name, place))
