@@ -29,7 +29,7 @@ from gateway.edges.disk.part_files import (
     free_bytes_near,
     reason_of,
 )
-from gateway.edges.disk.recordings import RecordingError, part_of, rename_recording
+from gateway.edges.disk.recordings import RecordingError, move_recording, part_of
 from gateway.edges.disk.restamp import Restamper, clear_copies
 from gateway.edges.disk.worker import begin_worker, done_by
 from gateway.flightlog.session import (
@@ -177,15 +177,14 @@ class Recorder:
         await self._restamped()
         old, files = self._session.name, self._files
         if files is None:
-            await done_by(self._syncer, rename_recording, self.folder, old, name)
+            await done_by(self._syncer, move_recording, self.folder, old, name)
         else:
             await done_by(self._writer, files.rename, name)
         self._session.name = name
         if self._part is not None:
             self._part.session = name
-        if files is not None:
-            # Not by the thread that writes.
-            await done_by(self._syncer, sync_folder, self.folder)
+        # Not by the thread that writes.
+        await done_by(self._syncer, sync_folder, self.folder)
 
     def status(self) -> RecorderStatus:
         """Return the present state."""
@@ -382,7 +381,8 @@ class Recorder:
         await self._restamped()
         old, new = action.session, action.to_session
         try:
-            found = await done_by(self._syncer, rename_recording, self.folder, old, new)
+            # Not by the thread that syncs the part before; the next part's sync keeps the names.
+            found = await done_by(self._writer, move_recording, self.folder, old, new)
         except (OSError, RecordingError) as error:
             log.warning("Recording %s keeps its name and times: %s", old, error)
             return

@@ -126,12 +126,12 @@ def check_free(folder: Path, name: str) -> None:
 
 def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
     """Rename a recording as `move_recording`, and sync its folder."""
-    move_recording(folder, name, to_name)
+    moved = move_recording(folder, name, to_name)
     sync_folder(folder)
-    return find_recording(folder, to_name)
+    return moved
 
 
-def move_recording(folder: Path, name: str, to_name: str) -> None:
+def move_recording(folder: Path, name: str, to_name: str) -> Recording:
     """Rename a recording, also while it is being written; never overwrites.
 
     Raises
@@ -143,6 +143,7 @@ def move_recording(folder: Path, name: str, to_name: str) -> None:
     check_free(folder, to_name)
     for path in recording.files:
         _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
+    return find_recording(folder, to_name)
 
 
 def delete_recording(folder: Path, name: str) -> Recording:
