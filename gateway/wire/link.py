@@ -109,7 +109,7 @@ class _Node:
     last_stamp_us: int | None = None
     """On its own clock; None before the first payload after a start of it."""
     quality: payloads.GpsQualityPayload | None = None
-    wrong_dates: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
 
 
@@ -193,8 +193,8 @@ class Link:
         )
 
     def _all_faults(self) -> Counter[str]:
-        wrong_dates = sum(node.wrong_dates for node in self._nodes.values())
-        return self._faults + Counter(gps_date=wrong_dates)
+        nodes = [*self._nodes.values(), *(node for node, _ in self._unproven.values())]
+        return sum((node.faults for node in nodes), self._faults)
 
     def _hear(
         self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
@@ -242,12 +242,18 @@ def _hear_node(
         node.last_stamp_us = None
     # A late payload is counted but not used: every stage behind relies on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
+        node.faults["sequence"] += _is_later(header.node_time_us, node.last_stamp_us)
         return None
     node.pipe = frame.pipe
     node.arrivals_us.append(arrival_us)
     node.last_time_us = _never_back(node, header.node_time_us, time_us)
     node.last_stamp_us = header.node_time_us
     return _to_record(header, frame.payload, node)
+
+
+def _is_later(stamp_us: int, last_us: int | None) -> bool:
+    """Return whether a payload is newer than the newest, so that its number should be, too."""
+    return last_us is not None and 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2
 
 
 def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
@@ -280,7 +286,7 @@ def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) 
             return _gps_fix(header, payload, node)
         case payloads.GpsQualityPayload():
             node.quality = payload
-            node.wrong_dates += payload.utc is not None and payload.utc.year < FIRST_YEAR
+            node.faults["gps_date"] += payload.utc is not None and payload.utc.year < FIRST_YEAR
             return None
         case payloads.NodeStatusPayload():
             return _node_status(header, payload, node.last_time_us)

@@ -20,6 +20,7 @@ from gateway.records import (
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import LATE_WINDOW, Arrival, Link, SequenceCounter
+from gateway.wire.timesync import WRAP_US
 
 IMU = payloads.ImuPayload(
     (1, 2, 3), (4, 5, 6), (7, 8, 9), -100, ImuFlags.MAG_NEW, accel_range=2, gyro_range=2, mag_gain=1
@@ -218,6 +219,25 @@ def test_a_date_before_the_protocol_is_no_time_of_a_fix(year: int, counted: int)
     assert fix.h_acc_m == 1.5
     faults = dict(link.report(0, connected=True, port="").faults)
     assert faults == ({"gps_date": counted} if counted else {})
+
+
+@pytest.mark.parametrize("first", [0, 5], ids=["from the first on", "later"])
+def test_a_node_whose_sequence_stands_still_is_shown_as_a_fault(first: int) -> None:
+    line, link = Line(), Link()
+    for number in range(first + 20):
+        link.feed(line.frame(number * 10_000, IMU, seq=min(number, first)), number * 10_000)
+    assert dict(link.report(0, connected=True, port="").faults) == {"sequence": 19}
+
+
+def test_payloads_that_come_twice_or_late_are_no_fault() -> None:
+    line, link = Line(), Link()
+    stamps = [0, 1, 1, 2, 4, 3, 4, 2, 5]
+    for number, stamp in enumerate(stamps):
+        frame = line.frame((WRAP_US - 20_000 + stamp * 10_000) % WRAP_US, IMU, seq=stamp)
+        link.feed(frame, 1_000_000 + number * 10_000)
+    report = link.report(0, connected=True, port="")
+    assert report.faults == ()
+    assert (report.nodes[0].duplicates, report.nodes[0].reordered) == (3, 1)
 
 
 def test_receiver_restart_is_no_serial_loss() -> None:
