@@ -40,6 +40,10 @@ ONBOARD: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: its numbers are not the vehicle's, so that a text is no loss."""
 MAX_SITES: Final = 2000
 """Names that strangers may fill the memory with."""
+HANDOVERS: Final = 10
+"""Ids that pass from one vehicle to another in `KEEP_S`; each costs some 0.1 ms."""
+FORGET_US: Final = 3600 * US_PER_S
+"""After so long without a frame a vehicle's id, or a site's place, may go to another."""
 
 
 class IdParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -175,10 +179,31 @@ class FleetServer:
             now_us = self._now_us()
             for site in self._sites.values():
                 site.translation.mark(now_us)
+            self._make_room(now_us)
             if self._ping_interval_us and now_us - self._ping_us >= self._ping_interval_us:
                 self._ping_us = now_us
                 self._session.ask_round_trips()
             await asyncio.sleep(KEEP_S)
+
+    def _make_room(self, now_us: int) -> None:
+        """Let those wait no longer whom others, of whom nothing is heard, keep out."""
+        if self._ids.unmapped:
+            heard_us = {
+                (name, system_id): traffic.heard_us
+                for name, site in self._sites.items()
+                for system_id, traffic in site.translation.traffic.items()
+            }
+            for _ in range(HANDOVERS):
+                if (done := self._ids.make_room(heard_us, now_us - FORGET_US)) is None:
+                    break
+                heard_us[done.holder] = now_us
+                text = "id %d of %s/%d is now that of %s/%d, which waited for one"
+                log.warning(text, done.own_id, *done.former, *done.holder)
+        if len(self._sites) >= MAX_SITES:
+            for name, site in list(self._sites.items()):
+                if not site.is_here and now_us - (site.heard_us or site.since_us) > FORGET_US:
+                    del self._sites[name]
+                    self._hub.vanish(site)
 
     def _take(self, name: str, data: bytes, is_own: bool) -> None:
         if (site := self._site(name)) is not None:

@@ -1,11 +1,14 @@
 """Which system id a vehicle of a site has here: two fields both have an aircraft 1."""
 
+from collections import Counter
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 FIRST_ID: Final = 1
 LAST_ID: Final = 249
 """From 250 on there are ground stations."""
+MAX_WAITING: Final = LAST_ID
+"""Vehicles without an id that are kept in mind; there is never room for more."""
 LEFT_OUT: Final = 0
 """In the place of an id: a vehicle that shall have none."""
 
@@ -13,11 +16,19 @@ Vehicle = tuple[str, int]
 """Site and system id there."""
 
 
+class Handover(NamedTuple):
+    """An id that another vehicle has from now on."""
+
+    own_id: int
+    former: Vehicle
+    holder: Vehicle
+
+
 class IdMap:
-    """System ids given once and kept.
+    """System ids given once and kept as long as there are enough.
 
     A vehicle keeps the id that it has at its site if nobody else has it here, else it gets the
-    lowest that is free.
+    lowest that is free. Where none is, `make_room` finds who can do without.
 
     Parameters
     ----------
@@ -48,13 +59,47 @@ class IdMap:
             return own_id
         if vehicle in self.unmapped or vehicle in self.left_out:
             return None
+        if len(self._vehicles) == LAST_ID:
+            if len(self.unmapped) < MAX_WAITING:
+                self.unmapped.add(vehicle)
+            return None
         wanted = [system_id, *range(FIRST_ID, LAST_ID + 1)]
-        own_id = next((each for each in wanted if self._is_free(each)), None)
-        if own_id is None:
-            self.unmapped.add(vehicle)
-        else:
-            self._give(vehicle, own_id)
-        return own_id
+        free: int = next(filter(self._is_free, wanted))
+        self._give(vehicle, free)
+        return free
+
+    def make_room(self, heard_us: Mapping[Vehicle, int], silent_since_us: int) -> "Handover | None":
+        """Give a vehicle that waits the id of another, which may wait in its turn.
+
+        It is one that was not heard for long, else one of the site that has the most ids, if the
+        site of the one that waits has fewer: no site can use up the ids of all.
+
+        Parameters
+        ----------
+        heard_us : mapping
+            When vehicles were last heard; one that is not in it never was.
+        silent_since_us : int
+            Who was heard before is forgotten.
+
+        Returns
+        -------
+        Handover, optional
+            What was changed, if anything.
+        """
+        if not self.unmapped:
+            return None
+        shares = Counter(site for site, _ in self._ids)
+        waiting = min(self.unmapped, key=lambda each: (shares[each[0]], each))
+        holder = min(self._ids, key=lambda each: heard_us.get(each, 0))
+        if heard_us.get(holder, 0) >= silent_since_us:
+            ((largest, most),) = shares.most_common(1)
+            if most <= shares[waiting[0]] + 1:
+                return None
+            of_it = [each for each in self._ids if each[0] == largest]
+            holder = min(of_it, key=lambda each: heard_us.get(each, 0))
+        own_id = self._ids.pop(holder)
+        self._give(waiting, own_id)
+        return Handover(own_id, holder, waiting)
 
     def known_id(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, if it has one."""

@@ -15,9 +15,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.operator.control_socket import ControlError, request
-from gateway.fleet import ids_file
+from gateway.fleet import fleet_server, ids_file
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings
+from gateway.fleet.id_map import LAST_ID
 from gateway.routing.hub_settings import HubSettings
 from gateway.vehicle.signing import key_from_passphrase
 from tests.edges.hub.conftest import LIMIT_S
@@ -46,6 +47,37 @@ async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: Wo
     await world.until(lambda: any(m.get_type() == "COMMAND_ACK" for m in world.got))
     answer = next(m for m in world.got if m.get_type() == "COMMAND_ACK")
     assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b"], 255)
+
+
+async def test_a_site_that_has_taken_all_ids_keeps_nobody_out(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fleet_server, "KEEP_S", 0.01)
+    for system_id in range(1, LAST_ID + 1):
+        world.fleet._ids.id_of("field-many", system_id)
+    world.open_site("field-a")
+    await world.until(lambda: bool(world.systems()))
+    (own_id,) = world.systems()
+    assert world.fleet._ids.vehicle_of(own_id) == ("field-a", 1)
+    assert f"id {own_id} of field-many/{own_id} is now that of field-a/1" in caplog.text
+
+
+async def test_sites_that_have_gone_make_room_for_others(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_server, "MAX_SITES", 3)
+    fleet, now_us = world.fleet, fleet_server.FORGET_US
+    for name in ("field-1", "field-2", "field-3", "field-4"):
+        fleet._note_session(name, "token", True)
+    fleet._note_session("field-2", "token", False)
+    assert (sorted(fleet._sites), fleet._bad_names) == (["field-1", "field-2", "field-3"], 1)
+    fleet._make_room(now_us // 2)
+    assert "field-2" in fleet._sites
+    fleet._make_room(now_us + fleet._now_us())
+    fleet._note_session("field-4", "token", True)
+    assert sorted(fleet._sites) == ["field-1", "field-3", "field-4"]
+    assert {client.name for client in fleet._hub.clients()} >= set(fleet._sites)
+    assert "field-2" not in {client.name for client in fleet._hub.clients()}
 
 
 async def test_one_sites_frames_never_reach_another(world: World) -> None:

@@ -1,10 +1,11 @@
 """Ids given once and kept."""
 
 import random
+from collections import Counter
 
 import pytest
 
-from gateway.fleet.id_map import FIRST_ID, LAST_ID, IdMap
+from gateway.fleet.id_map import FIRST_ID, LAST_ID, MAX_WAITING, Handover, IdMap
 
 
 def test_the_first_keeps_its_id_and_the_second_gets_the_lowest_that_is_free() -> None:
@@ -58,6 +59,56 @@ def test_more_than_there_are_ids_for() -> None:
     assert ids.id_of("site-299", 1) == 5
     assert ids.vehicle_of(5) == ("site-299", 1)
     assert ("site-299", 1) not in ids.unmapped
+
+
+def filled(site: str = "many") -> IdMap:
+    ids = IdMap()
+    for system_id in range(1, LAST_ID + 1):
+        ids.id_of(site, system_id)
+    return ids
+
+
+def test_a_site_that_takes_all_ids_gives_some_to_others() -> None:
+    ids = filled()
+    heard_us = {vehicle: 100 - vehicle[1] % 7 for vehicle, _ in ids.items()}
+    assert ids.id_of("field-1", 5) is None
+    assert ids.make_room(heard_us, 0) == Handover(6, ("many", 6), ("field-1", 5))
+    assert ids.id_of("field-1", 5) == 6
+    assert ids.id_of("many", 6) is None, "and it does not take it back"
+    assert ids.make_room(heard_us, 0) is None
+    assert ids.id_of("field-1", 5) == 6
+
+
+def test_sites_share_what_there_is() -> None:
+    ids = filled()
+    for system_id in range(1, LAST_ID + 1):
+        for site in ("a", "b"):
+            ids.id_of(site, system_id)
+            while ids.make_room({}, 0):
+                pass
+    shares = Counter(site for (site, _), _ in ids.items())
+    assert shares.total() == LAST_ID
+    assert max(shares.values()) - min(shares.values()) <= 1
+
+
+def test_who_was_not_heard_for_long_makes_room_for_one_of_the_same_site() -> None:
+    ids = filled()
+    ids.id_of("many", 250)
+    heard_us = {vehicle: 1000 for vehicle, _ in ids.items()}
+    assert ids.make_room(heard_us, 1000) is None
+    del heard_us["many", 7]
+    heard_us["many", 8] = 500
+    assert ids.make_room(heard_us, 1000) == Handover(7, ("many", 7), ("many", 250))
+    heard_us["many", 250] = 1000
+    ids.id_of("many", 7)
+    assert ids.make_room(heard_us, 1000) == Handover(8, ("many", 8), ("many", 7))
+
+
+def test_those_that_wait_are_no_more_than_some() -> None:
+    ids = filled()
+    for number in range(2 * MAX_WAITING):
+        assert ids.id_of(f"s{number}", 1) is None
+    assert len(ids.unmapped) == MAX_WAITING
 
 
 def test_by_hand() -> None:
