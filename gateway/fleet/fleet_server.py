@@ -40,8 +40,6 @@ ONBOARD: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: its numbers are not the vehicle's, so that a text is no loss."""
 MAX_SITES: Final = 2000
 """Names that strangers may fill the memory with."""
-HANDOVERS: Final = 10
-"""Ids that pass from one vehicle to another in `KEEP_S`; each costs some 0.1 ms."""
 FORGET_US: Final = 3600 * US_PER_S
 """After so long without a frame a vehicle's id, or a site's place, may go to another."""
 
@@ -193,11 +191,9 @@ class FleetServer:
                 for name, site in self._sites.items()
                 for system_id, traffic in site.translation.traffic.items()
             }
-            for _ in range(HANDOVERS):
-                if (done := self._ids.make_room(heard_us, now_us - FORGET_US)) is None:
-                    break
-                heard_us[done.holder] = now_us
-                text = "id %d of %s/%d is now that of %s/%d, which waited for one"
+            # One at a time: it takes some milliseconds where many wait.
+            if done := self._ids.make_room(heard_us, now_us - FORGET_US):
+                text = "id %d of %s/%d, long not heard, is that of %s/%d now"
                 log.warning(text, done.own_id, *done.former, *done.holder)
         if len(self._sites) >= MAX_SITES:
             for name, site in list(self._sites.items()):

@@ -140,8 +140,15 @@ class FrameTranslation:
         return given
 
     def to_site(self, frame: bytes, now_us: int) -> tuple[int, bytes] | None:
-        """Return the system at the site that a frame is for (0: all) and the frame for it."""
+        """Return the system at the site that a frame is for (0: all) and the frame for it.
+
+        None for one that cannot pass, or is for another site's vehicle: one that has got its id
+        from a vehicle of this site, where it may be a third one's.
+        """
         sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
+        addressed = self._ids.vehicle_of(target)
+        if addressed is not None and addressed[0] != self._site:
+            return None
         changed = self._rewritten(frame, sender, self._id_there)
         if changed is None:
             return None

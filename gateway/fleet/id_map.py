@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 FIRST_ID: Final = 1
 LAST_ID: Final = 249
 """From 250 on there are ground stations."""
-MAX_WAITING: Final = LAST_ID
-"""Vehicles without an id that are kept in mind; there is never room for more."""
+MAX_WAITING: Final = 20_000
+"""Vehicles without an id that are kept in mind: all of many sites."""
 LEFT_OUT: Final = 0
 """In the place of an id: a vehicle that shall have none."""
 
@@ -28,7 +28,8 @@ class IdMap:
     """System ids given once and kept as long as there are enough.
 
     A vehicle keeps the id that it has at its site if nobody else has it here, else it gets the
-    lowest that is free. Where none is, `make_room` finds who can do without.
+    lowest that is free. No site gets more than are left for the others, so that one alone cannot
+    use up all. Where none is left, `make_room` finds who has gone.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ class IdMap:
             return own_id
         if vehicle in self.unmapped or vehicle in self.left_out:
             return None
-        if len(self._vehicles) == LAST_ID:
+        if self._shares()[site] >= LAST_ID - len(self._ids):
             if len(self.unmapped) < MAX_WAITING:
                 self.unmapped.add(vehicle)
             return None
@@ -69,10 +70,10 @@ class IdMap:
         return free
 
     def make_room(self, heard_us: Mapping[Vehicle, int], silent_since_us: int) -> "Handover | None":
-        """Give a vehicle that waits the id of another, which may wait in its turn.
+        """Give a vehicle that waits the id of one that was not heard for long.
 
-        It is one that was not heard for long, else one of the site that has the most ids, if the
-        site of the one that waits has fewer: no site can use up the ids of all.
+        That is one of the same site, or of a site that has more ids. Who is heard keeps its id:
+        ground stations would command another vehicle by it.
 
         Parameters
         ----------
@@ -86,20 +87,17 @@ class IdMap:
         Handover, optional
             What was changed, if anything.
         """
-        if not self.unmapped:
-            return None
-        shares = Counter(site for site, _ in self._ids)
-        waiting = min(self.unmapped, key=lambda each: (shares[each[0]], each))
-        holder = min(self._ids, key=lambda each: heard_us.get(each, 0))
-        if heard_us.get(holder, 0) >= silent_since_us:
-            ((largest, most),) = shares.most_common(1)
-            if most <= shares[waiting[0]] + 1:
-                return None
-            of_it = [each for each in self._ids if each[0] == largest]
-            holder = min(of_it, key=lambda each: heard_us.get(each, 0))
-        own_id = self._ids.pop(holder)
-        self._give(waiting, own_id)
-        return Handover(own_id, holder, waiting)
+        shares = self._shares()
+        silent = [each for each in self._ids if heard_us.get(each, 0) < silent_since_us]
+        silent.sort(key=lambda each: heard_us.get(each, 0))
+        one_of_site = {each[0]: each for each in self.unmapped}
+        for site in sorted(one_of_site, key=lambda each: shares[each]):
+            for former in silent:
+                if former[0] == site or shares[former[0]] > shares[site]:
+                    own_id = self._ids.pop(former)
+                    self._give(one_of_site[site], own_id)
+                    return Handover(own_id, former, one_of_site[site])
+        return None
 
     def known_id(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, if it has one."""
@@ -150,6 +148,9 @@ class IdMap:
         """Return all vehicles with their ids in the order of these, first those left out."""
         out = [(vehicle, LEFT_OUT) for vehicle in sorted(self.left_out)]
         return out + sorted(self._ids.items(), key=lambda item: item[1])
+
+    def _shares(self) -> Counter[str]:
+        return Counter(site for site, _ in self._ids)
 
     def _is_free(self, own_id: int) -> bool:
         return FIRST_ID <= own_id <= LAST_ID and own_id not in self._vehicles

@@ -49,17 +49,21 @@ async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: Wo
     assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b"], 255)
 
 
-async def test_a_site_that_has_taken_all_ids_keeps_nobody_out(
+async def test_vehicles_that_were_not_heard_for_long_keep_nobody_out(
     world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(fleet_server, "KEEP_S", 0.01)
+    monkeypatch.setattr(fleet_server, "FORGET_US", 0)
     for system_id in range(1, LAST_ID + 1):
-        world.fleet._ids.id_of("field-many", system_id)
+        world.fleet._ids.set_by_hand("field-many", system_id, system_id)
     world.open_site("field-a")
     await world.until(lambda: bool(world.systems()))
     (own_id,) = world.systems()
     assert world.fleet._ids.vehicle_of(own_id) == ("field-a", 1)
-    assert f"id {own_id} of field-many/{own_id} is now that of field-a/1" in caplog.text
+    assert (
+        f"id {own_id} of field-many/{own_id}, long not heard, is that of field-a/1 now"
+        in caplog.text
+    )
 
 
 async def test_sites_that_have_gone_make_room_for_others(

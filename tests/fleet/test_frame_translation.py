@@ -216,6 +216,19 @@ def test_an_unknown_message_cannot_change() -> None:
     assert there.counters.unknown == 1
 
 
+def test_who_has_another_sites_id_now_is_not_commanded_there() -> None:
+    """Site b has an aircraft 30 of its own, which had the id 30 here, too."""
+    ids = IdMap()
+    there = FrameTranslation("b", ids)
+    assert ids.id_of("b", 30) == 30
+    assert there.to_site(packed(command(30), 255), 0) is not None
+    ids.set_by_hand("a", 1, 30)
+    assert there.to_site(packed(command(30), 255), 0) is None
+    found = FrameTranslation("a", ids).to_site(packed(command(30), 255), 0)
+    assert found is not None
+    assert found[0] == 1
+
+
 def test_no_id_left() -> None:
     ids = IdMap()
     for n in range(260):

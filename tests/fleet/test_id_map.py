@@ -1,7 +1,6 @@
 """Ids given once and kept."""
 
 import random
-from collections import Counter
 
 import pytest
 
@@ -61,52 +60,54 @@ def test_more_than_there_are_ids_for() -> None:
     assert ("site-299", 1) not in ids.unmapped
 
 
-def filled(site: str = "many") -> IdMap:
+def filled(sites: int) -> IdMap:
+    """Return a map that as many sites have filled as far as they could."""
     ids = IdMap()
-    for system_id in range(1, LAST_ID + 1):
-        ids.id_of(site, system_id)
+    for number in range(sites):
+        for system_id in range(1, LAST_ID + 1):
+            ids.id_of(f"many-{number}", system_id)
     return ids
 
 
-def test_a_site_that_takes_all_ids_gives_some_to_others() -> None:
-    ids = filled()
-    heard_us = {vehicle: 100 - vehicle[1] % 7 for vehicle, _ in ids.items()}
-    assert ids.id_of("field-1", 5) is None
-    assert ids.make_room(heard_us, 0) == Handover(6, ("many", 6), ("field-1", 5))
-    assert ids.id_of("field-1", 5) == 6
-    assert ids.id_of("many", 6) is None, "and it does not take it back"
-    assert ids.make_room(heard_us, 0) is None
-    assert ids.id_of("field-1", 5) == 6
+@pytest.mark.parametrize("sites", [1, 2, 5])
+def test_no_site_uses_up_the_ids_of_others(sites: int) -> None:
+    ids = filled(sites)
+    assert ids.id_of("field", 7) is not None
+    assert ids.id_of("many-0", 249) is None
 
 
-def test_sites_share_what_there_is() -> None:
-    ids = filled()
-    for system_id in range(1, LAST_ID + 1):
-        for site in ("a", "b"):
-            ids.id_of(site, system_id)
-            while ids.make_room({}, 0):
-                pass
-    shares = Counter(site for (site, _), _ in ids.items())
-    assert shares.total() == LAST_ID
-    assert max(shares.values()) - min(shares.values()) <= 1
-
-
-def test_who_was_not_heard_for_long_makes_room_for_one_of_the_same_site() -> None:
-    ids = filled()
-    ids.id_of("many", 250)
-    heard_us = {vehicle: 1000 for vehicle, _ in ids.items()}
+def test_who_is_heard_keeps_its_id() -> None:
+    ids = filled(8)
+    assert ids.id_of("field", 7) is None
+    before = ids.items()
+    heard_us = {vehicle: 1000 for vehicle, _ in before}
     assert ids.make_room(heard_us, 1000) is None
-    del heard_us["many", 7]
-    heard_us["many", 8] = 500
-    assert ids.make_room(heard_us, 1000) == Handover(7, ("many", 7), ("many", 250))
-    heard_us["many", 250] = 1000
-    ids.id_of("many", 7)
-    assert ids.make_room(heard_us, 1000) == Handover(8, ("many", 8), ("many", 7))
+    assert ids.items() == before
+    silent = min(vehicle for vehicle, _ in before)
+    heard_us[silent] = 999
+    done = ids.make_room(heard_us, 1000)
+    assert done == Handover(dict(before)[silent], silent, ("field", 7))
+    assert ids.id_of("field", 7) == done.own_id
+    assert ids.id_of(*silent) is None, "it waits in its turn"
+
+
+def test_a_site_gets_no_ids_of_smaller_ones_but_its_own() -> None:
+    ids = filled(8)
+    heard_us = {vehicle: 1000 for vehicle, _ in ids.items()}
+    (smallest, *_, largest) = sorted(heard_us, key=lambda each: ids._shares()[each[0]])
+    assert largest[0] == "many-0"
+    heard_us[smallest] = 1
+    ids.unmapped = {each for each in ids.unmapped if each[0] == "many-0"}
+    assert ids.make_room(heard_us, 1000) is None
+    heard_us[largest] = 2
+    done = ids.make_room(heard_us, 1000)
+    assert done is not None
+    assert (done.former, done.holder[0]) == (largest, "many-0")
 
 
 def test_those_that_wait_are_no_more_than_some() -> None:
-    ids = filled()
-    for number in range(2 * MAX_WAITING):
+    ids = filled(8)
+    for number in range(MAX_WAITING):
         assert ids.id_of(f"s{number}", 1) is None
     assert len(ids.unmapped) == MAX_WAITING
 
