@@ -79,7 +79,7 @@ class UdpListener(Listener[UdpPeer]):
         super().tick(now_us)
         if self._socket is not None and now_us >= self._retry_us:
             # Whether the next one can be admitted shows only when it comes.
-            self.reason = ""
+            self.reason, self._retry_us = "", now_us + RETRY_US
         settings = self._context.settings
         self.table.max_clients = settings.max_clients
         self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
@@ -138,7 +138,6 @@ class UdpListener(Listener[UdpPeer]):
             sock = _bound((local_host, self.port), shared=True)
         except OSError as error:
             self._report(error)
-            self._retry_us = now_us + RETRY_US
             self.table.remove(presence)
             return None
         try:
