@@ -67,8 +67,8 @@ def write_output(s: ComplementaryState, row: FloatArray) -> None:
     lat, lon = offset_deg(s.origin_lat, s.origin_lon, 0.0, s.pos_n[0], s.pos_n[1])
     row[NAV_LAT], row[NAV_LON] = lat, lon
     write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
-    row[NAV_VEL_STD] = row[NAV_VEL_STD + 1] = s.told_speed_mps
-    row[NAV_POS_STD] = row[NAV_POS_STD + 1] = s.told_place_m
+    for k in range(2):
+        row[NAV_VEL_STD + k], row[NAV_POS_STD + k] = s.told_speed_mps[k], s.told_place_m[k]
 
 
 @compiled

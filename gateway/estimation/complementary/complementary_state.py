@@ -10,7 +10,7 @@ from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
-STATES: Final = 13
+STATES: Final = 17
 """Of the Kalman filter in `drift`."""
 
 
@@ -228,17 +228,9 @@ class ComplementaryState(FilterState):
     fix_force_i: Annotated[FloatArray, (3,)]
     told_std: Annotated[FloatArray, (3,)]
     """Standard deviations of the attitude about north, east and down, rad."""
-    told_place_m: float
-    told_speed_mps: float
-    """The same of place and speed, along one level axis."""
-    fix_place_m: float
-    fix_speed_mps: float
-    """What they were after the last fix."""
-    pushed_place_m: float
-    pushed_speed_mps: float
-    """What the error of the acceleration has added since."""
-    pushed_rough_sq: float
-    """Square of the speed that the noise of the specific force has added since, m2/s2."""
+    told_place_m: Annotated[FloatArray, (2,)]
+    told_speed_mps: Annotated[FloatArray, (2,)]
+    """The same of place and speed, north and east."""
     accuracy_s: float
     """When all that was carried on last."""
     accuracy_force_i: Annotated[FloatArray, (3,)]

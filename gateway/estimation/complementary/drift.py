@@ -1,4 +1,4 @@
-"""Errors of attitude and sensors: a Kalman filter of thirteen states.
+"""Errors of attitude and sensors: a Kalman filter of thirteen states, and of four that follow.
 
 The gyroscope bias in body FRD, the heading, the slow error of the compass (iron, and the place),
 the tilt of the level frame, the accelerometer bias in body FRD, and the scale of each axis of the
@@ -9,6 +9,9 @@ heading, and a heading from GPS reveals the error of the compass.
 Only GPS reveals the scale: iron turns the compass in step with each turn, as a wrong scale would.
 To all other measurements it is only considered, the Schmidt-Kalman update: its gain is zero, its
 uncertainty still counts.
+
+Speed and place are blended by `navigation`, not estimated here; their errors follow from the
+others, which push them, and are only considered.
 
 While the low-pass of gravity levels the attitude, neither the tilt nor the accelerometer bias nor
 the scale is estimated; `bias` then corrects the gyroscope bias by what the low-pass corrects.
@@ -45,7 +48,10 @@ TILT: Final = 5
 FORCE: Final = 7
 """The accelerometer's bias."""
 SCALE: Final = 10
-"""The gyroscope's; the last, so that it can be left out."""
+"""The gyroscope's; the last that is estimated, so that it can be left out."""
+SPEED: Final = 13
+PLACE: Final = 15
+"""Along the level frame's first two axes; never estimated."""
 
 BIAS_WALK_RAD2PS3: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
 """A drift of 0.1 deg/s in 100 s."""
@@ -151,7 +157,7 @@ def end_level(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 @compiled
 def states_in_use(s: ComplementaryState) -> int:
-    """Return how many states there are: without GPS, neither tilt nor accelerometer nor scale."""
+    """Return how many states there are: without GPS, none from the tilt on."""
     return STATES if s.level_by_gps == 1 else TILT
 
 
@@ -279,7 +285,7 @@ def correct_drift(
     clip : float
         An innovation counts up to so many of its standard deviations.
     count : int
-        The first so many states are corrected, `SCALE` or `STATES`; what follows is considered.
+        The first so many states are corrected, `SCALE` or `SPEED`; what follows is considered.
     """
     if not math.isfinite(innovation):
         return
@@ -303,6 +309,18 @@ def expected_variance(s: ComplementaryState) -> float:
     for k in range(n):
         spread += row[k] * gain[k]
     return spread
+
+
+@compiled
+def push_state(s: ComplementaryState, k: int, dt: float) -> None:
+    """Let state `k` change for `dt` seconds at the rate whose derivatives stand in `drift_row`."""
+    P, gain = s.drift_cov, s.drift_gain
+    pushed_sq = dt * dt * expected_variance(s)
+    for j in range(STATES):
+        P[k, j] += dt * gain[j]
+    for j in range(STATES):
+        P[j, k] = P[k, j]
+    P[k, k] += dt * gain[k] + pushed_sq
 
 
 @compiled
@@ -333,7 +351,7 @@ def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float, count
     for k in range(3):
         force = s.accel_bias_b[k] + gain[FORCE + k] * share
         s.accel_bias_b[k] = max(-FORCE_BIAS_LIMIT_MPS2, min(FORCE_BIAS_LIMIT_MPS2, force))
-        if count == STATES:
+        if count == SPEED:
             scale = s.scale_b[k] + gain[SCALE + k] * share
             s.scale_b[k] = max(-SCALE_LIMIT, min(SCALE_LIMIT, scale))
     turn = from_rotation_vector((gain[TILT] * share, gain[TILT + 1] * share, 0.0))

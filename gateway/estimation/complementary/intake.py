@@ -13,7 +13,7 @@ from gateway.estimation.alignment.gps_velocity import (
 )
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.columns import GPS_SPEED_ACC
-from gateway.estimation.complementary.accuracy import settle_place
+from gateway.estimation.complementary.accuracy import doubt_place, settle_place
 from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
@@ -202,5 +202,5 @@ def blend_or_restart(
         return True
     if s.reject_s > 0.0:
         # They agree with one another: either may be wrong.
-        s.fix_place_m = max(s.fix_place_m, off_m)
+        doubt_place(s, off_m)
     return False

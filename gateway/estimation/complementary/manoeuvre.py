@@ -13,13 +13,13 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.wahba import PAIR_WINDOW_S
 from gateway.estimation.complementary.complementary_state import (
-    STATES,
     ComplementaryGains,
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import (
     FORCE,
     HEADING,
+    SPEED,
     TILT,
     carry_drift,
     cleared_row,
@@ -152,7 +152,7 @@ def match_force(
     accel_e = rotate((math.cos(half), 0.0, 0.0, math.sin(half)), accel_n)
     gravity = STANDARD_GRAVITY_MPS2 if axis == 2 else 0.0
     write_force_row(s, axis, f)
-    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA, STATES)
+    correct_drift(s, p, accel_e[axis] - gravity - f[axis], variance, OUTLIER_SIGMA, SPEED)
 
 
 @compiled

@@ -67,6 +67,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     for k in range(3):
         s.P[TILT + k, TILT + k] += turned + p.gyro_density * dt
         s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
+        s.P[POS + k, POS + k] += s.place_density[k] * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[MAG_BIAS + k, MAG_BIAS + k] += p.mag_bias_density * dt

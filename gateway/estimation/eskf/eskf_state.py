@@ -105,6 +105,8 @@ class EskfState(FilterState):
     fix_vel: Annotated[FloatArray, (3,)]
     wander_var: Annotated[FloatArray, (3,)]
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
+    place_density: Annotated[FloatArray, (3,)]
+    """Density of the noise by which the place runs away: slow errors of GPS velocities, m2/s."""
     bias_raised: Annotated[FloatArray, (3,)]
     """Sum of what doubt has added to the variance of the gyroscope's bias, rad2/s2."""
     renewals: Annotated[FloatArray, (STATES,)]

@@ -45,6 +45,10 @@ NOISE_SHARE: Final = 0.2
 WANDER_SHARE: Final = (0.7, 0.7, 0.9)
 """The share, north, east and down, that is its slow error; the horizontal accuracy is radial."""
 SPEED_SHARE: Final = (0.4, 0.4, 0.8)
+SLOW_MPS: Final = 0.05
+SLOW_S: Final = 4.0
+"""Beside their noise GPS velocities are off by as much again, or this, for so long: they do not
+hold the place for ever against the slow error of its fixes."""
 REST_VELOCITY_VAR: Final = 0.2**2
 REST_RATE_VAR: Final = 0.002**2
 UNAIDED_CORRELATION_S: Final = 1.0
@@ -142,6 +146,8 @@ def set_wander_variance(s: EskfState, p: EskfGains, row: FloatArray) -> None:
         usual = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         s.wander_var[k] = reported_variance(usual, acc, WANDER_SHARE[k])
+        slow = reported_variance(SLOW_MPS * SLOW_MPS, row[GPS_SPEED_ACC], SPEED_SHARE[k])
+        s.place_density[k] = 2.0 * SLOW_S * slow
 
 
 @compiled
