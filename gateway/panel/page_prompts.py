@@ -35,6 +35,13 @@ def notify_failure(context: ViewContext) -> Iterator[None]:
             ui.notify(f"only a gateway on this machine can: {text}", type="negative")
 
 
+def named_dialog(name: str) -> ui.dialog:
+    """Create a dialog that a screen reader announces by its name."""
+    dialog = ui.dialog()
+    dialog.props["aria-label"] = name
+    return dialog
+
+
 def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
     """Return what closes a dialog and then acts, for a button in it.
 
@@ -62,10 +69,9 @@ def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None
     act : callable
         Called on a yes.
     """
-    with ui.dialog() as dialog, ui.card().classes("asks"):
+    with named_dialog(question) as dialog, ui.card().classes("asks"):
         ui.label(question).classes("title")
-
-        ui.button(word, on_click=closing(dialog, act)).props("color=negative")
-        ui.button("Cancel", on_click=dialog.close).props("flat")
+        ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
     dialog.on("hide", dialog.delete)
     dialog.open()

@@ -64,9 +64,7 @@ from gateway.player import (
 
 VIEW_INTERVAL_S: Final = 0.25
 FASTEST: Final = "max"
-KEYS: Final = (
-    "space pause   ← → 10 s   ↓ ↑ 1 min   + − speed   . step   home begin   l loop   q quit"
-)
+KEYS: Final = "space pause  ← → 10 s  ↓ ↑ 1 min  + − speed  . step  home begin  l loop  q quit"
 LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
 
 

@@ -11,7 +11,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.page_prompts import closing, notify_failure
+from gateway.panel.page_prompts import closing, named_dialog, notify_failure
 from gateway.panel.state.instant import Spot
 from gateway.panel.view_context import WEB, ViewContext
 
@@ -51,8 +51,9 @@ def build(context: ViewContext) -> None:
 def _ask(context: ViewContext, event: GenericEventArguments) -> None:
     """Ask what to do at the clicked position."""
     spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
-    with ui.dialog() as dialog, ui.card().classes("asks"):
-        ui.label(f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}").classes("figure title")
+    name = f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}"
+    with named_dialog(name) as dialog, ui.card().classes("asks"):
+        ui.label(name).classes("figure title")
         ui.label(f"aircraft {context.system_id}").classes("soft")
 
         def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
@@ -62,13 +63,14 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
 
             return closing(dialog, run)
 
-        ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
-        ui.button("Set home here", on_click=then(partial(_set_home, context, spot))).props(
-            "outline"
-        )
+        mark = ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
+        mark.props("no-caps")
+        home = ui.button("Set home here", on_click=then(partial(_set_home, context, spot)))
+        home.props("no-caps outline")
         if context.vehicle is not None and context.vehicle.instant(context.now_us).mark:
-            ui.button("Clear the mark", on_click=then(partial(_clear, context))).props("outline")
-        ui.button("Cancel", on_click=dialog.close).props("flat")
+            clear = ui.button("Clear the mark", on_click=then(partial(_clear, context)))
+            clear.props("no-caps outline")
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
     dialog.on("hide", dialog.delete)
     dialog.open()
 

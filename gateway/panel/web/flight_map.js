@@ -117,9 +117,9 @@ export default {
     this.grid = new MetricGrid().addTo(map);
     this.dots = L.canvas({ pane: "fixes" });
     this.craft = {};
-    this.mark = L.marker([0, 0], { icon: icon('<svg viewBox="0 0 24 24" class="pin mark"><path d="M12 1v22M1 12h22M12 5a7 7 0 1 0 .1 0z"/></svg>', 26), interactive: false });
+    this.mark = L.marker([0, 0], { icon: icon('<svg viewBox="0 0 24 24" class="pin mark"><path d="M12 1v22M1 12h22M12 5a7 7 0 1 0 .1 0z"/></svg>', 26), interactive: false, keyboard: false });
     this.bearing = L.polyline([], { weight: 2, dashArray: "6 6" });
-    this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false });
+    this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false, keyboard: false });
     this.accuracy = L.circle([0, 0], { radius: 1, weight: 1, fillOpacity: 0.12, interactive: false });
     map.on("click", (event) => this.full && this.$emit("place", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
     map.on("dragstart", () => (this.follow = false));
@@ -171,7 +171,7 @@ export default {
     make(id, state) {
       const path = `<svg viewBox="0 0 32 32" class="craft"><path d="${AIRCRAFT[state.model] ?? AIRCRAFT.none}"/></svg>`;
       const one = {
-        marker: L.marker(at(state), { icon: icon(path, 34), title: `Aircraft ${id}`, interactive: false }).addTo(this.map),
+        marker: L.marker(at(state), { icon: icon(path, 34), title: `Aircraft ${id}`, interactive: false, keyboard: false }).addTo(this.map),
         generation: state.generation,
         colour: COLOURS[state.origin] ?? "track",
         track: L.polyline([], { color: mavgate.colour(COLOURS[state.origin] ?? "track"), weight: 3, interactive: false }).addTo(this.map),

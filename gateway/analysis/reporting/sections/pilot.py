@@ -118,7 +118,7 @@ def _feet_a_minute(mps: float) -> str:
 
 
 def _knots(mps: float) -> str:
-    return f"{mps * KNOTS_PER_MPS:.1f} kn"
+    return f"{mps * KNOTS_PER_MPS:.1f} kt"
 
 
 def _events_table(events: tuple[FlightEvent, ...]) -> pd.DataFrame:
