@@ -1,10 +1,12 @@
 """What waits for a slow link: bounded, the urgent first, numbered as it leaves.
 
-Three queues. The attitude and the answers a person waits for are urgent; other telemetry is usual;
-parameters, missions and files are bulk. An urgent frame goes first, but after a few of them one of
-the others gets its turn, so that a parameter list is slow on a slow radio but completes. When the
-bound is reached the oldest telemetry is dropped, usual before urgent, and bulk last: telemetry
-comes again, an answer does not.
+Four queues. The answers a person waits for, and after them the attitude, are urgent; other
+telemetry is usual; parameters, missions and files are bulk. An urgent frame goes first, but after
+a few of them one of the others gets its turn, so that a parameter list is slow on a slow radio but
+completes. When the bound is reached the oldest telemetry is dropped, usual before urgent, and
+answers last: telemetry comes again, an answer does not. Bulk has a bound of its own, since all
+parameters come at once. Where a link is slower than what is sent, old telemetry expires: it would
+be as late as the queue is long.
 
 Frames leave in another order than they came, and some are dropped; so our own frames are numbered
 at the exit. Loss that a ground station shows is then only that of the link.
@@ -21,22 +23,28 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import Seal
 from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of
 
-URGENT_IDS: Final = frozenset({0, 30, 31, 61, 69, 70, 75, 76, 77, 253})
-"""HEARTBEAT, the attitudes, manual control and overrides, commands and answers, STATUSTEXT."""
+ANSWER_IDS: Final = frozenset({0, 75, 76, 77, 253})
+"""HEARTBEAT, commands and their answers, STATUSTEXT: the next one does not make up for one."""
+URGENT_IDS: Final = frozenset({30, 31, 61, 69, 70})
+"""The attitudes, manual control and overrides."""
 BULK_IDS: Final = frozenset(
     {20, 21, 22, 23, 36, 110, 148, 300, 320, 321, 322, 323, 324, 395, 396, 397, 410}
-    | set(range(37, 52))
+    | set(range(37, 52)) - {42}
     | {73}
     | set(range(117, 123))
 )
 """Parameters, mission transfers, files, logs, versions: asked for, and waited for."""
 
+BULK_BYTES: Final = 16_384
+"""Least room for bulk: the parameters of three aircraft."""
 URGENT_RUN: Final = 4
 """Urgent frames in a row before one of another queue has its turn."""
 
 SEQUENCE_MASK: Final = 0xFF
 Waiting = tuple[bytes, int | None]
 """A frame and its step."""
+_Queue = deque[tuple[bytes, int | None, int]]
+"""Frames, their steps, and when they were pushed."""
 
 
 class Numbering:
@@ -89,23 +97,30 @@ class Outbox:
     Parameters
     ----------
     max_bytes : int
-        Most bytes that wait; the newest frame is always taken.
+        Most bytes that wait beside bulk; the newest frame is always taken.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
-        self.size = 0
-        """Bytes that wait."""
-        self._urgent: deque[Waiting] = deque()
-        self._usual: deque[Waiting] = deque()
-        self._bulk: deque[Waiting] = deque()
+        self.max_bulk_bytes = max(max_bytes, BULK_BYTES)
+        self._sizes = [0, 0]
+        """Bytes that wait beside bulk, and of bulk."""
+        self._answers: _Queue = deque()
+        self._urgent: _Queue = deque()
+        self._usual: _Queue = deque()
+        self._bulk: _Queue = deque()
         self._run = 0
         self._bulk_turn = False
 
     def __len__(self) -> int:
-        return len(self._urgent) + len(self._usual) + len(self._bulk)
+        return sum(map(len, (self._answers, self._urgent, self._usual, self._bulk)))
 
-    def push(self, frame: bytes, message_id: int, step: int | None = None) -> int:
+    @property
+    def size(self) -> int:
+        """Bytes that wait."""
+        return sum(self._sizes)
+
+    def push(self, frame: bytes, message_id: int, step: int | None = None, now_us: int = 0) -> int:
         """Take a frame in.
 
         Parameters
@@ -116,49 +131,70 @@ class Outbox:
             Decides in which queue it waits.
         step : int, optional
             Returned with the frame; see `Numbering`.
+        now_us : int, optional
+            Gateway time; see `expire`.
 
         Returns
         -------
         int
             How many older frames were dropped for it.
         """
-        if message_id in URGENT_IDS:
-            queue = self._urgent
+        size, dropped = len(frame), 0
+        if message_id in BULK_IDS:
+            queue = self._bulk
+            while queue and self._sizes[1] + size > self.max_bulk_bytes:
+                self._take(queue)
+                dropped += 1
         else:
-            queue = self._bulk if message_id in BULK_IDS else self._usual
+            queue = self._usual
+            if message_id in URGENT_IDS:
+                queue = self._urgent
+            elif message_id in ANSWER_IDS:
+                queue = self._answers
+            while self._sizes[0] and self._sizes[0] + size > self.max_bytes:
+                self._take(self._usual or self._urgent or self._answers)
+                dropped += 1
+        queue.append((frame, step, now_us))
+        self._sizes[queue is self._bulk] += size
+        return dropped
+
+    def expire(self, before_us: int) -> int:
+        """Drop the telemetry that was pushed before a time; return how many frames that were."""
         dropped = 0
-        while self and self.size + len(frame) > self.max_bytes:
-            self.size -= len((self._usual or self._urgent or self._bulk).popleft()[0])
-            dropped += 1
-        queue.append((frame, step))
-        self.size += len(frame)
+        for queue in (self._usual, self._urgent):
+            while queue and queue[0][2] < before_us:
+                self._take(queue)
+                dropped += 1
         return dropped
 
     def pop(self) -> Waiting | None:
         """Return the frame that leaves next with its step, or None if nothing waits."""
+        urgent = self._answers or self._urgent
         others = bool(self._usual or self._bulk)
-        if self._urgent and not (others and self._run >= URGENT_RUN):
+        if urgent and not (others and self._run >= URGENT_RUN):
             self._run += 1
-            waiting = self._urgent.popleft()
-        elif others:
-            self._run = 0
-            self._bulk_turn = not self._bulk_turn
-            first, second = self._usual, self._bulk
-            if self._bulk_turn:
-                first, second = second, first
-            waiting = (first or second).popleft()
-        else:
+            return self._take(urgent)
+        if not others:
             return None
-        self.size -= len(waiting[0])
-        return waiting
+        self._run = 0
+        self._bulk_turn = not self._bulk_turn
+        first, second = self._usual, self._bulk
+        if self._bulk_turn:
+            first, second = second, first
+        return self._take(first or second)
 
     def clear(self) -> int:
         """Forget all that waits; return how many frames that were."""
         count = len(self)
-        for queue in (self._urgent, self._usual, self._bulk):
+        for queue in (self._answers, self._urgent, self._usual, self._bulk):
             queue.clear()
-        self.size = 0
+        self._sizes = [0, 0]
         return count
+
+    def _take(self, queue: "_Queue") -> Waiting:
+        frame, step, _ = queue.popleft()
+        self._sizes[queue is self._bulk] -= len(frame)
+        return frame, step
 
 
 class Packer:

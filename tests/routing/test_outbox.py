@@ -5,10 +5,10 @@ import random
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.routing.outbox import URGENT_RUN, Numbering, Outbox, Pacer, Packer
+from gateway.routing.outbox import BULK_BYTES, URGENT_RUN, Numbering, Outbox, Pacer, Packer
 from gateway.wire.mavlink_splitter import split_datagram
 
-ATTITUDE, RAW_IMU, PARAM_VALUE = 30, 27, 22
+HEARTBEAT, ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK = 0, 30, 27, 22, 77
 
 
 def drain(outbox: Outbox) -> list[bytes]:
@@ -41,19 +41,53 @@ class TestOutbox:
 
     def test_oldest_telemetry_goes_first_and_answers_last(self) -> None:
         outbox = Outbox(30)
-        outbox.push(b"b" * 10, PARAM_VALUE)
+        outbox.push(b"c" * 10, COMMAND_ACK)
         outbox.push(b"a" * 10, ATTITUDE)
         outbox.push(b"1" * 10, RAW_IMU)
         assert outbox.push(b"2" * 10, RAW_IMU) == 1
         assert outbox.push(b"A" * 10, ATTITUDE) == 1
-        assert outbox.push(b"B" * 10, PARAM_VALUE) == 1
-        assert sorted(drain(outbox)) == [b"A" * 10, b"B" * 10, b"b" * 10]
+        assert outbox.push(b"C" * 10, COMMAND_ACK) == 1
+        assert drain(outbox) == [b"c" * 10, b"C" * 10, b"A" * 10]
 
-    @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, PARAM_VALUE])
+    def test_an_answer_overtakes_the_attitude(self) -> None:
+        outbox = Outbox(1000)
+        for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK, HEARTBEAT):
+            outbox.push(bytes([message_id]), message_id)
+        order = [frame[0] for frame in drain(outbox)]
+        assert order == [COMMAND_ACK, HEARTBEAT, ATTITUDE, PARAM_VALUE, RAW_IMU]
+
+    def test_all_parameters_find_room_beside_the_telemetry_of_the_slowest_line(self) -> None:
+        outbox = Outbox(100)
+        for n in range(300):
+            assert outbox.push(n.to_bytes(2, "big") * 18, PARAM_VALUE) == 0
+            outbox.push(b"a" * 44, ATTITUDE)
+        parameters = [frame for frame in drain(outbox) if frame[:1] != b"a"]
+        assert parameters == [n.to_bytes(2, "big") * 18 for n in range(300)]
+        for _ in range(BULK_BYTES // 36 + 1):
+            outbox.push(b"b" * 36, PARAM_VALUE)
+        assert outbox.size <= BULK_BYTES
+
+    def test_old_telemetry_expires_and_answers_do_not(self) -> None:
+        outbox = Outbox(1000)
+        for now_us in (1, 2, 3):
+            for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK):
+                outbox.push(bytes([message_id, now_us]), message_id, None, now_us)
+        assert outbox.expire(3) == 4
+        assert sorted(drain(outbox)) == [
+            bytes([PARAM_VALUE, 1]),
+            bytes([PARAM_VALUE, 2]),
+            bytes([PARAM_VALUE, 3]),
+            bytes([RAW_IMU, 3]),
+            bytes([ATTITUDE, 3]),
+            *(bytes([COMMAND_ACK, now_us]) for now_us in (1, 2, 3)),
+        ]
+        assert outbox.size == 0
+
+    @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, COMMAND_ACK])
     def test_the_newest_is_always_taken(self, message_id: int) -> None:
         outbox = Outbox(30)
         for n in range(3):
-            outbox.push(bytes((n,)) * 10, (ATTITUDE, RAW_IMU, PARAM_VALUE)[n])
+            outbox.push(bytes((n,)) * 10, (ATTITUDE, RAW_IMU, COMMAND_ACK)[n])
         assert outbox.push(b"n" * 30, message_id) == 3
         assert drain(outbox) == [b"n" * 30]
 
@@ -64,11 +98,14 @@ class TestOutbox:
         for _ in range(2000):
             if rng.random() < 0.6:
                 frame = bytes(rng.randrange(8, 60))
-                dropped += outbox.push(frame, rng.choice((ATTITUDE, RAW_IMU, PARAM_VALUE)))
+                kinds = (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK)
+                dropped += outbox.push(frame, rng.choice(kinds), None, pushed)
                 pushed += 1
+            elif rng.random() < 0.05:
+                dropped += outbox.expire(pushed - 3)
             elif outbox.pop() is not None:
                 left += 1
-            assert outbox.size <= 500
+            assert outbox.size <= 500 + BULK_BYTES
         assert pushed == dropped + left + len(outbox)
         assert outbox.clear() == pushed - dropped - left
         assert (len(outbox), outbox.size, outbox.pop()) == (0, 0, None)

@@ -16,14 +16,23 @@ from gateway.edges.hub.listener import RETRY_US, Listener, Peer
 from gateway.routing.client_table import Presence, who_leaves
 from gateway.routing.endpoint import host_and_port
 from gateway.routing.outbox import Numbering, Outbox
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavlinkSplitter
 
 CHUNK_BYTES: Final = 4096
 """Joined into one write while a queue drains."""
+SLOW_CHUNK_BYTES: Final = 512
+"""Of a slow connection: what is joined can no longer be overtaken."""
 USER_TIMEOUT_MS: Final = 30_000
 """A peer that acknowledges nothing for so long is gone; a paused one may come back sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
-"""Small, so that frames wait in our queue, where old ones make room for new ones."""
+"""What the peer has not acknowledged, and is underway on a long link."""
+UNSENT_BYTES: Final = 2048
+"""What the kernel takes beyond that: frames shall wait in our queue, where the urgent go first."""
+PATIENCE_US: Final = US_PER_S
+"""A connection that needs longer for what waits is slow; after a stall one catches up sooner."""
+FRESH_US: Final = US_PER_S // 2
+"""Telemetry that has waited longer is not sent to a slow one."""
 ACCEPT_BACKLOG: Final = 128
 """Pages that connect again at once wait there, since each wake-up accepts one."""
 
@@ -33,6 +42,9 @@ class StreamClient(Client):
 
     _partial = b""
     _socket: socket.socket | None = None
+    _sending_us: int | None = None
+    """Since when it has sent what waits without coming to an end."""
+    _chunk_bytes = CHUNK_BYTES
 
     def __post_init__(self) -> None:
         """Start without a connection."""
@@ -54,7 +66,7 @@ class StreamClient(Client):
         self.counters.sent += 1
         step = self._numbering.enter(frame)
         if self._partial or self._outbox:
-            self._drop(self._outbox.push(frame, message_id, step))
+            self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
         else:
             self._write(self._socket, self.wrap(self._numbering.leave(frame, step)))
 
@@ -66,6 +78,7 @@ class StreamClient(Client):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, USER_TIMEOUT_MS // 2000)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock
         self._splitter.reset()
         self.loop.add_reader(sock, self._on_readable, sock)
@@ -83,7 +96,7 @@ class StreamClient(Client):
             self.loop.remove_writer(self._socket)
             self._socket.close()
             self._socket = None
-        self._partial = b""
+        self._partial, self._sending_us = b"", None
         self._drop(self._outbox.clear())
 
     def broke(self) -> None:
@@ -118,16 +131,27 @@ class StreamClient(Client):
         return not self._partial
 
     def _on_writable(self, sock: socket.socket) -> None:
+        self._note_pace(self.context.now_us())
         if self._partial and not self._write(sock, self._partial):
             return
         while data := self._next_chunk():
             if not self._write(sock, data):
                 return
         self.loop.remove_writer(sock)
+        self._sending_us = None
+
+    def _note_pace(self, now_us: int) -> None:
+        """Drop telemetry that is old on a connection that does not come to an end with it."""
+        if self._sending_us is None:
+            self._sending_us = now_us
+        is_slow = now_us - self._sending_us > PATIENCE_US
+        self._chunk_bytes = SLOW_CHUNK_BYTES if is_slow else CHUNK_BYTES
+        if is_slow:
+            self._drop(self._outbox.expire(now_us - FRESH_US))
 
     def _next_chunk(self) -> bytes:
         frames, size = [], 0
-        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+        while size < self._chunk_bytes and (waiting := self._outbox.pop()) is not None:
             frames.append(self.wrap(self._numbering.leave(*waiting)))
             size += len(frames[-1])
         return b"".join(frames)

@@ -18,6 +18,8 @@ from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
+ATTITUDE, COMMAND_ACK = 30, 77
+
 
 async def connect(rig: Any, port: int) -> socket.socket:
     client = socket.socket()
@@ -96,6 +98,55 @@ class TestTcpListen:
         late = await read_frames(stalled, slow.sent)
         assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
         assert hub.clients()[0].queued == 0
+
+    async def narrow_client(self, rig: Any, hub: Any) -> socket.socket:
+        """Connect with the smallest buffer that the kernel gives."""
+        client = socket.socket()
+        rig.closing.append(client.close)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
+        client.setblocking(False)
+        place = ("127.0.0.1", hub.listening_ports()[0])
+        await asyncio.get_running_loop().sock_connect(client, place)
+        await rig.until(lambda: len(hub.clients()) == 1)
+        return client
+
+    async def test_frames_wait_in_our_queue_and_not_in_the_kernels(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        await self.narrow_client(rig, hub)
+        for _ in range(5000):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            await asyncio.sleep(0)
+        assert hub.clients()[0].queued > 1000
+        assert hub.clients()[0].bytes_sent < 10_000
+
+    async def test_a_slow_client_gets_what_is_fresh_and_answers_first(self, rig: Any) -> None:
+        """It takes 2 kB a second of 10."""
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        slow = await self.narrow_client(rig, hub)
+        splitter, heard = MavlinkSplitter(), list[tuple[int, bytes]]()
+        for now_ms in range(0, 12_000, 20):
+            rig.clock.us += 20_000
+            for _ in range(5):
+                hub.send(rig.out(rig.vehicle.pack(attitude_at(now_ms))))
+            if now_ms == 8000:
+                hub.send(rig.out(rig.vehicle.pack(dialect.MAVLink_command_ack_message(512, 0))))
+            await asyncio.sleep(0)
+            with contextlib.suppress(BlockingIOError):
+                heard += [(now_ms, frame) for frame in splitter.feed(slow.recv(40))]
+        late_ms = [now_ms - time_of(f) for now_ms, f in heard if message_id_of(f) == ATTITUDE]
+        (answered_ms,) = [now_ms for now_ms, f in heard if message_id_of(f) == COMMAND_ACK]
+        assert len(late_ms) > 400
+        assert max(late_ms[200:]) < 3500
+        assert answered_ms < 10_000
+
+
+def attitude_at(time_ms: int) -> Any:
+    return dialect.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 1.0)
+
+
+def time_of(frame: bytes) -> int:
+    return int.from_bytes(frame[10:14], "little")
 
 
 class TestTcpOut:

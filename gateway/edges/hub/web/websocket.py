@@ -16,7 +16,7 @@ from typing import Final
 from wsproto.frame_protocol import CloseReason
 
 from gateway.edges.hub.client import HubContext
-from gateway.edges.hub.tcp import CHUNK_BYTES, StreamClient, StreamListener, TcpClient
+from gateway.edges.hub.tcp import StreamClient, StreamListener, TcpClient
 from gateway.edges.hub.web.tls_layer import TlsLayer, caller_context, server_context
 from gateway.edges.hub.web.ws_protocol import WsCaller, WsInput, WsProtocol, WsServer
 from gateway.edges.reasons import reason_of
@@ -94,7 +94,8 @@ class WebStream(StreamClient):
             super().transmit(frame, message_id)
             return
         self.counters.sent += 1
-        self._drop(self._outbox.push(frame, message_id, self._numbering.enter(frame)))
+        step = self._numbering.enter(frame)
+        self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
         if self._outbox.size >= self.endpoint.pack_bytes:
             self._flush()
         elif not self._is_gathering:
@@ -199,7 +200,7 @@ class WebStream(StreamClient):
         if not pack_bytes:
             return super()._next_chunk()
         messages, frames, size = [], b"", 0
-        while size < CHUNK_BYTES and (waiting := self._outbox.pop()) is not None:
+        while size < self._chunk_bytes and (waiting := self._outbox.pop()) is not None:
             frame = self._numbering.leave(*waiting)
             if frames and len(frames) + len(frame) > pack_bytes:
                 messages.append(self.wrap(frames))
