@@ -106,6 +106,12 @@ class _Lane:
         self.due_us = max(self.due_us, now_us - slack_us) + self.interval_us
         return True
 
+    def change(self, interval_us: int) -> None:
+        """Let the frame that is next be as far from the last one as later ones will be."""
+        if self.due_us:
+            self.due_us += interval_us - self.interval_us
+        self.interval_us = interval_us
+
 
 @dataclass(slots=True)
 class _Plan:
@@ -269,7 +275,7 @@ class Fanout:
                 outlet = self._outlets[lane.client_id]
                 if outlet.width is not None:
                     # In place: a new lane would send at once.
-                    lane.interval_us = outlet.interval_us(key, plan)
+                    lane.change(outlet.interval_us(key, plan))
                     is_stale |= (lane.interval_us > 0) != is_limited
         return is_stale
 

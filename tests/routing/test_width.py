@@ -98,6 +98,21 @@ def test_place_and_health_are_thinned_less_than_raw_numbers() -> None:
     assert parts[33] == pytest.approx(parts[24], rel=0.3)
 
 
+def test_telemetry_comes_back_soon_after_many_answers() -> None:
+    """All parameters within two seconds, as they are sent: four times what the link takes."""
+    flight = Flight("udp:h:1?budget=960")
+    flight.run(10)
+    usual = rates(flight.sinks[0].since(flight.run(10)), 10)
+    for number in range(110):
+        frame = b"\xfd\x19\0\0" + bytes([number, 1, 1, 22, 0, 0]) + bytes(27)
+        flight.fanout.answer(frame, [0])
+        flight.run(0.02)
+    flight.run(4)
+    again = rates(flight.sinks[0].since(flight.run(6)), 6)
+    for message_id, rate in usual.items():
+        assert again.get(message_id, 0.0) >= 0.5 * min(rate, 2.0) - 0.17
+
+
 def test_thinning_leaves_no_gap_in_the_numbers() -> None:
     flight = Flight("udp:h:1?budget=1500")
     flight.run(20)
