@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 READ_BYTES: Final = 4096
 AHEAD_US: Final = 30_000
 """Most in the driver's buffer: enough to keep the line busy between two wake-ups."""
-QUEUE_S: Final = 1.0
+QUEUE_US: Final = US_PER_S
 """What may wait, as time on the line; older telemetry is of no use on a radio."""
 MIN_QUEUE_BYTES: Final = 2048
 
@@ -42,7 +42,9 @@ class RadioClient(Client):
         """Start without a port."""
         super().__post_init__()
         baud = self.endpoint.port
-        self._outbox = Outbox(max(MIN_QUEUE_BYTES, round(QUEUE_S * baud / BITS_PER_BYTE)))
+        self._outbox = Outbox(
+            max(MIN_QUEUE_BYTES, round(QUEUE_US / US_PER_S * baud / BITS_PER_BYTE))
+        )
         self._pacer = Pacer(baud, AHEAD_US)
         self._numbering = Numbering(self.context.is_own, self.context.seal)
         self._splitter = MavlinkSplitter()
@@ -58,7 +60,8 @@ class RadioClient(Client):
             self.counters.dropped += 1
             return
         self.counters.sent += 1
-        self._drop(self._outbox.push(frame, message_id, self._numbering.enter(frame)))
+        step = self._numbering.enter(frame)
+        self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
         if self._timer is None and not self._partial:
             self._pump()
 
@@ -116,7 +119,9 @@ class RadioClient(Client):
 
     def _write(self, port: serial.Serial) -> bool:
         """Write one frame; if the driver is full, wait for it."""
+        now_us = self.context.now_us()
         if not self._partial:
+            self._drop(self._outbox.expire(now_us - QUEUE_US))
             waiting = self._outbox.pop()
             if waiting is None:
                 return False
@@ -129,7 +134,7 @@ class RadioClient(Client):
             self._broke(error)
             return False
         self.counters.bytes_sent += taken
-        self._pacer.wrote(taken, self.context.now_us())
+        self._pacer.wrote(taken, now_us)
         self._partial = self._partial[taken:]
         if self._partial:
             self.loop.add_writer(port.fileno(), self._on_writable, port)
