@@ -1,6 +1,8 @@
 """Tables of one aircraft behind one another, cut and moved in time."""
 
+import math
 from collections.abc import Iterator
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -21,16 +23,20 @@ from gateway.records import FusionState, NodeStatus
 
 Limits = tuple[Moment | None, Moment | None]
 
+OLDER: Final = "a recording is older than the first; give the oldest first"
+OVERLAP: Final = "{} rows that overlap with the recording before were left out"
+
 
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     """Put tables of one aircraft behind one another on the clock of the first.
 
-    Parts of one recording share a clock; other recordings are put in their place by civil time.
+    Parts of one recording share a clock; other recordings are put in their place by civil time,
+    and where two overlap, the later one is taken from the end of the earlier one on.
 
     Raises
     ------
     FlightError
-        If they are of several aircraft.
+        If they are of several aircraft; while the rows are read, if one is older than the first.
     """
     vehicles = sorted({table.header.vehicle_id for table in tables})
     if len(vehicles) > 1:
@@ -40,26 +46,55 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     remarks: list[str] = []
 
     def blocks() -> Iterator[TableBlock]:
-        known = first
+        known, first_us, newest_us = first, math.inf, -math.inf
         for table in tables:
-            header = table.header
+            header, left_out = table.header, 0
             if (header.settings, header.calibration) != (known.settings, known.calibration):
                 yield TableBlock(NO_ROWS, ((0, header),))
+            shift_us = _shift_us(header, first)
+            is_behind = shift_us is None or table is tables[0]
             for block in table.blocks:
                 for _, comment in block.comments:
                     known = comment if isinstance(comment, TableHeader) else known
-                yield shifted(block, _shift_us(header, first))
+                placed = shifted(block, shift_us or 0)
+                times_us = placed.cells[:, 0]
+                if len(block) and not is_behind:
+                    if times_us[0] < first_us:
+                        raise FlightError(OLDER)
+                    overlap = _first(times_us >= newest_us)
+                    placed, is_behind = _without(placed, overlap), overlap < len(block)
+                    left_out += overlap
+                first_us = times_us[:1].min(initial=first_us)
+                newest_us = times_us.max(initial=newest_us)
+                yield placed
             remarks.extend(table.remarks)
+            if left_out:
+                remarks.append(OVERLAP.format(left_out))
 
     return RecordedTable(first, blocks(), remarks)
 
 
-def _shift_us(header: TableHeader, first: TableHeader) -> int:
-    """Return how far two clocks are apart; the parts of a recording have one, by whatever name."""
-    if None in (header.unix_us_at_zero, first.unix_us_at_zero):
-        return 0
-    shift_us = (header.unix_us_at_zero or 0) - (first.unix_us_at_zero or 0)
-    return 0 if header.session == first.session or abs(shift_us) <= JUMP_US else shift_us
+def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
+    """Return how far two clocks are apart by civil time.
+
+    None where that does not tell: the parts of a recording have one clock, by whatever name.
+    """
+    zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
+    is_part = header.session != "" and header.session == first.session
+    if is_part or zero_us is None or first_zero_us is None:
+        return None
+    shift_us = zero_us - first_zero_us
+    return 0 if abs(shift_us) <= JUMP_US else shift_us
+
+
+def _without(block: TableBlock, count: int) -> TableBlock:
+    """Leave out the first rows, and what was remarked there; what was changed still holds."""
+    comments = tuple(
+        (max(row - count, 0), comment)
+        for row, comment in block.comments
+        if row >= count or isinstance(comment, TableHeader)
+    )
+    return TableBlock(block.cells[count:], comments)
 
 
 def shifted(block: TableBlock, shift_us: int) -> TableBlock:
