@@ -205,7 +205,8 @@ def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
             for track in tracks_of_table(table, aircraft_of(table, flight.options))
         ]
     if not found:
-        raise FlightError(f"{flight.title}: nothing to draw, since the flight has no position")
+        files = ", ".join(map(str, flight.files))
+        raise FlightError(f"{files}: nothing to draw, since the flight has no position")
     return found
 
 

@@ -14,6 +14,7 @@ from multiprocessing.synchronize import Event
 from typing import Any, Final, Protocol, TypeVar
 
 from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
+from gateway.edges.reasons import reason_of
 
 WAITING: Final = 2
 """Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""
@@ -100,8 +101,11 @@ def _run_in_one_pool(
 
 def failure_of(error: BaseException) -> WorkFailed:
     """Say what was wrong."""
-    is_plain = isinstance(error, WorkError)
-    return WorkFailed(str(error) if is_plain else f"{type(error).__name__}: {error}")
+    if isinstance(error, WorkError):
+        return WorkFailed(str(error))
+    if isinstance(error, OSError) and error.filename:
+        return WorkFailed(f"{error.filename}: {error.strerror or reason_of(error)}")
+    return WorkFailed(f"{type(error).__name__}: {error}")
 
 
 @contextmanager

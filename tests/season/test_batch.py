@@ -21,7 +21,7 @@ from gateway.pipeline import PipelineSettings
 from gateway.season.batch.flight_tasks import FlightResult, FuseTask, InfoTask, without_secrets
 from gateway.season.batch.result_folder import RESULTS, ResultFolder, read_results
 from gateway.season.batch.season_run import run_season
-from gateway.season.batch.storage import StorageError, items_of
+from gateway.season.batch.storage import BatchItem, StorageError, StoredFile, items_of
 from gateway.season.executors import LocalProcesses, WorkError, WorkFailed, failure_of
 
 pytestmark = pytest.mark.io
@@ -146,6 +146,13 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert again.find("k") == result
     (tmp_path / RESULTS / "k.json").write_bytes(b"")
     assert again.find("k") is None
+
+
+def test_a_file_that_has_gone_is_said_in_plain_words(season: Path, tmp_path: Path) -> None:
+    gone = tmp_path / "gone.csv"
+    items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((StoredFile(str(gone)),))]
+    results = run_season(InfoTask(OPTIONS), items, LocalProcesses(1), None, silent)
+    assert [result.error for result in results] == [None, f"{gone}: No such file or directory"]
 
 
 def test_two_batches_do_not_write_into_one_folder(season: Path, tmp_path: Path) -> None:

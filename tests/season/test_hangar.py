@@ -152,6 +152,19 @@ def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(tmp_path: Path) ->
     assert facts.gps_lost == pytest.approx(11.0, abs=1.5)
 
 
+def test_files_that_go_while_they_are_looked_for_stop_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [write_tlog(tmp_path / name) for name in ("a.tlog", "b.tlog")]
+    index_folder(tmp_path, OPTIONS, InThisProcess())
+    files[0].unlink()
+    monkeypatch.setattr(indexing, "recordings_below", lambda _: iter(files))
+    report = index_folder(tmp_path, OPTIONS, InThisProcess())
+    assert (report.read, report.broken, report.unchanged) == (1, 1, 1)
+    (row,) = find_flights(tmp_path, "error is not null")
+    assert (row["path"], row["error"]) == ("a.tlog", "No such file or directory")
+
+
 @pytest.mark.parametrize("name", ["a.tlog.gz", "packed.tlog"])
 def test_a_packed_file_is_known_by_its_first_bytes(tmp_path: Path, name: str) -> None:
     plain = write_tlog(tmp_path / "a.tlog").read_bytes()

@@ -91,7 +91,7 @@ def index_folder(
         wanted = [
             (str(path.relative_to(folder)), known[name][2] if name in known else "")
             for name, path in there.items()
-            if name not in known or _stamp(path) != known[name][:2]
+            if name not in known or _stamp_if_there(path) != known[name][:2]
         ]
         report = IndexReport(unchanged=len(there) - len(wanted), gone=len(gone))
         return _read_all(hangar, folder, options, executor, wanted, on_progress, report)
@@ -185,7 +185,7 @@ def _read_piece(folder: Path, options: ReadOptions, piece: list[Wanted]) -> list
 
 def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
     path = folder / name
-    size, modified_ns = _stamp(path) if path.exists() else (0, 0)
+    size, modified_ns = _stamp_if_there(path) or (0, 0)
     recording = as_text(recording_name(path))
     return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", reason)
 
@@ -193,6 +193,14 @@ def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
 def _stamp(path: Path) -> tuple[int, int]:
     found = path.stat()
     return found.st_size, min(found.st_mtime_ns, LATEST_NS)
+
+
+def _stamp_if_there(path: Path) -> tuple[int, int] | None:
+    """Return the same; None of a file that has gone meanwhile."""
+    try:
+        return _stamp(path)
+    except OSError:
+        return None
 
 
 def _may_be_recording(path: Path) -> bool:
