@@ -4,6 +4,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import islice
 from typing import Final
 
@@ -69,7 +70,9 @@ class FusedTlog:
 
     def close(self) -> None:
         """Delete the generated frames."""
-        self._file.close()
+        with suppress(OSError):
+            # What found no room is written again.
+            self._file.close()
 
     def _make(self) -> bool:
         """Generate some frames; return whether there were any."""

@@ -7,11 +7,12 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import BinaryIO, Final, cast
+from tempfile import NamedTemporaryFile, gettempdir
+from typing import IO, BinaryIO, Final, cast
 
 from gateway.flightlog.table.table import MAX_LINE, TableBlock, TableReader
 from gateway.flightlog.tlog.tlog import Batch, TlogScanner
@@ -157,6 +158,38 @@ def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]
             if progress is not None:
                 progress(raw.tell() - done)
                 done = raw.tell()
+
+
+@contextmanager
+def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
+    """Have a file's content in a temporary one, which nobody cuts while it is read.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for an error.
+    content : iterable of bytes
+        Its bytes, unpacked.
+
+    Raises
+    ------
+    OSError
+        If there is no room for it.
+    """
+    copy = NamedTemporaryFile(prefix="mavgate-")  # noqa: SIM115
+    try:
+        for data in content:
+            copy.write(data)
+        copy.flush()
+    except OSError as error:
+        with suppress(OSError):
+            copy.close()
+        if error.filename is not None:
+            raise
+        why = f"{error.strerror} for a copy of {path}; TMPDIR names another folder"
+        raise OSError(error.errno, why, gettempdir()) from error
+    with copy:
+        yield copy
 
 
 def read_ends(path: Path) -> tuple[bytes, bytes]:

@@ -2,10 +2,15 @@
 
 import os
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Final
 
-from gateway.edges.disk.recording_streams import Progress, is_packed, open_descriptor, read_chunks
+from gateway.edges.disk.recording_streams import (
+    Progress,
+    is_packed,
+    open_descriptor,
+    read_chunks,
+    temporary_copy,
+)
 from gateway.flightlog.answers import LogAnswers
 from gateway.flightlog.tlog.tlog import TlogIndex, TlogScanner
 
@@ -37,7 +42,7 @@ class TlogFile:
         self, path: Path, progress: Progress | None = None, answers: LogAnswers | None = None
     ) -> None:
         self.path = path
-        self._file = _open_unpacked_copy(path) if is_packed(path) else open_descriptor(path)
+        self._file = _unpacked(path) if is_packed(path) else open_descriptor(path)
         self.index = TlogIndex()
         scanner = TlogScanner()
         offset = 0
@@ -73,10 +78,7 @@ class TlogFile:
         os.close(self._file)
 
 
-def _open_unpacked_copy(path: Path) -> int:
-    """Open a temporary copy without a name, since a packed file cannot be read at any position."""
-    with TemporaryFile() as plain:
-        for data in read_chunks(path):
-            plain.write(data)
-        plain.flush()
+def _unpacked(path: Path) -> int:
+    """Open a copy, since a packed file cannot be read at any position."""
+    with temporary_copy(path, read_chunks(path)) as plain:
         return os.dup(plain.fileno())

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import re
-import tempfile
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Final
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-from gateway.edges.disk.recording_streams import read_chunks
+from gateway.edges.disk.recording_streams import read_chunks, temporary_copy
 from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
@@ -81,11 +80,10 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
     first = next(content, b"")
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text
-    with tempfile.NamedTemporaryFile() as plain:
-        for data in chain([first], content):
-            # A byte that is not text must not stop the reading.
-            plain.write(data if is_binary else data.translate(_AS_TEXT))
-        plain.flush()
+    # A byte that is not text must not stop the reading.
+    all_of_it = chain([first], content)
+    sound = all_of_it if is_binary else (data.translate(_AS_TEXT) for data in all_of_it)
+    with temporary_copy(path, sound) as plain:
         log = kind.__new__(kind)
         # The fast indexer prints to the terminal directly, not through Python.
         log.init_arrays_fast = log.init_arrays

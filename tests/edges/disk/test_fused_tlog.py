@@ -1,12 +1,16 @@
 """A tlog that is made while it is played."""
 
 import asyncio
+import tempfile
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import pytest
 
+from gateway.edges.disk import recording_streams
 from gateway.edges.disk.fused_tlog import PIECE, FusedTlog
 from gateway.edges.disk.player_edge import PlayerEdge
+from gateway.edges.disk.recording_streams import temporary_copy
 from gateway.flightlog.playback import Player
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flightlog.track import Track
@@ -103,3 +107,32 @@ async def test_the_old_place_plays_on_until_a_seek_is_ready(
     assert frames[-1] == RECORDS[15_000_000 // STEP_US].frame
     assert making.made < len(RECORDS)
     edge.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_ends_the_playback_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("w+b"))  # noqa: SIM115
+    file = FusedTlog(iter(RECORDS))
+    assert file.prepare(RECORDS[-1].time_us)
+    assert "The rest cannot be played" in caplog.text
+    file.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_copy_that_finds_no_room_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.bin"
+    monkeypatch.setattr(
+        recording_streams,
+        "NamedTemporaryFile",
+        lambda **_: Path("/dev/full").open("wb"),  # noqa: SIM115
+    )
+    with (
+        pytest.raises(OSError, match=f"No space left on device for a copy of {path}") as caught,
+        temporary_copy(path, [b"1"]),
+    ):
+        pass
+    assert caught.value.filename == tempfile.gettempdir()
