@@ -23,6 +23,9 @@ from gateway.records import FusionState, NodeStatus
 
 Limits = tuple[Moment | None, Moment | None]
 
+NOTHING_WITHIN: Final = (
+    "there is nothing between that begin and end; `mavgate info` shows the length"
+)
 OLDER: Final = "a recording is older than the first; give the oldest first"
 OVERLAP: Final = "{} rows that overlap with the recording before were left out"
 
@@ -114,13 +117,19 @@ def _moved(comment: TableComment, shift_us: int) -> TableComment:
 
 
 def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
-    """Cut a table at its begin and end, each a moment or None."""
+    """Cut a table at its begin and end, each a moment or None.
+
+    Raises
+    ------
+    FlightError
+        While the rows are read, if none is between them.
+    """
     begin, end = limits
     zero_us = table.header.unix_us_at_zero or 0
 
     def blocks() -> Iterator[TableBlock]:
         first_us: int | None = None
-        begun = begin is None
+        begun, count = begin is None, 0
         for block in table.blocks:
             times_us = zero_us + block.cells[:, 0]
             if first_us is None and len(block):
@@ -138,8 +147,11 @@ def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
                 if k <= stop and (was_begun or (begun and k > start) or isinstance(c, TableHeader))
             )
             yield TableBlock(block.cells[start:stop], comments)
+            count += stop - start
             if stop < len(block):
-                return
+                break
+        if not count and limits != (None, None):
+            raise FlightError(NOTHING_WITHIN)
 
     cold_start = table.header.cold_start and begin is None
     return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), blocks())

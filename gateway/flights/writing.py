@@ -16,7 +16,7 @@ from gateway.flightlog.table.table import encode_block, encode_head
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord, encode_record
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
-from gateway.flights.joined import Limits, joined_tables, trimmed
+from gateway.flights.joined import NOTHING_WITHIN, Limits, joined_tables, trimmed
 from gateway.flights.map_tracks import tracks_of_frames, tracks_of_table
 from gateway.flights.reading import (
     ReadOptions,
@@ -239,9 +239,13 @@ add_writer(".parquet", _packaged("parquet_file", "Parquet"), Lacks(of_tlogs=NOT_
 def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:
     begin, end = limits
     first_us: int | None = None
+    is_empty = limits != (None, None)
     for record in records:
         first_us = record.time_us if first_us is None else first_us
         if end is not None and record.time_us > place_in(end, first_us):
-            return
+            break
         if begin is None or record.time_us >= place_in(begin, first_us):
             yield record
+            is_empty = False
+    if is_empty:
+        raise FlightError(NOTHING_WITHIN)

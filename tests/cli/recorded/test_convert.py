@@ -74,6 +74,18 @@ def test_trim_a_tlog(tlog: Path, tmp_path: Path) -> None:
     assert read_tlog(out) == RECORDS[100:201]
 
 
+@pytest.mark.parametrize("ending", ["csv", "tlog", "kml", "parquet"])
+@pytest.mark.parametrize("options", [("--from", "99:00"), ("--from", "2100-01-01T00:00:00Z")])
+def test_a_stretch_that_holds_nothing_is_refused(
+    tlog: Path, table: Path, tmp_path: Path, ending: str, options: tuple[str, str]
+) -> None:
+    for source in (tlog, table) if ending in ("tlog", "kml") else (table,):
+        out = tmp_path / f"out.{ending}"
+        text = run("convert", source, "-o", out, *options, code=2)
+        assert "nothing between that begin and end" in " ".join(text.split())
+        assert not out.exists()
+
+
 def test_join_tlogs_by_time(tmp_path: Path) -> None:
     for name, records in (("a", RECORDS[::2]), ("b", RECORDS[1::2])):
         (tmp_path / f"{name}.tlog").write_bytes(make_tlog(records))
