@@ -1,4 +1,4 @@
-"""Whether the place is as accurate as it is told, with GPS and without."""
+"""Whether place and level are as accurate as they are told, with GPS and in outages."""
 
 import math
 from pathlib import Path
@@ -34,7 +34,7 @@ from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, correlated, estimator_of
 from tools.flights import Flight, north_east_m, read_flight, simulated_flight
-from tools.score_estimators import Run, outages, run_complementary
+from tools.score_estimators import Run, outages, run_complementary, run_eskf, run_smoothed
 from tools.score_honesty import share, two_sigma
 
 FIELD_N_UT = (21.0, 0.0, 43.0)
@@ -116,6 +116,16 @@ def test_a_real_outage_is_as_far_off_as_told(data_dir: Path, length_s: float) ->
     within, ratio = outage_ratio(flight, run_complementary, length_s)
     assert within > 0.95
     assert 0.7 < ratio < 1.1
+
+
+@pytest.mark.parametrize("run", [run_complementary, run_eskf, run_smoothed])
+def test_a_real_outage_tilts_by_no_more_than_told(data_dir: Path, run: Run) -> None:
+    """That aircraft loops and rolls: force turns what its gyroscope tells."""
+    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    within = [
+        two_sigma(flight, out)["tilt"][inside] for out, inside, _ in outages(flight, run, 10.0)
+    ]
+    assert 0.9 < share(np.concatenate(within)) < 0.98
 
 
 def test_a_simulated_outage_is_as_far_off_as_told() -> None:

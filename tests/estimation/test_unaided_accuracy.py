@@ -20,10 +20,14 @@ from gateway.estimation.columns import (
     IMU_COLUMNS,
     MAG,
     NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
 )
+from gateway.estimation.eskf.covariance import GYRO_BY_FORCE, propagate
+from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
-from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, STATES, TILT, EskfState
 from gateway.estimation.eskf.level_doubt import doubt_level
+from gateway.estimation.eskf.measure import update_by_velocity
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
@@ -99,6 +103,28 @@ def test_doubt_of_the_level_leaves_what_gravity_showed(rng: np.random.Generator)
     np.testing.assert_allclose(rows @ s.P @ rows.T, 0.0, atol=1e-12)
     assert math.degrees(math.sqrt(s.P[TILT, TILT])) > 0.2
     assert np.linalg.eigvalsh(s.P).min() > -1e-12
+
+
+def test_what_force_turns_is_told_until_it_is_found_out() -> None:
+    """It changes nothing else: the tilt's covariance, and so the estimate, is the same."""
+    gains = make_gains(EskfSettings(), ReferenceSettings(), RestSettings(), CompassSettings())
+    seconds, accel_mps2, runs = 5.0, 2.0 * G, []
+    for accel in (0.0, accel_mps2):
+        s, row = new_record(EskfState), np.zeros(NAV_COLUMNS)
+        s.started, s.iron_search_started, s.q_nb[0] = 1, 1, 1.0
+        s.P[:] = 1e-4 * np.eye(STATES)
+        s.pending_s, s.pending_accel_sq = seconds, accel * accel * seconds
+        s.pending_force_n[:] = (0.0, 0.0, -G * seconds)
+        propagate(s, gains)
+        level, told = s.P[TILT, TILT], []
+        for _ in range(2):
+            write_output(s, row)
+            told.append(row[NAV_ATTITUDE_STD] ** 2 - s.P[TILT, TILT])
+            update_by_velocity(s, gains, 0.1)
+        runs.append((level, *told))
+    assert runs[0] == (runs[1][0], pytest.approx(0.0, abs=1e-15), pytest.approx(0.0, abs=1e-15))
+    assert runs[1][1] == pytest.approx((GYRO_BY_FORCE * accel_mps2) ** 2 * seconds)
+    assert 0.0 < runs[1][2] < 0.7 * runs[1][1]
 
 
 def test_a_heading_without_declination_is_as_good_as_told() -> None:

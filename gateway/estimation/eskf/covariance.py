@@ -31,11 +31,14 @@ from gateway.estimation.filtering.covariance_scale import limit_variance, scale_
 from gateway.estimation.filtering.roughness import note_force_noise
 from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 MOVED: Final = POS + 3
 """The transition changes the first states alone: attitude, velocity, place."""
 SCALE_S: Final = 1.0
 """An acceleration keeps its axis in the body for about this time, and its error its sign."""
+GYRO_BY_FORCE: Final = 0.1 * RAD_PER_DEG / STANDARD_GRAVITY_MPS2
+"""Force beside gravity turns what an MPU6050's gyroscope tells by 0.1 deg/s for each g."""
 MAX_WANDER_SIGMA: Final = 3.0
 """What the fixes are off beyond this is no slow error of theirs but the filter's."""
 MAX_TILT_VAR: Final = 3.0
@@ -58,6 +61,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     apply_transition(s, s.P, MOVED)
     symmetrise(s.P)
     turned = p.gyro_roughness_sq * s.rough_gyro + p.gyro_turn_var * s.pending_rad + s.clipped_rad2
+    s.force_turn_var += GYRO_BY_FORCE**2 * SCALE_S * s.pending_accel_sq
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
     pulled += s.clipped_m2ps2
     note_force_noise(s, dt)

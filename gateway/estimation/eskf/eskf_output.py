@@ -71,7 +71,8 @@ def write_output(s: EskfState, row: FloatArray) -> None:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
         for k in range(2):
             told = row[NAV_ATTITUDE_STD + k]
-            row[NAV_ATTITUDE_STD + k] = math.sqrt(told * told + standing_level_var(s))
+            lasting = standing_level_var(s) + s.force_turn_var
+            row[NAV_ATTITUDE_STD + k] = math.sqrt(told * told + lasting)
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_place(s, row)
 

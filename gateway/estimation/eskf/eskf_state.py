@@ -107,6 +107,9 @@ class EskfState(FilterState):
     """Of the slow error of the GPS position, by the receiver's own word where it gives one, m2."""
     place_density: Annotated[FloatArray, (3,)]
     """Density of the noise by which the place runs away: slow errors of GPS velocities, m2/s."""
+    force_turn_var: float
+    """Variance of the attitude about an axis by what force does to a gyroscope, rad2: it is told
+    beside `P`, and fades as that is reduced."""
     bias_raised: Annotated[FloatArray, (3,)]
     """Sum of what doubt has added to the variance of the gyroscope's bias, rad2/s2."""
     renewals: Annotated[FloatArray, (STATES,)]

@@ -203,6 +203,18 @@ def place_distance_sq(
 
 
 @compiled
+def level_variance(s: EskfState) -> float:
+    """Return the variance of the tilt, rad2."""
+    return float(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
+
+
+@compiled
+def fade_force_turn(s: EskfState, level_before: float) -> None:
+    """Take what force has turned to be found out as far as the rest of the tilt is."""
+    s.force_turn_var *= level_variance(s) / level_before
+
+
+@compiled
 def update_by_fix(
     s: EskfState,
     p: EskfGains,
@@ -230,7 +242,7 @@ def update_by_fix(
     lag : float
         Age of the fix, s.
     """
-    before = s.P[TILT + 2, TILT + 2]
+    before, level = s.P[TILT + 2, TILT + 2], level_variance(s)
     late_pos, late_vel = delay_variances(s, p, once, lag)
     repeated = max(1.0, p.velocity_correlation_s / max(s.time_s - s.fix_s, 0.05))
     north, east, _ = mean_acceleration(once, lag)
@@ -249,6 +261,7 @@ def update_by_fix(
             s, off_pos[k], reported_variance(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq
         )
     s.compass_share *= s.P[TILT + 2, TILT + 2] / before
+    fade_force_turn(s, level)
     inject(s)
 
 
@@ -313,6 +326,7 @@ def update_by_baro(s: EskfState, p: EskfGains, down_m: float) -> None:
 def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
     """Update by a velocity of about zero, for want of better."""
     propagate(s, p)
+    level = level_variance(s)
     for k in range(3):
         clear(s)
         s.h[VEL + k] = 1.0
@@ -321,6 +335,7 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
     for k in range(6):
         s.assumed[k] += s.dx[TILT + k]
+    fade_force_turn(s, level)
     inject(s)
 
 
@@ -338,6 +353,7 @@ def take_back(s: EskfState) -> None:
 def update_by_rest(s: EskfState, p: EskfGains) -> None:
     """Update by standing still: no velocity, and a rate that is the bias."""
     propagate(s, p)
+    level = level_variance(s)
     rate = as_vec(s.gyro_rest)
     for k in range(3):
         clear(s)
@@ -347,4 +363,5 @@ def update_by_rest(s: EskfState, p: EskfGains) -> None:
         clear(s)
         s.h[VEL + k] = 1.0
         update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
+    fade_force_turn(s, level)
     inject(s)

@@ -46,6 +46,7 @@ def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: fl
     propagate(s, p)
     renew(s, TILT, level_var)
     renew(s, TILT + 1, level_var)
+    s.force_turn_var = 0.0
     renew(s, TILT + 2, heading_var)
     s.compass_share = 0.0
     for k in range(3):
