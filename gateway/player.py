@@ -18,6 +18,7 @@ from gateway.edges.operator.control_verbs import PlayerVerbs
 from gateway.flightlog.answers import VehicleAnswers
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import Player
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.opening import PlayedFlight
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.endpoint import parse_endpoint, stays_here
@@ -49,12 +50,17 @@ class PlayPlan:
 
 
 def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
-    """Fuse tables up to the requested start."""
+    """Fuse tables up to the requested start; raises FlightError if the flights end before."""
     tracks = [track for flight in flights for track in flight.tracks]
     if plan.begin is not None:
         begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
         while not all(track.prepare(begin_us) for track in tracks):
             pass
+        if begin_us > (end_us := max(track.last_us for track in tracks)):
+            first_us = min(track.first_us for track in tracks)
+            raise FlightError(
+                f"it ends after {(end_us - first_us) / US_PER_S:.1f} s, before --from"
+            )
 
 
 def endpoints_beyond(settings: HubSettings) -> list[str]:

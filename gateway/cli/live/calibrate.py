@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from gateway.cli.support.errors import refuse
+from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -91,7 +92,7 @@ def calibrate(
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
     log: Annotated[
         Path | None,
-        typer.Option("--log", help="Calibrate from a recording instead of the live link."),
+        typer.Option("--log", help="Calibrate from a recording, by name or file, instead."),
     ] = None,
     port: Annotated[
         str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
@@ -220,6 +221,7 @@ def _log_step(
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
     raws, moving, fix = list[ImuRaw](), list[bool](), _Fix()
     with refusing():
+        (path, *_) = files_of([path], folder_of(settings), "tables")
         table = open_rows(path, ReadOptions(current=PipelineSettings(settings.default_aircraft)))
         for row in table.plain_rows:
             if row.gps is not None and row.gps.node.vehicle_id == vehicle:

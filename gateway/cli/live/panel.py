@@ -14,6 +14,7 @@ from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
+from gateway.routing.endpoint import parse_endpoint
 
 
 def register(app: typer.Typer) -> None:
@@ -59,6 +60,8 @@ def panel(
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = Path(settings.recording.folder).expanduser()
     try:
+        if connect is not None:
+            parse_endpoint(connect)
         run_panel(wanted, folder, connect, socket, _show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))

@@ -20,7 +20,7 @@ from gateway.cli.support.recording_options import (
     print_remarks,
     progress_of,
     read_column_map,
-    read_moment,
+    read_range,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -95,7 +95,7 @@ def convert(
             system_id=system,
             progress=advance,
         )
-        limits = (read_moment(begin), read_moment(end))
+        limits = read_range(begin, end)
         flight = FlightToWrite(
             files,
             options,

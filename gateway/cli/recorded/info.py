@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 SHOWN: Final = 8
 """Gaps and damaged places that are listed one by one."""
 
+EARLIEST_US: Final = 366 * 86_400 * US_PER_S
+"""Times before, in µs since 1970, are those since a start, as in other programs' logs."""
+
 Report = Callable[[str], None]
 
 
@@ -152,7 +155,8 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
-    console.print(f"{file}: {found.kind}, {found.size / 1e6:.3f} MB")
+    kind = "another program's CSV" if found.kind == "foreign" else found.kind
+    console.print(f"{file}: {kind}, {found.size / 1e6:.3f} MB")
     console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:
         head = found.header
@@ -211,6 +215,9 @@ def _when(found: FileInfo) -> str:
         zero_us = found.header.unix_us_at_zero
         begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
     if begin_us is None:
+        return ""
+    if begin_us < EARLIEST_US:
+        # Seconds since a start, as in other programs' logs.
         return ""
     moment = civil_time(begin_us)
     return (

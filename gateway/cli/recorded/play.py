@@ -30,7 +30,7 @@ from gateway.cli.support.recording_options import (
     ToOption,
     progress_of,
     read_column_map,
-    read_moment,
+    read_range,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -124,7 +124,7 @@ def play(
         _ask_for_commands(gateway)
     with ExitStack() as opened, refusing():
         plan = PlayPlan(
-            read_moment(begin), read_moment(end), _speed(speed), skip_gaps, loop, paused,
+            *read_range(begin, end), _speed(speed), skip_gaps, loop, paused,
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
         files = files_of(files, recordings_folder(config), "tlogs")

@@ -68,6 +68,17 @@ def read_moment(text: str | None) -> Moment | None:
         raise FlightError(str(error)) from error
 
 
+def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Moment | None]:
+    """Read --from and --to; raises FlightError if one is invalid, or nothing lies between them."""
+    first, last = read_moment(begin), read_moment(end)
+    both = None not in (first, last)
+    for unit in ("offset_s", "time_us"):
+        low, high = getattr(first, unit, None), getattr(last, unit, None)
+        if both and low is not None and high is not None and low >= high:
+            raise FlightError(f"nothing lies between --from {begin} and --to {end}")
+    return first, last
+
+
 @contextmanager
 def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
     """Show the progress of reading, on a terminal."""

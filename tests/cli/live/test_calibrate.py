@@ -141,9 +141,9 @@ def test_the_gyroscope_from_a_flight(tmp_path: Path, config: Path) -> None:
         if isinstance(record, ImuRaw | GpsFix):
             kind = "raw" if isinstance(record, ImuRaw) else "gps"
             lines.append(row_to_line(TableRow(record.time_us, **{kind: record})))
-    log = tmp_path / "flight.csv"
-    log.write_text("".join(lines))
-    output = run(config, "gyro", "--log", str(log))
+    (tmp_path / "flight_01_v3.csv").write_text("".join(lines))
+    config.write_text(f'{config.read_text()}[recording]\nfolder = "{tmp_path}"\n')
+    output = run(config, "gyro", "--log", "flight")
     saved = load_aircraft(load(config))[3].calibration
     assert "gyro: done" in output
     off = np.subtract(saved.gyro_bias_radps, flight.errors.gyro_bias_radps)

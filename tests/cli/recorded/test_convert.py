@@ -247,10 +247,16 @@ def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
     [
         (("-o", "x.txt"), "must end in"),
         (("-o", "x.tlog", "--from", "soon"), "no moment"),
+        (("-o", "x.tlog", "--from", "4", "--to", "2"), "nothing lies between --from 4 and --to 2"),
     ],
 )
 def test_wrong_wishes_are_refused(tlog: Path, args: tuple[str, ...], text: str) -> None:
     assert text in " ".join(run("convert", tlog, *args, code=2).split())
+
+
+def test_a_beginning_behind_the_end_is_refused(tlog: Path) -> None:
+    text = run("play", tlog, "--from", "1:30", "--endpoint", "udp:127.0.0.1:1", code=2)
+    assert "it ends after 10.0 s, before --from" in text
 
 
 def test_info_for_programs(tlog: Path, table: Path) -> None:
