@@ -118,3 +118,10 @@ class EskfState(FilterState):
     """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
     contradiction_m: float
     """By how much the last two fixes did; the true place may be either."""
+    weighed_s: float
+    """Arrival of the last fix that was weighed, accepted or not."""
+    doubt_vel_sq: float
+    doubt_pos_sq: float
+    """Variance by which fixes are off of late beyond what is expected, per axis, m2/s2 and m2."""
+    manoeuvre_mps2: float
+    """Hardest acceleration of late."""

@@ -20,7 +20,6 @@ from gateway.estimation.eskf.measure import (
 from gateway.estimation.eskf.recovery import lose_attitude, review_attitude, turn_heading
 from gateway.estimation.eskf.start import (
     bridge_gap,
-    relock_at,
     restart_at,
     start_height,
 )
@@ -96,7 +95,7 @@ def align(s: EskfState, p: EskfGains, valid_s: float, pos: Vec3, told: Vec3) -> 
 
 @compiled
 def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Update by a fix that lies near, reject one that does not, relock on those that insist."""
+    """Update by a fix, hardly by one that does not lie near; relock on those that insist."""
     propagate(s, p)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
     past_pos, past_vel = past_state(s, s.then, lag)
@@ -111,11 +110,13 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
     unlikely = place_distance_sq(s, p, row, off_pos, once, twice, lag) > p.gate_sq
     off_m = math.hypot(off_pos[0], off_pos[1])
     note_contradiction(s, off_m if unlikely else 0.0)
-    if not unlikely or off_m < p.gate_m:
-        update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
+    far = unlikely and off_m >= p.gate_m
+    if far and is_relocked(s, p.gps_relock_s, pos, vel):
+        restart_at(s, p, pos, as_vec(s.fix_vel), lag)
         accept_fix(s)
-    elif is_relocked(s, p.gps_relock_s, pos, vel):
-        relock_at(s, p, pos, as_vec(s.fix_vel), lag)
+        return
+    update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
+    if not far:
         accept_fix(s)
 
 

@@ -17,6 +17,7 @@ from gateway.estimation.eskf.covariance import (
     clear,
     consider,
     inject,
+    innovation_variance,
     normalised_innovation_sq,
     propagate,
     update_scalar,
@@ -32,6 +33,14 @@ from gateway.estimation.eskf.eskf_state import (
     VEL,
     WANDER,
     EskfState,
+)
+from gateway.estimation.eskf.fix_doubt import (
+    DOUBT_PLACE_SQ,
+    MOST_M,
+    MOST_MPS,
+    fade_doubt,
+    lag_variance,
+    lasting_excess,
 )
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
@@ -63,6 +72,8 @@ error by it lasts as long, for it changes with the attitude alone."""
 VELOCITY_GATE_SQ: Final = 9.0
 """A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
 FAR_SQ: Final = 1e12
+LEAST_S: Final = 0.05
+"""Fixes closer together count as that far apart."""
 
 
 @compiled
@@ -165,6 +176,13 @@ def velocity_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int) -> fl
 
 
 @compiled
+def place_variance(p: EskfGains, row: FloatArray, k: int) -> float:
+    """Return the noise of one coordinate of a fix from one to the next, m2."""
+    usual = p.gps_position_var if k < 2 else p.gps_height_var
+    return reported_variance(usual, row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC], NOISE_SHARE)
+
+
+@compiled
 def mean_acceleration(once: Vec3, lag: float) -> Vec3:
     """Return the mean acceleration over the lag, m/s2; `once` as of `lag_integrals`."""
     span = max(lag, 0.02)
@@ -194,11 +212,11 @@ def place_distance_sq(
         The larger normalised innovation squared of north and east.
     """
     worst = 0.0
-    variance = reported_variance(p.gps_position_var, row[GPS_H_ACC], NOISE_SHARE)
     late, _ = delay_variances(s, p, once, lag)
     for k in range(2):
         position_row(s, k, once, twice, lag)
-        worst = max(worst, normalised_innovation_sq(s, off_pos[k], variance + late[k]))
+        variance = place_variance(p, row, k) + late[k]
+        worst = max(worst, normalised_innovation_sq(s, off_pos[k], variance))
     return worst
 
 
@@ -225,7 +243,7 @@ def update_by_fix(
     twice: Vec3,
     lag: float,
 ) -> None:
-    """Update by an accepted fix: three velocities, three positions.
+    """Update by a fix: three velocities, three positions, the less the more it is doubted.
 
     Parameters
     ----------
@@ -243,23 +261,35 @@ def update_by_fix(
         Age of the fix, s.
     """
     before, level = s.P[TILT + 2, TILT + 2], level_variance(s)
+    since = max(s.time_s - s.weighed_s, LEAST_S)
+    s.weighed_s = s.time_s
+    accel = mean_acceleration(once, lag)
+    fade_doubt(s, accel, since)
     late_pos, late_vel = delay_variances(s, p, once, lag)
-    repeated = max(1.0, p.velocity_correlation_s / max(s.time_s - s.fix_s, 0.05))
-    north, east, _ = mean_acceleration(once, lag)
-    unexpected = lasting_noise_sq(s, north * north + east * east, s.time_s - s.fix_s)
+    repeated = max(1.0, p.velocity_correlation_s / since)
+    unexpected = lasting_noise_sq(s, accel[0] * accel[0] + accel[1] * accel[1], since)
+    # All of a fix is weighed before any of it is used: a glitch that shows in one axis spoils all.
     for k in range(3):
-        acc = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
-            noise = repeated * velocity_variance(s, p, row, k) + late_vel[k]
-            update_scalar(s, off_vel[k], max(noise, unexpected), VELOCITY_GATE_SQ)
-        if not math.isfinite(off_pos[k]):
-            continue
-        position_row(s, k, once, twice, lag)
-        noise = p.gps_position_var if k < 2 else p.gps_height_var
-        update_scalar(
-            s, off_pos[k], reported_variance(noise, acc, NOISE_SHARE) + late_pos[k], p.gate_sq
-        )
+            noise = max(repeated * velocity_variance(s, p, row, k) + late_vel[k], unexpected)
+            explained = innovation_variance(s, noise) + lag_variance(s)
+            excess = lasting_excess(off_vel[k], MOST_MPS, explained, VELOCITY_GATE_SQ, since)
+            s.doubt_vel_sq = max(s.doubt_vel_sq, excess)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            explained = innovation_variance(s, place_variance(p, row, k) + late_pos[k])
+            excess = lasting_excess(off_pos[k], MOST_M, explained, DOUBT_PLACE_SQ, since)
+            s.doubt_pos_sq = max(s.doubt_pos_sq, excess)
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            noise = max(repeated * velocity_variance(s, p, row, k) + late_vel[k], unexpected)
+            update_scalar(s, off_vel[k], noise + s.doubt_vel_sq, VELOCITY_GATE_SQ)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            noise = place_variance(p, row, k) + late_pos[k]
+            update_scalar(s, off_pos[k], noise + s.doubt_pos_sq, p.gate_sq)
     s.compass_share *= s.P[TILT + 2, TILT + 2] / before
     fade_force_turn(s, level)
     inject(s)

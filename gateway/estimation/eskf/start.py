@@ -47,7 +47,6 @@ GAP_REST_RATE: Final = 0.02
 GAP_HAND_RATE: Final = 0.3
 """What flies goes straight on, but a hand turns as it likes."""
 GAP_ACCEL_MPS2: Final = 3.0
-RELOCK_HEADING_VAR: Final = 0.3**2
 
 
 @compiled
@@ -71,7 +70,8 @@ def start(s: EskfState, p: EskfGains) -> None:
 @compiled
 def forget_times(s: EskfState) -> None:
     """Drop all that is tied to the clock."""
-    s.mag_s = s.mag_used_s = s.fix_s = s.pair_s = s.baro_s = s.pseudo_s = NEVER_S
+    s.mag_s = s.mag_used_s = s.fix_s = s.weighed_s = NEVER_S
+    s.pair_s = s.baro_s = s.pseudo_s = NEVER_S
     s.reject_last[0] = NEVER_S
     forget_velocities(s)
     s.reject_s = s.rest_s = 0.0
@@ -161,6 +161,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         doubt_level(s, p)
         start_iron_search(s)
     s.off_last_m = s.contradiction_m = 0.0
+    s.doubt_vel_sq = s.doubt_pos_sq = 0.0
 
 
 @compiled
@@ -200,13 +201,6 @@ def start_position(s: EskfState, k: int, value: float, noise_var: float) -> None
     renew(s, POS + k, wander_var + noise_var)
     renew(s, WANDER + k, wander_var)
     set_covariance(s, POS + k, WANDER + k, -wander_var)
-
-
-@compiled
-def relock_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Start anew where fixes have insisted; whatever was wrong may be the heading."""
-    restart_at(s, p, pos, vel, lag)
-    s.P[TILT + 2, TILT + 2] += RELOCK_HEADING_VAR
 
 
 @compiled
