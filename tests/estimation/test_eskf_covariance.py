@@ -135,6 +135,7 @@ def test_a_heading_of_which_nothing_is_known_keeps_its_correlations(
 
 def test_update_is_the_kalman_update(state: EskfState, rng: np.random.Generator) -> None:
     before, h = state.P.copy(), rng.normal(size=STATES)
+    state.aided = 1
     clear(state)
     state.h[:] = h
     update_scalar(state, 2.0, 3.0, 1e12)
@@ -155,6 +156,16 @@ def test_held_states_are_considered_but_not_changed(
     np.testing.assert_array_equal(state.dx[held], 0.0)
     np.testing.assert_allclose(state.P[held, held], before[held, held])
     assert np.linalg.eigvalsh(state.P).min() > -1e-8
+
+
+def test_only_gps_tells_the_scale(state: EskfState, rng: np.random.Generator) -> None:
+    before, h = state.P.copy(), rng.normal(size=STATES)
+    clear(state)
+    state.h[:] = h
+    update_scalar(state, 2.0, 3.0, 1e12)
+    held = slice(GYRO_SCALE, GYRO_SCALE + 3)
+    np.testing.assert_array_equal(state.dx[held], 0.0)
+    np.testing.assert_allclose(state.P[held, held], before[held, held])
 
 
 def test_an_outlier_moves_little_and_is_never_ignored(state: EskfState) -> None:

@@ -7,6 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
+from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
 from gateway.estimation.complementary.accuracy import watch_accuracy, write_attitude_std
 from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
@@ -84,6 +85,7 @@ def start(s: ComplementaryState, p: ComplementaryGains) -> None:
     s.declination_rad = p.declination_rad
     s.earth_dip_rad = NAN
     begin_latency(s, p.gps_latency_s)
+    begin_lag(s)
     forget_times(s)
 
 
@@ -148,9 +150,13 @@ def take_imu(
     if row[CLIPPED] != 0.0:
         doubt_clipped(s, dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
+    follow_rate(s, dt)
     misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
-        take_mag(s, p, mag)
+        # Not while gravity holds the level: in fast turns its low-pass lags as well, which the dip
+        # turns into heading, and recorded motion did better with the field as it came.
+        present = present_field(s, mag)
+        take_mag(s, p, present if s.level_by_gps == 1 else mag)
     elif s.mag_misplaced > misplaced:
         doubt_sensors(s, p)
         lose_attitude(s, p)

@@ -7,6 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.columns import CLIPPED, imu_vectors
+from gateway.estimation.compass_lag import follow_rate, present_field
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -124,6 +125,7 @@ def take_imu(
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
     take_substitutes(s, p)
+    follow_rate(s, dt)
     misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
         take_mag(s, p, mag)
@@ -226,7 +228,7 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
         s.pending_turn[k, 0] += x[k] * dt
         s.pending_turn[k, 1] += y[k] * dt
         s.pending_turn[k, 2] += z[k] * dt
-        if s.aided == 1:
+        if s.aided == 1 or k == 2:
             s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
             s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
             s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
@@ -283,11 +285,12 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     mag_b : tuple of 3 floats
         Calibrated field in body FRD, uT.
     """
+    b = s.mag_bias_b
+    raw, mag_b = mag_b, (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
+    mag_b = present_field(s, mag_b)
     if s.lost == 1:
         return
-    look_for_iron(s, p, mag_b, s.time_s - s.mag_s)
-    b = s.mag_bias_b
-    mag_b = (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
+    look_for_iron(s, p, raw, s.time_s - s.mag_s)
     field = rotate(as_quat(s.q_nb), mag_b)
     level = math.hypot(field[0], field[1])
     norm = math.hypot(level, field[2])

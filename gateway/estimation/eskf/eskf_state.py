@@ -55,7 +55,8 @@ class EskfState(FilterState):
     pending_turn: Annotated[FloatArray, (3, 3)]
     """Integral of `R_nb` over that time."""
     pending_scaled: Annotated[FloatArray, (3, 3)]
-    """Integral of `R_nb diag(gyro)` over that time, while GPS is there to tell the scale."""
+    """Integral of `R_nb diag(gyro)` over that time; without GPS the last row alone, for the
+    heading: the level then rests on gravity."""
 
     aided: int
     """1 while position and velocity are those of GPS, 0 while they only keep the attitude level."""

@@ -13,6 +13,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_velocity import TOLD_NOISE_MPS
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
+from gateway.estimation.compass_lag import late_var
 from gateway.estimation.eskf.covariance import (
     clear,
     consider,
@@ -336,7 +337,8 @@ def update_by_compass(
         consider(s, ACCEL_BIAS, 3)
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
-    update_scalar(s, wrap_pi(measured), repeated * p.mag_var / weight + lasting, p.gate_sq)
+    noise = repeated * (p.mag_var / weight + late_var(s)) + lasting
+    update_scalar(s, wrap_pi(measured), noise, p.gate_sq)
     s.compass_share = 1.0 - (1.0 - s.compass_share) * s.P[TILT + 2, TILT + 2] / before
     inject(s)
 

@@ -7,6 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
@@ -56,7 +57,7 @@ def start(s: EskfState, p: EskfGains) -> None:
     for k in range(3):
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] = p.gyro_bias_var
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = p.accel_bias_var
-        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = p.gyro_scale_var
+        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = p.unaided_scale_var
         s.wander_var[k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
         s.rate_b[k] = NAN
@@ -64,6 +65,7 @@ def start(s: EskfState, p: EskfGains) -> None:
     s.earth_dip_rad = NAN
     s.left_iron_ut = math.sqrt(p.mag_bias_var)
     begin_latency(s, p.gps_latency_s)
+    begin_lag(s)
     forget_times(s)
 
 
@@ -158,6 +160,8 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
     if s.iron_search_started == 0:
+        for k in range(3):
+            renew(s, GYRO_SCALE + k, p.gyro_scale_var)
         doubt_level(s, p)
         start_iron_search(s)
     s.off_last_m = s.contradiction_m = 0.0

@@ -6,6 +6,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
+from gateway.estimation.compass_lag import LagState
 from gateway.estimation.filtering.roughness import RoughnessState
 from gateway.estimation.flagbits import (
     AT_REST,
@@ -53,7 +54,14 @@ def filter_gains(
 
 
 class FilterState(
-    HealthState, RoughnessState, RestState, FieldState, LatencyState, ReviewState, WayState
+    HealthState,
+    RoughnessState,
+    RestState,
+    FieldState,
+    LagState,
+    LatencyState,
+    ReviewState,
+    WayState,
 ):
     """The part of a filter's state that says nothing of its model."""
 

@@ -99,13 +99,15 @@ def begin_node(s: EskfState, p: EskfGains, P: FloatArray, F: FloatArray) -> None
 def end_node(s: EskfState, copy: EskfState, F: FloatArray, foreseen: FloatArray) -> None:
     """Keep the covariance foreseen; of what began anew the stretch's begin tells nothing.
 
-    Nor does it of a place that follows the fixes, which is no state.
+    Nor does it of a place that follows the fixes, which is no state, nor of a scale that is only
+    considered: what that adds to the heading is noise to a stretch.
     """
     for i in range(STATES):
         for j in range(STATES):
             foreseen[i, j] = copy.P[i, j]
     for i in range(STATES):
-        unfiltered = i in (POS, POS + 1, POS + 2) and min(s.aided, copy.aided) == 0
+        shown_by_gps = POS <= i < POS + 3 or GYRO_SCALE <= i < GYRO_SCALE + 3
+        unfiltered = shown_by_gps and min(s.aided, copy.aided) == 0
         if unfiltered or copy.started == 0 or s.renewals[i] != copy.renewals[i]:
             for j in range(STATES):
                 F[i, j] = foreseen[i, j] = foreseen[j, i] = 0.0
