@@ -263,28 +263,6 @@ class TestSerial:
         assert ids.index(30) <= 22 - waiting + 1
         assert [frame[4] for frame in frames] == list(range(22))
 
-    async def test_telemetry_of_more_than_a_second_ago_is_not_sent(
-        self, rig: Any, line: tuple[int, str]
-    ) -> None:
-        near, device = line
-        hub = rig.hub(f"serial:{device}:9600")
-        for _ in range(50):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
-        parameter = dialect.MAVLink_param_value_message(b"X", 1.0, 9, 1, 0)
-        for _ in range(30):
-            hub.send(rig.out(rig.vehicle.pack(parameter)))
-        splitter, heard = MavlinkSplitter(), list[tuple[int, int]]()
-        while hub.clients()[0].queued:
-            rig.clock.us += 5_000
-            await asyncio.sleep(0.001)
-            with contextlib.suppress(BlockingIOError):
-                data = os.read(near, 4096)
-                heard += [(rig.clock.us, message_id_of(frame)) for frame in splitter.feed(data)]
-        telemetry_us = [us for us, message_id in heard if message_id == 27]
-        assert 10 < len(telemetry_us) < 25
-        assert max(telemetry_us) < 1_200_000
-        assert hub.clients()[0].dropped > 20
-
     async def test_a_port_that_goes_and_comes_back(
         self, rig: Any, line: tuple[int, str], tmp_path: Any
     ) -> None:
