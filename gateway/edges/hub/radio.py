@@ -12,13 +12,13 @@ from typing import Final
 
 import serial
 
-from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US
+from gateway.edges.hub.queued import QueuedClient
 from gateway.routing.endpoint import BITS_PER_BYTE
 from gateway.routing.limits.width import RADIO_STATUS
-from gateway.routing.outbox import Numbering, Outbox, Pacer
+from gateway.routing.outbox import Pacer
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavlinkSplitter, free_percent, message_id_of
+from gateway.wire.mavlink_splitter import free_percent, message_id_of
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +30,9 @@ QUEUE_US: Final = US_PER_S
 MIN_QUEUE_BYTES: Final = 2048
 
 
-class RadioClient(Client):
+class RadioClient(QueuedClient):
     """A peer on a serial port that may come and go."""
 
-    _partial = b""
     _port: serial.Serial | None = None
     _retry_us = 0
     _timer: asyncio.TimerHandle | None = None
@@ -41,18 +40,13 @@ class RadioClient(Client):
     def __post_init__(self) -> None:
         """Start without a port."""
         super().__post_init__()
-        baud = self.endpoint.port
-        self._outbox = Outbox(
-            max(MIN_QUEUE_BYTES, round(QUEUE_US / US_PER_S * baud / BITS_PER_BYTE))
-        )
-        self._pacer = Pacer(baud, AHEAD_US)
-        self._numbering = Numbering(self.context.is_own, self.context.seal)
-        self._splitter = MavlinkSplitter()
+        self._pacer = Pacer(self.endpoint.port, AHEAD_US)
 
     @property
-    def queued(self) -> int:
-        """Frames that wait for the line."""
-        return len(self._outbox)
+    def queue_bytes(self) -> int:
+        """The most that waits for the line."""
+        bytes_per_s = self.endpoint.port / BITS_PER_BYTE
+        return max(MIN_QUEUE_BYTES, round(bytes_per_s * QUEUE_US / US_PER_S))
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Queue one frame and write what the line has room for."""
@@ -60,8 +54,7 @@ class RadioClient(Client):
             self.counters.dropped += 1
             return
         self.counters.sent += 1
-        step = self._numbering.enter(frame)
-        self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
+        self._push(frame, message_id, self._numbering.enter(frame))
         if self._timer is None and not self._partial:
             self._pump()
 
@@ -93,12 +86,7 @@ class RadioClient(Client):
             self.loop.remove_writer(self._port.fileno())
             self._port.close()
             self._port = None
-        self._partial = b""
-        self._drop(self._outbox.clear())
-
-    def _drop(self, frames: int) -> None:
-        self.counters.dropped += frames
-        self.counters.sent -= frames
+        self._drop_all()
 
     def _broke(self, error: OSError) -> None:
         log.warning("%s is gone: %s", self.endpoint.host, error)

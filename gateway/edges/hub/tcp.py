@@ -11,13 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gateway.edges.accepting import accept_each
-from gateway.edges.hub.client import Client
 from gateway.edges.hub.listener import RETRY_US, Listener, Peer
+from gateway.edges.hub.queued import QueuedClient
 from gateway.routing.client_table import Presence, who_leaves
 from gateway.routing.endpoint import host_and_port
-from gateway.routing.outbox import Numbering, Outbox
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavlinkSplitter
 
 CHUNK_BYTES: Final = 4096
 """Joined into one write while a queue drains."""
@@ -37,26 +35,13 @@ ACCEPT_BACKLOG: Final = 128
 """Pages that connect again at once wait there, since each wake-up accepts one."""
 
 
-class StreamClient(Client):
-    """A peer behind a byte stream."""
+class StreamClient(QueuedClient):
+    """A peer behind a socket that carries a byte stream."""
 
-    _partial = b""
     _socket: socket.socket | None = None
     _sending_us: int | None = None
     """Since when it has sent what waits without coming to an end."""
     _chunk_bytes = CHUNK_BYTES
-
-    def __post_init__(self) -> None:
-        """Start without a connection."""
-        super().__post_init__()
-        self._outbox = Outbox(self.context.settings.queue_bytes)
-        self._numbering = Numbering(self.context.is_own, self.context.seal)
-        self._splitter = MavlinkSplitter()
-
-    @property
-    def queued(self) -> int:
-        """Frames that wait for the connection."""
-        return len(self._outbox)
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Send one frame at once if nothing waits, else queue it."""
@@ -66,7 +51,7 @@ class StreamClient(Client):
         self.counters.sent += 1
         step = self._numbering.enter(frame)
         if self._partial or self._outbox:
-            self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
+            self._push(frame, message_id, step)
         else:
             self._write(self._socket, self.wrap(self._numbering.leave(frame, step)))
 
@@ -96,8 +81,8 @@ class StreamClient(Client):
             self.loop.remove_writer(self._socket)
             self._socket.close()
             self._socket = None
-        self._partial, self._sending_us = b"", None
-        self._drop(self._outbox.clear())
+        self._sending_us = None
+        self._drop_all()
 
     def broke(self) -> None:
         """Handle the end of the connection."""
@@ -110,10 +95,6 @@ class StreamClient(Client):
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""
         self.receive(self._splitter.feed(data), len(data), now_us)
-
-    def _drop(self, frames: int) -> None:
-        self.counters.dropped += frames
-        self.counters.sent -= frames
 
     def _write(self, sock: socket.socket, data: bytes) -> bool:
         """Write; keep what the socket does not accept and wait for room."""

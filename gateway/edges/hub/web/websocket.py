@@ -94,8 +94,7 @@ class WebStream(StreamClient):
             super().transmit(frame, message_id)
             return
         self.counters.sent += 1
-        step = self._numbering.enter(frame)
-        self._drop(self._outbox.push(frame, message_id, step, self.context.now_us()))
+        self._push(frame, message_id, self._numbering.enter(frame))
         if self._outbox.size >= self.endpoint.pack_bytes:
             self._flush()
         elif not self._is_gathering:
