@@ -1,7 +1,8 @@
 """Draw docs/pictures/accuracy.png: how far off the estimators are on every flight.
 
-    python tools/score_estimators.py --data DIR --json scores.json
-    python tools/draw_scores.py scores.json
+    python tools/draw_scores.py SCORES.json
+
+The scores are what `score_estimators.py --json` has written.
 """
 
 import argparse
