@@ -29,7 +29,7 @@ FIELD_NOISE: Final = 0.03
 ODD_FIELD: Final = 0.1
 """A pair off by more of the strength, beyond what the lag may explain, is a disturbance's."""
 LAGS_KEPT: Final = 0.9995
-"""What was compared is forgotten after so many thousand pairs."""
+"""What was compared fades within some two thousand pairs."""
 
 
 class LagState:

@@ -214,10 +214,7 @@ def _when(found: FileInfo) -> str:
     if found.header is not None:
         zero_us = found.header.unix_us_at_zero
         begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
-    if begin_us is None:
-        return ""
-    if begin_us < EARLIEST_US:
-        # Seconds since a start, as in other programs' logs.
+    if begin_us is None or 0 <= begin_us < EARLIEST_US:
         return ""
     moment = civil_time(begin_us)
     return (
