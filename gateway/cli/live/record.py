@@ -131,7 +131,7 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     else:
         running = config is None and is_running()
         folder = ask("record.status")["folder"] if running else _folder(config)
-        console_of().print(f"no recordings in {folder}", markup=False)
+        console_of().print(f"no recordings in {folder}")
 
 
 @group.command()

@@ -83,8 +83,8 @@ def first_bytes(path: Path) -> bytes:
 
 def is_packed(path: Path) -> bool:
     """Return whether a file is gzipped, by its first bytes; raises OSError."""
-    with open_recording(path) as raw:
-        return raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    with open_unpacked(path) as (file, raw):
+        return file is not raw
 
 
 @contextmanager

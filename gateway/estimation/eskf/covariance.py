@@ -210,6 +210,18 @@ def update_scalar(s: EskfState, innovation: float, variance: float, gate_sq: flo
 
 
 @compiled
+def level_variance(s: EskfState) -> float:
+    """Return the variance of the tilt, rad2."""
+    return float(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
+
+
+@compiled
+def fade_force_turn(s: EskfState, level_before: float) -> None:
+    """Take what force has turned to be found out as far as the rest of the tilt is."""
+    s.force_turn_var *= level_variance(s) / level_before
+
+
+@compiled
 def consider(s: EskfState, first: int, count: int) -> None:
     """Mark states as only considered."""
     fill(s.considered[first : first + count], 1.0)

@@ -8,10 +8,10 @@ from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import follow_rate, present_field
-from gateway.estimation.eskf.covariance import propagate
+from gateway.estimation.eskf.covariance import level_variance, propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.iron import doubt_standing_field, follow_field, look_for_iron
 from gateway.estimation.eskf.measure import (
@@ -182,8 +182,7 @@ def is_pushed(s: EskfState, dt: float) -> bool:
     What would have pushed to a speed that nothing here flies is a tilt that is wrong.
     """
     f = rotate(as_quat(s.q_nb), as_vec(s.accel_lp))
-    tilt_var = s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1]
-    unsure = STANDARD_GRAVITY_MPS2**2 * tilt_var + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
+    unsure = STANDARD_GRAVITY_MPS2**2 * level_variance(s) + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
     level_sq = f[0] * f[0] + f[1] * f[1]
     pushed = s.lost == 0 and level_sq > PUSHED_SQ * unsure + PUSH_MPS2 * PUSH_MPS2
     s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
@@ -286,12 +285,11 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
         Calibrated field in body FRD, uT.
     """
     b = s.mag_bias_b
-    raw, mag_b = mag_b, (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2])
-    mag_b = present_field(s, mag_b)
+    present = present_field(s, (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2]))
     if s.lost == 1:
         return
-    look_for_iron(s, p, raw, s.time_s - s.mag_s)
-    field = rotate(as_quat(s.q_nb), mag_b)
+    look_for_iron(s, p, mag_b, s.time_s - s.mag_s)
+    field = rotate(as_quat(s.q_nb), present)
     level = math.hypot(field[0], field[1])
     norm = math.hypot(level, field[2])
     if norm < MIN_FIELD_UT or level < 0.05 * norm or s.time_s <= s.mag_s:

@@ -12,9 +12,6 @@ from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
 VELOCITY_CORRELATION_S: Final = 0.25
-UNAIDED_SCALE: Final = 0.01
-"""Share by which each axis of the gyroscope is taken to be off scale where no GPS has told it: a
-third of an MPU6050's tolerance."""
 LASTING_RAD: Final = 0.005
 """Axes and scales of the sensors are off by about this for a whole flight."""
 
@@ -156,8 +153,6 @@ class EskfGains(FilterGains):
     gyro_roughness_sq: float
     accel_roughness_sq: float
     gyro_scale_var: float
-    unaided_scale_var: float
-    """The same before the first fix: to the heading alone, and considered only."""
     gyro_turn_var: float
     """Variance of the attitude after a turn of 1 rad, by scale and axes of the gyroscope, rad2."""
     accel_density: float
@@ -220,7 +215,6 @@ def make_gains(
         "gyro_roughness_sq": s.gyro_roughness**2,
         "accel_roughness_sq": s.accel_roughness**2,
         "gyro_scale_var": s.gyro_scale**2,
-        "unaided_scale_var": UNAIDED_SCALE**2,
         # What is off by a lasting angle errs by no more than twice that in a turn, and not at all
         # after a circle; on average over the circle, such a walk errs as much.
         "gyro_turn_var": LASTING_RAD**2 / math.pi,

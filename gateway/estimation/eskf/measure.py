@@ -17,8 +17,10 @@ from gateway.estimation.compass_lag import late_var
 from gateway.estimation.eskf.covariance import (
     clear,
     consider,
+    fade_force_turn,
     inject,
     innovation_variance,
+    level_variance,
     normalised_innovation_sq,
     propagate,
     update_scalar,
@@ -222,18 +224,6 @@ def place_distance_sq(
 
 
 @compiled
-def level_variance(s: EskfState) -> float:
-    """Return the variance of the tilt, rad2."""
-    return float(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
-
-
-@compiled
-def fade_force_turn(s: EskfState, level_before: float) -> None:
-    """Take what force has turned to be found out as far as the rest of the tilt is."""
-    s.force_turn_var *= level_variance(s) / level_before
-
-
-@compiled
 def update_by_fix(
     s: EskfState,
     p: EskfGains,
@@ -269,28 +259,35 @@ def update_by_fix(
     late_pos, late_vel = delay_variances(s, p, once, lag)
     repeated = max(1.0, p.velocity_correlation_s / since)
     unexpected = lasting_noise_sq(s, accel[0] * accel[0] + accel[1] * accel[1], since)
+    noise_vel = (
+        max(repeated * velocity_variance(s, p, row, 0) + late_vel[0], unexpected),
+        max(repeated * velocity_variance(s, p, row, 1) + late_vel[1], unexpected),
+        max(repeated * velocity_variance(s, p, row, 2) + late_vel[2], unexpected),
+    )
+    noise_pos = (
+        place_variance(p, row, 0) + late_pos[0],
+        place_variance(p, row, 1) + late_pos[1],
+        place_variance(p, row, 2) + late_pos[2],
+    )
     # All of a fix is weighed before any of it is used: a glitch that shows in one axis spoils all.
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
-            noise = max(repeated * velocity_variance(s, p, row, k) + late_vel[k], unexpected)
-            explained = innovation_variance(s, noise) + lag_variance(s)
+            explained = innovation_variance(s, noise_vel[k]) + lag_variance(s)
             excess = lasting_excess(off_vel[k], MOST_MPS, explained, VELOCITY_GATE_SQ, since)
             s.doubt_vel_sq = max(s.doubt_vel_sq, excess)
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
-            explained = innovation_variance(s, place_variance(p, row, k) + late_pos[k])
+            explained = innovation_variance(s, noise_pos[k])
             excess = lasting_excess(off_pos[k], MOST_M, explained, DOUBT_PLACE_SQ, since)
             s.doubt_pos_sq = max(s.doubt_pos_sq, excess)
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
-            noise = max(repeated * velocity_variance(s, p, row, k) + late_vel[k], unexpected)
-            update_scalar(s, off_vel[k], noise + s.doubt_vel_sq, VELOCITY_GATE_SQ)
+            update_scalar(s, off_vel[k], noise_vel[k] + s.doubt_vel_sq, VELOCITY_GATE_SQ)
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
-            noise = place_variance(p, row, k) + late_pos[k]
-            update_scalar(s, off_pos[k], noise + s.doubt_pos_sq, p.gate_sq)
+            update_scalar(s, off_pos[k], noise_pos[k] + s.doubt_pos_sq, p.gate_sq)
     s.compass_share *= s.P[TILT + 2, TILT + 2] / before
     fade_force_turn(s, level)
     inject(s)

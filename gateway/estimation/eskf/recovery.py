@@ -12,7 +12,7 @@ from gateway.estimation.alignment.review import (
     tells_heading,
 )
 from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, heading_difference
-from gateway.estimation.eskf.covariance import propagate, renew
+from gateway.estimation.eskf.covariance import level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
@@ -101,7 +101,7 @@ def watch_gravity(s: EskfState, p: EskfGains) -> None:
 @compiled
 def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
-    level_told = math.sqrt(s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1])
+    level_told = math.sqrt(level_variance(s))
     heading_told = math.sqrt(s.P[TILT + 2, TILT + 2])
     bias = math.sqrt(0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1]))
     if not is_to_be_taken(s, as_quat(s.q_nb), level_told, heading_told, bias, dt):

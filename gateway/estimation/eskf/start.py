@@ -48,6 +48,9 @@ GAP_REST_RATE: Final = 0.02
 GAP_HAND_RATE: Final = 0.3
 """What flies goes straight on, but a hand turns as it likes."""
 GAP_ACCEL_MPS2: Final = 3.0
+UNAIDED_SCALE: Final = 0.01
+"""Before the first fix each axis of the gyroscope is taken to be off scale by this share, a third
+of an MPU6050's tolerance: it is considered, for the heading alone."""
 
 
 @compiled
@@ -57,7 +60,7 @@ def start(s: EskfState, p: EskfGains) -> None:
     for k in range(3):
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] = p.gyro_bias_var
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = p.accel_bias_var
-        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = p.unaided_scale_var
+        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = UNAIDED_SCALE * UNAIDED_SCALE
         s.wander_var[k] = p.gps_wander_var if k < 2 else p.gps_height_wander_var
         s.P[WANDER + k, WANDER + k] = s.wander_var[k]
         s.rate_b[k] = NAN

@@ -5,8 +5,9 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.wahba import TURN_S
+from gateway.estimation.eskf.covariance import level_variance
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import TILT, VEL, EskfState
+from gateway.estimation.eskf.eskf_state import VEL, EskfState
 from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, lag_integrals, take_back
 from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.local_position import past_state
@@ -65,8 +66,7 @@ def watch_way(s: EskfState, dt: float) -> None:
     north = (vel[0] - s.assumed[3]) * lag + pushed[0]
     east = (vel[1] - s.assumed[4]) * lag + pushed[1]
     unsure = s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
-    tilt_var = s.P[TILT, TILT] + s.P[TILT + 1, TILT + 1]
-    pulled_sq = (0.5 * STANDARD_GRAVITY_MPS2 * lag) ** 2 * tilt_var
+    pulled_sq = (0.5 * STANDARD_GRAVITY_MPS2 * lag) ** 2 * level_variance(s)
     drift = unsure + PUSHED_SQ * (2.0 * s.hand_sq + pulled_sq)
     flew = s.flies
     s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * drift else 0
