@@ -149,10 +149,10 @@ def tidied(command: Any) -> Any:
     if command.help:
         paragraphs = command.help.split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
-    with command.make_context("", [], resilient_parsing=True) as context:
-        for parameter in command.get_params(context):
-            if getattr(parameter, "is_flag", False):
-                parameter.metavar = ""
+    # A context that parses nothing, since parsing loads what takes half of the time of `--help`.
+    for parameter in command.get_params(command.context_class(command)):
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
     for below in getattr(command, "commands", {}).values():
         tidied(below)
     return command

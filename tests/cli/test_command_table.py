@@ -64,11 +64,13 @@ def test_help_lists_every_command() -> None:
     ids=" ".join,
 )  # fmt: skip
 def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -> None:
+    # What parses options takes as long as all else that `--help` needs.
+    large = {*LARGE, "pydantic"} if words == ["--help"] else {*LARGE}
     program = (
         "import sys; from gateway.cli.app import main; sys.argv = ['mavgate', *sys.argv[1:]]\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        f"print(*(set({LARGE!r}) & set(sys.modules)), file=sys.stderr)"
+        f"print(*({large!r} & set(sys.modules)), file=sys.stderr)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, *words],
