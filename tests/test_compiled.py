@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import logging
 import shutil
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from gateway.compiled.entry_point import (
     dispatched,
     nothing_compiled,
 )
-from gateway.compiled.machine_code import compiling, keep_code
+from gateway.compiled.machine_code import ONCE, compiling, keep_code
 from gateway.estimation.complementary.complementary_kernels import KERNELS
 
 FLOAT = np.dtype(np.float64)
@@ -108,6 +109,27 @@ def test_code_of_an_earlier_source_goes(folder: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(globals(), "scaled", compiled(lambda x: 5.0 * x))
     assert use(EntryPoint(scale)) == [5.25, 12.75]
     assert len(kept_in(folder)) == 1
+
+
+@pytest.mark.io
+def test_that_something_is_compiled_is_told_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(folder))
+    monkeypatch.setattr("gateway.compiled.machine_code._HAS_TOLD", told := bytearray(1))
+    path = folder / "raced.py"
+    path.write_text(SOURCE)
+    with caplog.at_level(logging.INFO):
+        use(EntryPoint(scale))
+        assert caplog.messages == [ONCE]
+        process(path)(NEAR)
+        assert caplog.messages == [ONCE]
+        told[0] = 0
+        use(EntryPoint(scale))
+        process(path)(NEAR)
+        assert caplog.messages == [ONCE], "what is kept is not compiled"
+        process(path)(FAR)
+        assert caplog.messages == [ONCE, ONCE]
 
 
 @pytest.mark.io

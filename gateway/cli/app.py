@@ -5,7 +5,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated, cast
 
 import typer
 
@@ -49,10 +49,27 @@ def _options(
         from rich.logging import RichHandler
 
         form = "%(message)s"
-        handler = RichHandler(console=Console(stderr=True), show_path=False)
+        shown = Console(file=cast(IO[str], _StderrNow()))
+        handler = RichHandler(console=shown, show_path=False)
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
     logging.basicConfig(level=level, handlers=[handler])
+
+
+class _StderrNow:
+    """`sys.stderr` as it is at each moment: a progress bar replaces it, to stay below the lines."""
+
+    def write(self, text: str) -> int:
+        return sys.stderr.write(text)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+    def isatty(self) -> bool:
+        return sys.stderr.isatty()
+
+    def fileno(self) -> int:
+        return sys.stderr.fileno()
 
 
 def _prepare_streams() -> None:

@@ -21,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic, overload, typeof_impl
 
 from gateway.compiled import array_at, digest_of, is_compiled, record_at
-from gateway.compiled.machine_code import ENTRY, MachineCode, compiling
+from gateway.compiled.machine_code import ENTRY, MachineCode, compiling, tell_of_compiling
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
 """Offline fusion of a log must give exactly what it gave live."""
@@ -135,6 +135,13 @@ class _FileBySignature(IndexDataCacheFile):
     Numba numbers the files of a function. Two processes that compile it for different types at the
     same time may take the same number, and ever after one would run the other's code.
     """
+
+    def load(self: Any, key: object) -> object:
+        """Return the kept machine code of one signature; None where it has to be compiled."""
+        found = super().load(key)
+        if found is None:
+            tell_of_compiling()
+        return found
 
     def save(self: Any, key: object, data: object) -> None:
         """Keep the machine code of one signature."""

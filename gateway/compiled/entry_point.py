@@ -15,6 +15,7 @@ from gateway.compiled.machine_code import (
     keep_code,
     kept_code,
     load_code,
+    tell_of_compiling,
 )
 
 Parameters = ParamSpec("Parameters")
@@ -108,6 +109,7 @@ class EntryPoint(Generic[Parameters]):
         # Imported late, here and below: numba takes 60 MB.
         from gateway.compiled.compiler import compile_entry
 
+        tell_of_compiling()
         code = compile_entry(self._function)
         keep_code(name, digest, code)
         return code

@@ -9,6 +9,8 @@ import ctypes
 import errno
 import fcntl
 import hashlib
+import logging
+import mmap
 import os
 import sys
 import tempfile
@@ -21,10 +23,16 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+log = logging.getLogger(__name__)
+
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 READABLE: Final = 0o644
 ENTRY: Final = "entry"
 """The function's symbol."""
+ONCE: Final = "compiling machine code, once after an upgrade: it takes up to a minute"
+
+_HAS_TOLD: Final = mmap.mmap(-1, 1)
+"""Whether `tell_of_compiling` has logged; forked processes share this byte, so one of them does."""
 
 
 class MachineCode(NamedTuple):
@@ -103,6 +111,13 @@ def keep_code(name: str, digest: str, code: MachineCode) -> None:
                 if old != target:
                     old.unlink()
             return
+
+
+def tell_of_compiling(text: str = ONCE) -> None:
+    """Log that machine code is being compiled, for which somebody waits; only the first time."""
+    if not _HAS_TOLD[0]:
+        _HAS_TOLD[0] = 1
+        log.info(text)
 
 
 @contextlib.contextmanager

@@ -126,8 +126,7 @@ def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, 
     """Fuse causally; from the state at the table's begin on where there is one that fits."""
     fusion = RowFusion(Aircraft(table.header.vehicle_id, aircraft), follow=False)
     rows = [block.cells for block in fusion.blocks(_with_begin(table.blocks))]
-    for reason in fusion.refused:
-        console_of(stderr=True).print(SETTLES.format(reason))
+    table.remarks.extend(SETTLES.format(reason) for reason in fusion.refused)
     cells = np.concatenate(rows)
     cells = cells[has_group(cells, NAV)]
     return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]

@@ -13,7 +13,7 @@ from typing import Final
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.compiled.entry_point import EntryPoint
-from gateway.compiled.machine_code import MachineCode
+from gateway.compiled.machine_code import MachineCode, tell_of_compiling
 from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper.paper_entry import step_live
@@ -74,7 +74,7 @@ def make_ready(*estimators: str) -> "Compilation | None":
         _rehearse(name)
     if not missing:
         return None
-    log.info("compiling, this once: estimates cost more computing for a minute")
+    tell_of_compiling("compiling, this once: estimates cost more computing for a minute")
     return Compilation(missing)
 
 
