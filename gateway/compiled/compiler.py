@@ -138,7 +138,7 @@ class _FileBySignature(IndexDataCacheFile):
 
     def load(self: Any, key: object) -> object:
         """Return the kept machine code of one signature; None where it has to be compiled."""
-        found = super().load(key)
+        found: object = super().load(key)  # type: ignore[no-untyped-call]
         if found is None:
             tell_of_compiling()
         return found

@@ -78,6 +78,8 @@ class FileInfo:
     gaps: tuple[Gap, ...]
     damaged_bytes: int
     damaged_runs: int
+    unfinished_bytes: int = 0
+    """Of a last record or line that is not whole: it is being written, or was cut."""
     header: TableHeader | None = None
     marks: tuple[TableMark, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -206,6 +208,7 @@ class TlogSummary:
             gaps=tuple(self._gaps.found),
             damaged_bytes=index.damaged_bytes,
             damaged_runs=len(index.damage),
+            unfinished_bytes=index.unfinished,
             remarks=(MENDED.format(index.mended),) if index.mended else (),
         )
 
@@ -240,7 +243,7 @@ class TableSummary:
         self._header: TableHeader | None = None
         self._marks: list[TableMark] = []
         self._counts: Counter[str] = Counter()
-        self._damaged_bytes = 0
+        self._damaged_bytes = self._unfinished_bytes = 0
         self._last_us: int | None = None
         self._way = GroundWay()
         self._span, self._gaps = TimesSpan(), _Gaps()
@@ -251,6 +254,8 @@ class TableSummary:
         for _, comment in block.comments:
             if isinstance(comment, TableMark):
                 self._marks.append(comment)
+            elif isinstance(comment, TableFault) and comment.is_cut:
+                self._unfinished_bytes += comment.size
             elif isinstance(comment, TableFault):
                 self._counts["damage"] += 1
                 self._damaged_bytes += comment.size
@@ -282,6 +287,7 @@ class TableSummary:
             gaps=tuple(self._gaps.found),
             damaged_bytes=self._damaged_bytes,
             damaged_runs=self._counts["damage"],
+            unfinished_bytes=self._unfinished_bytes,
             header=self._header,
             marks=tuple(self._marks),
         )

@@ -68,6 +68,30 @@ def test_gaps_and_damage_are_found(chunk: int) -> None:
     assert info.damaged_bytes >= 40
 
 
+def test_a_last_record_that_is_being_written_is_no_damage() -> None:
+    data = make_tlog(make_flight(20, 1))
+    info = sum_up(data[:300] + b"\xaa" * 40 + data[300:-4])
+    assert info.damaged_bytes == sum_up(data[:300] + b"\xaa" * 40 + data[300:]).damaged_bytes
+    assert 0 < info.unfinished_bytes < 40
+    wrong = sum_up(data + b"\xaa" * 4)
+    assert (wrong.damaged_bytes, wrong.unfinished_bytes) == (4, 0)
+
+
+@pytest.mark.parametrize(
+    ("tail", "damaged", "unfinished"),
+    [(b"1000,0,", 0, 7), (b"1000," + bytes(3), 8, 0), (b"1000,0,\n", 8, 0)],
+)
+def test_a_last_line_that_is_being_written_is_no_damage(
+    rng: np.random.Generator, tail: bytes, damaged: int, unfinished: int
+) -> None:
+    rows = RowBuilder().add(make_fused(rng, 0))
+    text = encode_head(TableHeader()) + "".join(map(row_to_line, rows))
+    summary, reader = TableSummary(), TableReader()
+    summary.add(reader.feed_block(text.encode() + tail, final=True), reader.header)
+    info = summary.result(0)
+    assert (info.damaged_bytes, info.unfinished_bytes) == (damaged, unfinished)
+
+
 @pytest.mark.parametrize("chunk", [50, 100_000])
 @pytest.mark.parametrize("years", [56, -30])
 def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(years: int, chunk: int) -> None:

@@ -128,6 +128,8 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
     for batch in read_batches(file, advance, strict=True):
         for run in batch.damage:
             report(f"at byte {run.offset}: {run.size} bytes that are no record")
+        if batch.unfinished:
+            report(f"at the end: {batch.unfinished} bytes of an incomplete record")
         if batch.mended:
             console_of().print(MENDED.format(batch.mended))
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
@@ -178,6 +180,11 @@ def _show(file: Path, found: FileInfo) -> None:
             f"damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
             "`mavgate recover` leaves them out",
             style="red",
+        )
+    if found.unfinished_bytes:
+        console.print(
+            f"the last {'record' if found.kind == 'tlog' else 'line'} is incomplete "
+            f"({found.unfinished_bytes} bytes): it is still being written, or was cut off"
         )
     for remark in found.remarks:
         console.print(remark)

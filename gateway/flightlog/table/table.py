@@ -94,6 +94,8 @@ class TableFault:
     """Counted from 1."""
     size: int
     reason: str
+    is_cut: bool = False
+    """Whether the file ends within the line: it is being written, or was cut."""
 
 
 _COMMENTS: Final[dict[str, Any]] = {
@@ -253,7 +255,8 @@ class TableReader:
         if final and (rest or self._skipped):
             self.lines += 1
             size = self._skipped + len(rest)
-            cut = TableFault(self.lines, size, "the line has no end")
+            is_cut = not self._skipped and b"\0" not in rest
+            cut = TableFault(self.lines, size, "the line has no end", is_cut)
             block = TableBlock(block.cells, (*block.comments, (len(block), cut)))
         return block
 

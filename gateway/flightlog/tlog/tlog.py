@@ -16,6 +16,7 @@ from gateway.flightlog.tlog.tlog_scan import (
     TIME_SIZE,
     IntArray,
     crc_extra_table,
+    lacks_end,
     scan,
 )
 from gateway.wire.mavlink_splitter import is_station_heartbeat
@@ -83,6 +84,8 @@ class Batch:
     damage: tuple[Damage, ...]
     mended: int = 0
     """How many of the times were damaged, and are those of the record before."""
+    unfinished: int = 0
+    """Bytes at the end of the file that begin a record: it is being written, or was cut."""
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -155,6 +158,7 @@ class TlogScanner:
         room = len(data) // SMALLEST_RECORD + 1
         columns = np.empty((COLUMNS, room), np.int64)
         runs = np.empty((2, room + 1), np.int64)
+        was_in_step = self._in_step
         end, count, damaged, self._in_step = scan(
             np.frombuffer(data, np.uint8),
             final,
@@ -170,9 +174,16 @@ class TlogScanner:
         found = columns[:, :count]
         mended = self._mend(found[2], data[end : end + TIME_SIZE]) if count else 0
         begins, ends = runs[:, :damaged].tolist()
-        damage = tuple(Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True))
+        damage = [Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True)]
+        unfinished = 0
+        if final and damage and (begins[-1] or was_in_step):
+            rest = np.frombuffer(data, np.uint8)[begins[-1] :]
+            unfinished = damage.pop().size if lacks_end(rest) else 0
         starts, sizes, times, origins, message_ids = found
-        return Batch(data, offset, starts, sizes, times, origins, message_ids, damage, mended)
+        return Batch(
+            data, offset, starts, sizes, times, origins, message_ids, tuple(damage), mended,
+            unfinished,
+        )  # fmt: skip
 
     def _mend(self, times: IntArray, following: bytes) -> int:
         """Give records whose time is damaged, which no checksum shows, that of the one before.
@@ -235,6 +246,8 @@ class TlogIndex:
         self.damaged_bytes = 0
         self.mended = 0
         """Records whose time was damaged."""
+        self.unfinished = 0
+        """Bytes of a last record that is not whole."""
         self._offsets = array("q")
         self._times = array("q")
 
@@ -243,6 +256,7 @@ class TlogIndex:
         for run in batch.damage:
             self._add_damage(run)
         self.mended += batch.mended
+        self.unfinished += batch.unfinished
         if not len(batch):
             return
         self.origins |= set(np.unique(batch.origins).tolist())

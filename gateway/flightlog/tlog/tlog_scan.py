@@ -78,6 +78,15 @@ def _frame_size(data: ByteArray, at: int) -> int:
     return int(data[at + 1]) + 12 + 13 * int(flags)
 
 
+def lacks_end(data: ByteArray) -> bool:
+    """Return whether these bytes are the first of a record whose others are missing."""
+    if len(data) < HEADER_SIZE:
+        return len(data) > 0 and data[0] == 0
+    if _is_header(data, 0, True) != _YES:
+        return False
+    return len(data) < TIME_SIZE + 3 or len(data) < TIME_SIZE + _frame_size(data, TIME_SIZE)
+
+
 @compiled
 def _message_id(data: ByteArray, at: int) -> int:
     if data[at] == 0xFE:

@@ -171,7 +171,7 @@ class TableSkimmer:
                 self._tally.add(event)
             case NodeStatus():
                 self._tally.add_status(event)
-            case TableFault():
+            case TableFault(is_cut=False):
                 self._damaged += event.size
 
 

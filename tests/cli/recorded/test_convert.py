@@ -272,7 +272,12 @@ def test_info_for_people(tlog: Path) -> None:
     text = run("info", tlog)
     assert "500 records" in text
     assert "HEARTBEAT" in text
-    tlog.write_bytes(tlog.read_bytes()[:-3])
+    whole = tlog.read_bytes()
+    tlog.write_bytes(whole[:-3])
+    text = run("info", tlog)
+    assert "the last record is incomplete" in text
+    assert "damaged" not in text
+    tlog.write_bytes(whole[:1000] + b"\xaa" * 77 + whole[1000:])
     assert "damaged" in run("info", tlog)
 
 

@@ -86,7 +86,7 @@ def test_every_prefix_opens_and_loses_at_most_the_cut_record() -> None:
         batches = scan(data[:size])
         assert records_of(batches) == records[:whole]
         cut = size - (int(ends[whole - 1]) if whole else 0)
-        assert index_of(batches).damaged_bytes == cut
+        assert (index_of(batches).damaged_bytes, index_of(batches).unfinished) == (0, cut)
 
 
 @pytest.mark.parametrize("seed", range(20))
