@@ -1,4 +1,4 @@
-"""Rest detection: quiet sensors, a small rate, and no GPS speed; never in flight."""
+"""Rest detection: quiet sensors, a small rate, and no speed that is known; never in flight."""
 
 import math
 from typing import Annotated, Final
@@ -89,10 +89,20 @@ class RestState:
 
 
 @compiled
+def outruns(speed_mps: float, unsure_sq: float, p: RestGains) -> bool:
+    """Return whether a level speed of this variance, m2/s2, is that of motion rather than rest.
+
+    What rolls or glides steadily is as quiet as rest, and stopping it there would be off by all of
+    its speed: one standard deviation is enough to go on.
+    """
+    return speed_mps > p.rest_speed_mps + math.sqrt(unsure_sq)
+
+
+@compiled
 def watch_rest(
     s: RestState, p: RestGains, gyro: Vec3, accel: Vec3, moving: bool, dt: float
 ) -> None:
-    """Judge whether the aircraft stands: quiet sensors, small rate, no GPS speed.
+    """Judge whether the aircraft stands: quiet sensors, small rate, no speed.
 
     A gyroscope that an idling engine shakes is quiet where its average is.
 
@@ -105,7 +115,7 @@ def watch_rest(
     gyro, accel : tuple of 3 floats
         Newest sample in body FRD, bias still in.
     moving : bool
-        What the GPS says.
+        What GPS or dead reckoning says.
     dt : float
         Time step, s.
     """
@@ -144,7 +154,7 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
     rested : bool
         Whether it rested until the newest sample.
     moving : bool
-        What the GPS says.
+        What GPS or dead reckoning says.
     dt : float
         Time step, s.
 

@@ -11,6 +11,7 @@ from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
 from gateway.estimation.complementary.accuracy import watch_accuracy, write_attitude_std
 from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
+    DEAD_RECKONING_MAX_S,
     write_output,
 )
 from gateway.estimation.complementary.complementary_state import (
@@ -53,7 +54,7 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
-from gateway.estimation.rest import doubt_rest_bias, watch_rest
+from gateway.estimation.rest import doubt_rest_bias, outruns, watch_rest
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -231,9 +232,14 @@ def is_under_way(s: ComplementaryState) -> bool:
 
 @compiled
 def is_moving(s: ComplementaryState, p: ComplementaryGains) -> bool:
-    """Return whether the GPS says that the aircraft moves."""
-    speed_mps = math.hypot(s.vel_n[0], s.vel_n[1])
-    return s.time_s - s.fix_s < FRESH_GPS_S and speed_mps > p.rest_speed_mps
+    """Return whether GPS or dead reckoning says that the aircraft moves."""
+    since_fix = s.time_s - s.fix_s
+    if since_fix > DEAD_RECKONING_MAX_S:
+        return False
+    unsure_sq = 0.0
+    if since_fix > FRESH_GPS_S:
+        unsure_sq = s.told_speed_mps[0] ** 2 + s.told_speed_mps[1] ** 2
+    return outruns(math.hypot(s.vel_n[0], s.vel_n[1]), unsure_sq, p)
 
 
 KERNELS: Final[Kernels[ComplementaryState, ComplementaryGains]] = kernels_of(

@@ -11,7 +11,7 @@ from gateway.estimation.compass_lag import follow_rate, present_field
 from gateway.estimation.eskf.covariance import level_variance, propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.iron import doubt_standing_field, follow_field, look_for_iron
 from gateway.estimation.eskf.measure import (
@@ -58,7 +58,7 @@ from gateway.estimation.magfield import (
     is_field_told,
     take_field,
 )
-from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, watch_rest
+from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, outruns, watch_rest
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -167,12 +167,14 @@ def level_force(s: EskfState) -> Vec3:
 
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
-    """Return whether the GPS says that the aircraft moves, or without any the way that it went."""
+    """Return whether GPS or dead reckoning says that it moves, or without any the way it went."""
     if s.aided == 0 and s.flies == 1 and s.pushed_mps < PUSHED_MPS:
         return True
-    vel = s.vel_n if s.aided == 1 else s.fix_vel
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
-    return bool(fresh and math.hypot(vel[0], vel[1]) > p.rest_speed_mps)
+    if s.aided == 0:
+        return fresh and math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
+    unsure_sq = 0.0 if fresh else s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
+    return outruns(math.hypot(s.vel_n[0], s.vel_n[1]), unsure_sq, p)
 
 
 @compiled

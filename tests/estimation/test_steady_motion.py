@@ -1,0 +1,83 @@
+"""Steady motion without GPS: as quiet as rest, and no rest."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gateway.estimation.columns import (
+    ACCEL,
+    GPS_ALT,
+    GPS_COLUMNS,
+    GPS_DECLINATION,
+    GPS_LAT,
+    GPS_USABLE,
+    GPS_VEL,
+    GYRO,
+    IMU_COLUMNS,
+    MAG,
+    NAV_FLAGS,
+    NAV_VEL,
+)
+from gateway.estimation.kernel import SampleLog
+from gateway.geometry.geodesy import radii_m
+from gateway.records import NavFlags
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
+
+FIELD_N_UT = (21.0, 0.0, 43.0)
+SPEED_MPS = 8.0
+STARTS_S, LOST_S, STOPS_S, ENDS_S = 30.0, 70.0, 80.0, 95.0
+LASTS_S = 20.0
+"""Later the speed may be none, for all that dead reckoning knows."""
+PACE_S = 6.0
+"""It starts, and stops, within this time."""
+SEEDS = range(4)
+
+
+def drive(seed: int, *, stops: bool) -> tuple[SampleLog, np.ndarray]:
+    """Drive north on a smooth road, lose GPS, and go on or stop; also tell the speed, m/s."""
+    rng, n = np.random.default_rng(seed), round(ENDS_S * RATE_HZ)
+    time_s = np.arange(n) / RATE_HZ
+    speed = np.clip((time_s - STARTS_S) / PACE_S, 0.0, 1.0)
+    if stops:
+        speed -= np.clip((time_s - STOPS_S) / PACE_S, 0.0, 1.0)
+    speed *= SPEED_MPS
+    imu = np.full((n, IMU_COLUMNS), 0.0)
+    imu[:, ACCEL : ACCEL + 3] = rng.normal(0.0, 0.06, (n, 3)) + rng.normal(0.0, 0.03, 3)
+    imu[:, ACCEL] += np.gradient(speed, time_s)
+    imu[:, ACCEL + 2] -= G
+    imu[:, GYRO : GYRO + 3] = rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
+    imu[:, MAG : MAG + 3] = FIELD_N_UT + rng.normal(0.0, 0.4, (n, 3))
+    at = np.arange(RATE_HZ, round(LOST_S * RATE_HZ), RATE_HZ // FIXES_HZ)
+    gps = np.full((len(at), GPS_COLUMNS), math.nan)
+    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
+    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
+    gps[:, GPS_LAT] += np.degrees(np.cumsum(speed)[at] / RATE_HZ / radii_m(LAT_DEG, ALT_M)[0])
+    gps[:, GPS_ALT] = ALT_M
+    gps[:, GPS_VEL : GPS_VEL + 3] = rng.normal(0.0, 0.1, (len(at), 3))
+    gps[:, GPS_VEL] += speed[at]
+    us = np.round(time_s * 1e6).astype(np.int64)
+    return SampleLog(us, imu, np.empty(0, np.int64), np.empty(0), us[at], gps), speed
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_what_rolls_on_in_an_outage_does_not_rest(name: str, seed: int) -> None:
+    log, speed = drive(seed, stops=False)
+    out = estimator_of(name).run(log)
+    lost = (log.imu_time_us > LOST_S * 1e6) & (log.imu_time_us < (LOST_S + LASTS_S) * 1e6)
+    assert not (out[lost, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
+    assert np.abs(out[lost, NAV_VEL] - speed[lost]).max() < 0.5 * SPEED_MPS
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_what_stops_in_an_outage_rests(name: str, seed: int) -> None:
+    log, _ = drive(seed, stops=True)
+    out = estimator_of(name).run(log)
+    rests = (out[:, NAV_FLAGS].astype(int) & NavFlags.AT_REST) != 0
+    time_s = log.imu_time_us * 1e-6
+    assert not rests[(time_s > LOST_S) & (time_s < STOPS_S)].any()
+    assert rests[time_s > STOPS_S + PACE_S + 4.0].all()
+    assert np.abs(out[-1, NAV_VEL : NAV_VEL + 2]).max() < 0.2
