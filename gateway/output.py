@@ -8,6 +8,7 @@ of it or nothing under that name: not after a power loss, and not after it was k
 import contextlib
 import errno
 import os
+import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -128,6 +129,48 @@ def write_new(
             fresh.unlink(missing_ok=True)
     sync_folder(path.parent)
     return size
+
+
+@contextlib.contextmanager
+def written_together(folder: Path) -> Iterator[Path]:
+    """Have files written that belong together: all of them get into a folder, or none.
+
+    Parameters
+    ----------
+    folder : Path
+        Made where it is not there yet. Files of the same names in it are replaced.
+
+    Yields
+    ------
+    Path
+        An empty folder, on the same disk, to write the files into.
+
+    Raises
+    ------
+    OSError
+        As `check_output`, or if the disk fails.
+    """
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(dir=folder, prefix="."))
+    try:
+        yield fresh
+        files = [*fresh.iterdir()]
+        for file in files:
+            check_output(folder / file.name, overwrite=True)
+        for file in files:
+            file.replace(folder / file.name)
+        sync_folder(folder)
+    except OSError as error:
+        if error.filename is not None and Path(error.filename).parent == fresh:
+            error.filename = str(folder / Path(error.filename).name)
+        raise
+    finally:
+        shutil.rmtree(fresh)
+        if is_new:
+            # It is still empty where something failed.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 @contextlib.contextmanager

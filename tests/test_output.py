@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.output import PRIVATE, check_folder, check_output, write_new
+from gateway.output import PRIVATE, check_folder, check_output, write_new, written_together
 
 pytestmark = pytest.mark.io
 
@@ -151,6 +151,36 @@ def test_a_full_disk_is_told_by_the_file_that_was_wanted(
     with pytest.raises(OSError, match="No space left") as caught:
         write_new(tmp_path / "a.csv", [b"1"])
     assert caught.value.filename == str(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_files_that_belong_together_get_their_names_together(
+    tmp_path: Path, is_there: bool
+) -> None:
+    folder = tmp_path / "report"
+    if is_there:
+        folder.mkdir()
+        (folder / "page").write_bytes(b"old")
+
+    def fill_disk() -> None:
+        with written_together(folder) as fresh:
+            write_new(fresh / "page", [b"new"])
+            raise OSError(errno.ENOSPC, "full", str(fresh / "figure"))
+
+    with pytest.raises(OSError, match="full") as caught:
+        fill_disk()
+    assert caught.value.filename == str(folder / "figure")
+    assert [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()] == (
+        [b"old"] if is_there else []
+    )
+    assert folder.exists() == is_there
+    with written_together(folder) as fresh:
+        write_new(fresh / "page", [b"new"])
+        write_new(fresh / "figure", [b"1"])
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        "page": b"new",
+        "figure": b"1",
+    }
 
 
 def test_what_cannot_be_read_keeps_its_own_name(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from gateway.analysis.reporting.style import (
     to_png,
     to_svg,
 )
-from gateway.output import write_new
+from gateway.output import write_new, written_together
 
 PAGE_NAME: Final = "index.html"
 
@@ -129,18 +129,17 @@ def write_report(
     Path
         The page.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for section in report.sections:
-        for table in section.tables:
-            _write(folder / f"{table.name}.csv", table.frame.to_csv(index=False).encode())
-    pictures = [picture for section in report.sections for picture in section.pictures]
-    drawn = {}
-    for picture in draw_all(pictures, folder, jobs or cores()):
-        drawn[picture.name] = picture
-        on_picture()
-    page = folder / PAGE_NAME
-    _write(page, render_page(report, drawn).encode())
-    return page
+    with written_together(folder) as fresh:
+        for section in report.sections:
+            for table in section.tables:
+                _write(fresh / f"{table.name}.csv", table.frame.to_csv(index=False).encode())
+        pictures = [picture for section in report.sections for picture in section.pictures]
+        drawn = {}
+        for picture in draw_all(pictures, fresh, jobs or cores()):
+            drawn[picture.name] = picture
+            on_picture()
+        _write(fresh / PAGE_NAME, render_page(report, drawn).encode())
+    return folder / PAGE_NAME
 
 
 def render_page(report: Report, drawn: dict[str, Drawn]) -> str:
@@ -192,7 +191,7 @@ def _draw_one(index: int) -> Drawn:
 
 
 def _write(path: Path, content: bytes) -> None:
-    write_new(path, [content], overwrite=True)
+    write_new(path, [content])
 
 
 def _write_picture(picture: Picture, folder: Path) -> Drawn:
