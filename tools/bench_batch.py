@@ -4,7 +4,7 @@
     python tools/bench_batch.py fuse --flights 24      # or report, sweep: serial beside processes
     python tools/bench_batch.py dask --flights 24      # fuse: a cluster of two beside processes
     python tools/bench_batch.py growth --flights 200   # cost and memory against the number of files
-    python tools/bench_batch.py hangar --files 10000   # a catalogue: index, index again, ask
+    python tools/bench_batch.py catalogue --files 10000   # a catalogue: index, index again, ask
     python tools/bench_batch.py --quick                # all of it with few, short flights
 
 Recordings are simulated once and stay in --folder. Each measurement has a fresh process of its own,
@@ -47,9 +47,9 @@ from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, 
 from gateway.season.batch.result_folder import ResultFolder
 from gateway.season.batch.season_run import LOOKING, run_season
 from gateway.season.batch.storage import items_of
+from gateway.season.catalogue.catalogue_file import CATALOGUE_NAME, find_flights, geojson_of
+from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import Executor, LocalProcesses
-from gateway.season.hangar.hangar_file import HANGAR_NAME, find_flights, geojson_of
-from gateway.season.hangar.indexing import index_folder
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -79,7 +79,7 @@ BROKEN = 100
 ROW = "{:<8} {:<10} {:>7} {:>7} {:>8} {:>8} {:>9} {:>9} {:>9} {:>8}"
 HEAD = ("part", "by", "flights", "failed", "start, s", "wall, s", "s/flight", "CPU, s", "worker MB",
         "here MB")  # fmt: skip
-PARTS = ("all", "make", "fuse", "report", "sweep", "dask", "growth", "hangar")
+PARTS = ("all", "make", "fuse", "report", "sweep", "dask", "growth", "catalogue")
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -102,12 +102,12 @@ def main() -> None:
     files = chosen.files or (500 if quick else 10_000)
     whole = chosen.part == "all"
     began = time.perf_counter()
-    if chosen.part != "hangar":
+    if chosen.part != "catalogue":
         make(folder / "flights", flights, SHORT_S if quick else FLIGHT_S)
     if whole or chosen.part in (*SHARE, "dask", "growth"):
         work(folder, chosen.part, flights)
-    if whole or chosen.part == "hangar":
-        fresh_process(hangar, folder / f"hangar-{files}", files)
+    if whole or chosen.part == "catalogue":
+        fresh_process(catalogue, folder / f"catalogue-{files}", files)
     print(f"\n{time.perf_counter() - began:.0f} s in all")
 
 
@@ -300,13 +300,13 @@ def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
     return header_for(AircraftSettings(calibration=calibration), 1), rows
 
 
-def hangar(place: Path, count: int) -> None:
+def catalogue(place: Path, count: int) -> None:
     """Index many short recordings, again with nothing new, again with some new, and ask."""
     make(place, count, CATALOGUED_S)
     paths = sorted(place.glob("flight*.csv"))
     for number in range(count // BROKEN):
         (place / f"broken{number:05d}.csv").write_text(f"x,y\n1,{number}\n")
-    (place / HANGAR_NAME).unlink(missing_ok=True)
+    (place / CATALOGUE_NAME).unlink(missing_ok=True)
     size = sum(path.stat().st_size for path in paths)
     print(
         f"\ncatalogue of {count} recordings of {CATALOGUED_S:.0f} s, {size / 1e9:.2f} GB, "
@@ -317,7 +317,7 @@ def hangar(place: Path, count: int) -> None:
     for path in paths[::100]:
         path.write_bytes(path.read_bytes() + b'# mark: {"time_us": 1, "text": "new"}\n')
     _index(place, "again, 1 % changed")
-    print(f"  {(place / HANGAR_NAME).stat().st_size / 1e6:.1f} MB in {HANGAR_NAME}")
+    print(f"  {(place / CATALOGUE_NAME).stat().st_size / 1e6:.1f} MB in {CATALOGUE_NAME}")
     asked: dict[str, Callable[[], Any]] = {
         query: partial(find_flights, place, query) for query in QUERIES
     }

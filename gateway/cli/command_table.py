@@ -90,8 +90,8 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
         RECORDINGS,
     ),
-    "hangar": CommandEntry(
-        "recorded.hangar",
+    "catalogue": CommandEntry(
+        "recorded.catalogue",
         "Index all recordings under a folder, and list and search what is in them.",
         RECORDINGS,
     ),

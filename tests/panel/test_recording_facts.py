@@ -3,20 +3,20 @@ from pathlib import Path
 import pytest
 
 from gateway.panel.serving.recording_facts import RecordingFacts
-from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
+from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
 from gateway.season.statistics.flight_facts import FlightFacts
 
 pytestmark = pytest.mark.io
 
 
 def catalogue(folder: Path, **seconds: float) -> None:
-    hangar = Hangar(folder)
+    catalogue = Catalogue(folder)
     for name, duration in seconds.items():
         for kind in ("tlog", "table"):
             facts = FlightFacts(duration=duration, loss=0.1 if kind == "table" else None)
             path = f"{name}.{kind}"
-            hangar.put([CataloguedFile(path, name, kind, 1, 1, path, flights=((facts, []),))])
-    hangar.close()
+            catalogue.put([CataloguedFile(path, name, kind, 1, 1, path, flights=((facts, []),))])
+    catalogue.close()
 
 
 def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_without_a_catalogue_names_are_searched_all_the_same(tmp_path: Path) -> 
     facts.look(tmp_path, "x")
     assert facts.of("x1") is None
     assert facts.shows("x1", "x")
-    assert "mavgate hangar" in facts.trouble
+    assert "mavgate catalogue" in facts.trouble
     catalogue(tmp_path, x1=5.0)
     facts.look(tmp_path, "x")
     assert facts.trouble == ""

@@ -4,12 +4,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.season.hangar.hangar_file import HANGAR_NAME, HangarError, Row, find_flights
+from gateway.season.catalogue.catalogue_file import (
+    CATALOGUE_NAME,
+    CatalogueError,
+    Row,
+    find_flights,
+)
 
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""
 
-NO_CATALOGUE: Final = "Run mavgate hangar to fill in duration, distance, height and loss."
+NO_CATALOGUE: Final = "Run mavgate catalogue to fill in duration, distance, height and loss."
 
 
 class RecordingFacts:
@@ -30,7 +35,7 @@ class RecordingFacts:
         folder : Path
             Of the recordings.
         search : str
-            A part of a name, or a condition as for `mavgate hangar list --where`.
+            A part of a name, or a condition as for `mavgate catalogue list --where`.
         """
         stamp = _stamp(folder)
         if self._asked == (folder, stamp, search):
@@ -44,7 +49,7 @@ class RecordingFacts:
                 if is_condition
                 else None
             )
-        except HangarError as error:
+        except CatalogueError as error:
             self.trouble, self._found = str(error), frozenset()
 
     def of(self, name: str) -> Row | None:
@@ -61,7 +66,7 @@ class RecordingFacts:
 def _stamp(folder: Path) -> tuple[int, int] | None:
     """Return a stamp that changes with the catalogue; None if there is none."""
     try:
-        found = (folder / HANGAR_NAME).stat()
+        found = (folder / CATALOGUE_NAME).stat()
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size

@@ -18,7 +18,7 @@ from gateway.panel.recorded_aircraft import Profile
 from gateway.panel.recording_player import SPEEDS, Playback
 from gateway.panel.serving.recording_facts import RecordingFacts
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.season.hangar.hangar_file import Row
+from gateway.season.catalogue.catalogue_file import Row
 
 REFRESH_S: Final = 1.0
 PLACE_S: Final = 0.25

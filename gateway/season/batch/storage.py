@@ -16,8 +16,8 @@ import msgspec
 
 from gateway.edges.disk.recording_streams import CHUNK, GZIP
 from gateway.edges.disk.recordings import parts_together, recording_name
+from gateway.season.catalogue.indexing import ENDINGS, digest_of, recordings_below
 from gateway.season.executors import WorkError
-from gateway.season.hangar.indexing import ENDINGS, digest_of, recordings_below
 
 MARK: Final = "://"
 """What makes a name a URL."""

@@ -280,8 +280,8 @@ def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:
 def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> None:
     (tmp_path / "x[").mkdir()
     table(tmp_path / "x[" / "y].csv")
-    run("hangar", tmp_path, "--jobs", 1)
-    assert "x[/y].csv" in run("hangar", "list", "-d", tmp_path)
+    run("catalogue", tmp_path, "--jobs", 1)
+    assert "x[/y].csv" in run("catalogue", "list", "-d", tmp_path)
 
 
 def test_a_log_line_holds_no_control_characters() -> None:

@@ -1,6 +1,7 @@
 import gzip
 import json
 import os
+import re
 import sqlite3
 from pathlib import Path
 
@@ -14,18 +15,18 @@ from gateway.cli.app import app
 from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
-from gateway.season.executors import LocalProcesses
-from gateway.season.hangar import indexing
-from gateway.season.hangar.hangar_file import (
+from gateway.season.catalogue import indexing
+from gateway.season.catalogue.catalogue_file import (
+    CATALOGUE_NAME,
     COLUMNS,
-    HANGAR_NAME,
+    Catalogue,
     CataloguedFile,
-    Hangar,
-    HangarError,
+    CatalogueError,
     find_flights,
     geojson_of,
 )
-from gateway.season.hangar.indexing import index_folder, read_file, recordings_below
+from gateway.season.catalogue.indexing import index_folder, read_file, recordings_below
+from gateway.season.executors import LocalProcesses
 from gateway.season.statistics.flight_facts import FlightFacts, lost_share
 from gateway.season.statistics.track_shape import feature, simplified
 from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
@@ -253,27 +254,27 @@ def test_a_condition_can_only_read(folder: Path, where: str, told: str) -> None:
     if not told:
         assert len(find_flights(folder, where)) == 4
         return
-    with pytest.raises(HangarError, match=f"(?s)({told}).*duration > 300"):
+    with pytest.raises(CatalogueError, match=f"(?s)({told}).*duration > 300"):
         find_flights(folder, where)
     assert len(find_flights(folder)) == 6
 
 
 def test_what_is_no_catalogue_is_said(tmp_path: Path) -> None:
-    with pytest.raises(HangarError, match="no catalogue yet"):
+    with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)
-    (tmp_path / HANGAR_NAME).write_text("a diary" * 1000)
-    with pytest.raises(HangarError, match="delete it"):
-        Hangar(tmp_path)
+    (tmp_path / CATALOGUE_NAME).write_text("a diary" * 1000)
+    with pytest.raises(CatalogueError, match="delete it"):
+        Catalogue(tmp_path)
 
 
 def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
-    hangar = Hangar(tmp_path)
-    hangar.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
-    hangar._db.execute("PRAGMA user_version = 99")
-    hangar.close()
-    with pytest.raises(HangarError, match="another version"):
+    catalogue = Catalogue(tmp_path)
+    catalogue.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
+    catalogue._db.execute("PRAGMA user_version = 99")
+    catalogue.close()
+    with pytest.raises(CatalogueError, match="another version"):
         find_flights(tmp_path)
-    Hangar(tmp_path).close()
+    Catalogue(tmp_path).close()
     assert find_flights(tmp_path) == []
 
 
@@ -285,15 +286,15 @@ def test_a_catalogue_that_cannot_be_written_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
 ) -> None:
     def fail(*_: object) -> None:
-        (tmp_path / HANGAR_NAME).touch()
+        (tmp_path / CATALOGUE_NAME).touch()
         error = sqlite3.OperationalError("no luck")
         error.sqlite_errorcode = code
         raise error
 
-    monkeypatch.setattr(Hangar, "_make", fail)
-    with pytest.raises(HangarError, match=f"no luck; .*{told}"):
-        Hangar(tmp_path)
-    with pytest.raises(HangarError, match="no catalogue yet"):
+    monkeypatch.setattr(Catalogue, "_make", fail)
+    with pytest.raises(CatalogueError, match=f"no luck; .*{told}"):
+        Catalogue(tmp_path)
+    with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)
 
 
@@ -304,24 +305,24 @@ def catalogued(number: int) -> CataloguedFile:
 def test_a_catalogue_that_another_indexing_made_meanwhile_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = Hangar(tmp_path)
+    first = Catalogue(tmp_path)
     first.put([catalogued(1)])
-    looks, is_made = [False], Hangar._is_made
-    monkeypatch.setattr(Hangar, "_is_made", lambda self: looks.pop() if looks else is_made(self))
-    second = Hangar(tmp_path)
+    looks, is_made = [False], Catalogue._is_made
+    monkeypatch.setattr(Catalogue, "_is_made", lambda self: looks.pop() if looks else is_made(self))
+    second = Catalogue(tmp_path)
     second.put([catalogued(2)])
     assert second.known().keys() == first.known().keys() == {"1.csv", "2.csv"}
-    for hangar in (first, second):
-        hangar.close()
+    for catalogue in (first, second):
+        catalogue.close()
 
 
 def test_a_damaged_catalogue_is_said(tmp_path: Path) -> None:
-    hangar = Hangar(tmp_path)
-    hangar.put(catalogued(number) for number in range(200))
-    hangar.close()
-    data = (tmp_path / HANGAR_NAME).read_bytes()
-    (tmp_path / HANGAR_NAME).write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
-    with pytest.raises(HangarError, match="delete it and index again"):
+    catalogue = Catalogue(tmp_path)
+    catalogue.put(catalogued(number) for number in range(200))
+    catalogue.close()
+    data = (tmp_path / CATALOGUE_NAME).read_bytes()
+    (tmp_path / CATALOGUE_NAME).write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
+    with pytest.raises(CatalogueError, match="delete it and index again"):
         index_folder(tmp_path, OPTIONS, LocalProcesses(1))
 
 
@@ -359,24 +360,27 @@ def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:
 
 def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> None:
     (tmp_path / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
+    (tmp_path / "one_02_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "bad.csv").write_text("")
     run = CliRunner().invoke
-    done = run(app, ["hangar", str(tmp_path), "--jobs", "1"])
+    done = run(app, ["catalogue", str(tmp_path), "--jobs", "1"])
     assert done.exit_code == 0, done.output
-    assert "2 read, 0 unchanged, 0 gone; 1 of those read are broken" in done.output
-    listed = run(app, ["hangar", "list", "--folder", str(tmp_path)])
+    assert "3 files read (1 of them broken), 0 unchanged, 0 gone" in done.output
+    listed = run(app, ["catalogue", "list", "--folder", str(tmp_path)])
     assert "one_01_v1.csv" in listed.output
-    assert "broken" in listed.output
-    wanted = ["hangar", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
-    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one"]
-    shown = run(app, ["hangar", "show", "one", "-d", str(tmp_path)])
-    assert "takeoff" in shown.output or "fastest" in shown.output
-    geo = json.loads(run(app, ["hangar", "show", "one", "-d", str(tmp_path), "--geojson"]).output)
+    assert re.search(r"1 flight, \S+ h, in 3 files; 1 broken", listed.output)
+    wanted = ["catalogue", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
+    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one", "one"]
+    shown = run(app, ["catalogue", "show", "one", "-d", str(tmp_path)])
+    assert re.search(r"fastest +\d+\.\d +m/s", shown.output)
+    geo = json.loads(
+        run(app, ["catalogue", "show", "one", "-d", str(tmp_path), "--geojson"]).output
+    )
     assert geo["type"] == "FeatureCollection"
-    refused = run(app, ["hangar", "list", "-d", str(tmp_path), "--where", "nonsense"])
+    refused = run(app, ["catalogue", "list", "-d", str(tmp_path), "--where", "nonsense"])
     assert refused.exit_code == 2
     assert "no such column" in refused.output
-    assert run(app, ["hangar", "show", "nobody", "-d", str(tmp_path)]).exit_code == 2
+    assert run(app, ["catalogue", "show", "nobody", "-d", str(tmp_path)]).exit_code == 2
 
 
 def test_every_column_has_a_place_in_the_book() -> None:

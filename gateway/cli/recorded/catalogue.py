@@ -1,4 +1,4 @@
-"""`mavgate hangar`: the catalogue of all recordings under a folder."""
+"""`mavgate catalogue`: the catalogue of all recordings under a folder."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,12 +16,18 @@ from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_col
 from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, table_of
 from gateway.flights.reading import ReadOptions
+from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
+from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import LocalProcesses
-from gateway.season.hangar.hangar_file import HangarError, Row, find_flights, geojson_of
-from gateway.season.hangar.indexing import index_folder
+from gateway.season.statistics.flight_facts import UNITS
 
 INDEX: Final = "index"
 UNKNOWN: Final = "—"
+DIGITS: Final = {
+    "duration": 1, "distance": 0, "highest": 1, "fastest": 1, "gps_lost": 1, "loss": 4,
+    **dict.fromkeys(("lat_min", "lat_max", "lon_min", "lon_max", "takeoff_lat", "takeoff_lon"), 6),
+}  # fmt: skip
+"""Decimals that are shown of a number."""
 
 
 class _IndexByDefault(TyperGroup):
@@ -52,7 +58,7 @@ GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.add_typer(group, name="hangar", rich_help_panel=PANEL)
+    app.add_typer(group, name="catalogue", rich_help_panel=PANEL)
 
 
 @group.command(INDEX)
@@ -86,8 +92,8 @@ def index(
 
         report = index_folder(place, options, LocalProcesses(jobs), show)
     console_of().print(
-        f"{place}: {report.read} read, {report.unchanged} unchanged, {report.gone} gone; "
-        f"{report.broken} of those read are broken",
+        f"{place}: {report.read} files read ({report.broken} of them broken), "
+        f"{report.unchanged} unchanged, {report.gone} gone"
     )
 
 
@@ -129,7 +135,7 @@ def show(
     with _asking():
         rows = find_flights(place, where)
         if not rows:
-            refuse(f"{name}: is not in the catalogue of {place}; `mavgate hangar list` shows it")
+            refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
         if geojson:
             print(msgspec.json.encode(geojson_of(place, where)).decode())
             return
@@ -138,10 +144,11 @@ def show(
         return
     for number, row in enumerate(rows):
         print(end="\n" if number else "")
-        grid = table_of("what", "value", left=2)
+        grid = table_of("what", "value", "unit", left=3)
         for key, value in row.items():
             if value is not None and key != "modified":
-                grid.add_row(key, f"{value:.7g}" if isinstance(value, float) else str(value))
+                text = f"{value:.{DIGITS[key]}f}" if isinstance(value, float) else str(value)
+                grid.add_row(key, text, UNITS.get(key, ""))
         console_of().print(grid)
 
 
@@ -154,14 +161,14 @@ def _asking() -> Iterator[None]:
     """End the command with a clear word where the catalogue cannot answer."""
     try:
         yield
-    except HangarError as error:
+    except CatalogueError as error:
         refuse(str(error))
 
 
 def _show_table(rows: list[Row]) -> None:
     grid = table_of(
-        "recording", "kind", "began (UTC)", "aircraft", "s", "km", "max m", "max m/s", "GPS lost",
-        "faults", "loss", left=3,
+        "file", "kind", "began (UTC)", "aircraft", "duration, s", "distance, km", "highest, m",
+        "fastest, m/s", "GPS outages", "faults", "loss", left=3,
     )  # fmt: skip
     for row in rows:
         if row["error"] is not None:
@@ -177,9 +184,27 @@ def _show_table(rows: list[Row]) -> None:
         )  # fmt: skip
     console = console_of()
     console.print(grid)
-    hours = sum(row["duration"] or 0.0 for row in rows) / 3600.0
+    lasted_s = _durations_s(rows)
+    hours = sum(lasted_s.values()) / 3600.0
+    files = len({row["path"] for row in rows})
     broken = sum(row["error"] is not None for row in rows)
-    console.print(f"{len(rows) - broken} flights, {hours:.1f} h; {broken} broken files")
+    console.print(
+        f"{len(lasted_s)} flight{'s' * (len(lasted_s) != 1)}, {hours:.2f} h, in {files} files; "
+        f"{broken} broken"
+    )
+
+
+def _durations_s(rows: list[Row]) -> dict[tuple[str, int | None], float]:
+    """Return how long each flight lasted, by recording and aircraft.
+
+    The tables of a recording hold the same flight as its tlogs; its parts follow one another.
+    """
+    found: dict[tuple[str, int | None], dict[str, float]] = {}
+    for row in rows:
+        if row["error"] is None:
+            of_kind = found.setdefault((row["name"], row["vehicle"]), {})
+            of_kind[row["kind"]] = of_kind.get(row["kind"], 0.0) + (row["duration"] or 0.0)
+    return {flight: max(of_kind.values()) for flight, of_kind in found.items()}
 
 
 def _text(value: float | None, digits: int = 0) -> str:

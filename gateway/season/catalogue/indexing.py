@@ -24,8 +24,8 @@ from gateway.edges.disk.recording_streams import (
 from gateway.edges.disk.recordings import as_text, recording_name
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.flights.reading import ReadOptions, open_rows
+from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
 from gateway.season.executors import Executor, WorkFailed
-from gateway.season.hangar.hangar_file import CataloguedFile, Hangar
 from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows
 
 ENDINGS: Final = (".tlog", ".csv")
@@ -79,24 +79,24 @@ def index_folder(
 
     Raises
     ------
-    HangarError
+    CatalogueError
         If the catalogue cannot be written.
     """
-    hangar = Hangar(folder)
+    catalogue = Catalogue(folder)
     try:
-        known = hangar.known()
+        known = catalogue.known()
         there = {as_text(str(path.relative_to(folder))): path for path in recordings_below(folder)}
         gone = known.keys() - there.keys()
-        hangar.forget(gone)
+        catalogue.forget(gone)
         wanted = [
             (str(path.relative_to(folder)), known[name][2] if name in known else "")
             for name, path in there.items()
             if name not in known or _stamp_if_there(path) != known[name][:2]
         ]
         report = IndexReport(unchanged=len(there) - len(wanted), gone=len(gone))
-        return _read_all(hangar, folder, options, executor, wanted, on_progress, report)
+        return _read_all(catalogue, folder, options, executor, wanted, on_progress, report)
     finally:
-        hangar.close()
+        catalogue.close()
 
 
 def recordings_below(folder: Path) -> Iterator[Path]:
@@ -138,7 +138,7 @@ def digest_of(path: Path) -> str:
 
 
 def _read_all(
-    hangar: Hangar,
+    catalogue: Catalogue,
     folder: Path,
     options: ReadOptions,
     executor: Executor,
@@ -160,7 +160,7 @@ def _read_all(
             known = {as_text(name): digest for name, digest in piece}
             same = [file for file in files if file.digest and file.digest == known[file.path]]
             for file in same:
-                hangar.touch(file.path, file.modified_ns)
+                catalogue.touch(file.path, file.modified_ns)
             fresh = [file for file in files if file not in same]
             waiting += fresh
             report = replace(
@@ -169,13 +169,13 @@ def _read_all(
                 broken=report.broken + sum(file.error is not None for file in fresh),
             )
             if time.monotonic() - kept_s > KEEP_S:
-                hangar.put(waiting)
+                catalogue.put(waiting)
                 waiting, kept_s = [], time.monotonic()
             done += len(piece)
             if on_progress is not None:
                 on_progress(done, len(wanted))
     finally:
-        hangar.put(waiting)
+        catalogue.put(waiting)
     return report
 
 

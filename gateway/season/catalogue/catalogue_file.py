@@ -15,7 +15,7 @@ from gateway.season.statistics.flight_facts import FlightFacts
 from gateway.season.statistics.recording_tally import Flown
 from gateway.season.statistics.track_shape import Place, feature, feature_collection
 
-HANGAR_NAME: Final = "hangar.sqlite"
+CATALOGUE_NAME: Final = "catalogue.sqlite"
 SCHEMA: Final = 1
 """Of another one, the catalogue is made anew."""
 BUSY_S: Final = 10.0
@@ -48,7 +48,7 @@ _WAYS_OUT: Final = {
 Row = dict[str, Any]
 
 
-class HangarError(Exception):
+class CatalogueError(Exception):
     """A catalogue that cannot be read, or a question that it does not understand."""
 
 
@@ -71,7 +71,7 @@ class CataloguedFile:
     """One for each vehicle; none in a broken file."""
 
 
-class Hangar:
+class Catalogue:
     """The catalogue, open to be changed.
 
     Parameters
@@ -81,12 +81,12 @@ class Hangar:
 
     Raises
     ------
-    HangarError
+    CatalogueError
         If the file cannot be made or is of another program.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / HANGAR_NAME
+        self.path = folder / CATALOGUE_NAME
         with _told(self.path):
             self._db = sqlite3.connect(self.path, timeout=BUSY_S)
             if not self._is_made():
@@ -175,7 +175,7 @@ def find_flights(folder: Path, where: str = "") -> list[Row]:
 
     Raises
     ------
-    HangarError
+    CatalogueError
         If there is no catalogue, or the condition is none.
     """
     with _asked(folder) as db:
@@ -199,18 +199,20 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
 @contextmanager
 def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
     """Open a catalogue for reading alone."""
-    path = folder / HANGAR_NAME
+    path = folder / CATALOGUE_NAME
     # An indexing that found no room leaves an empty file.
     if not path.exists() or not path.stat().st_size:
-        raise HangarError(f"{folder} has no catalogue yet; `mavgate hangar {folder}` makes one")
+        raise CatalogueError(
+            f"{folder} has no catalogue yet; `mavgate catalogue {folder}` makes one"
+        )
     with _told(path):
         db = sqlite3.connect(
             f"file:{quote(str(path.absolute()))}?mode=ro", uri=True, timeout=BUSY_S
         )
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
-                raise HangarError(
-                    f"{path} is of another version; `mavgate hangar {folder}` makes it anew"
+                raise CatalogueError(
+                    f"{path} is of another version; `mavgate catalogue {folder}` makes it anew"
                 )
             yield db
         finally:
@@ -241,7 +243,7 @@ def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[
         ).fetchall()
     except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
         text = "it takes too long" if steps > MAX_STEPS else str(error)
-        raise HangarError(
+        raise CatalogueError(
             f"--where {where!r}: {text}; write a condition such as "
             f"'duration > 300 and loss > 0.05', of {', '.join(COLUMNS)}"
         ) from error
@@ -258,7 +260,7 @@ def _told(path: Path) -> Iterator[None]:
     except sqlite3.Error as error:
         # The lowest byte; the others tell more precisely what failed.
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-        raise HangarError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
+        raise CatalogueError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
 
 
 def _counts(place: Place) -> tuple[int, int, int]:
