@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.config import GatewaySettings
-from gateway.edges.disk import tracker_csv
+from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import with_reference
+from gateway.flights.reading import ReadOptions
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
@@ -39,8 +40,8 @@ MAX_START_S = 1.0
 
 def through_pipeline(file: Path) -> Iterator[mavlink.MAVLink_message]:
     """Give the messages of a log that is pushed through the stages without waiting."""
-    log = tracker_csv.read_flight(file)
     settings = GatewaySettings()
+    log = open_flown([file], ReadOptions(PipelineSettings(settings.default_aircraft)))
     aircraft = with_reference(settings.default_aircraft, gps_latency_s=log.gps_latency_s)
     pipeline = Pipeline(PipelineSettings(aircraft))
     parser = mavlink.MAVLink(None)

@@ -3,15 +3,12 @@
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from gateway.aircraft import AircraftSettings
-from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.edges.disk.tracker_csv import read_flight
 from gateway.flightlog.table.row import TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import joined_tables
@@ -52,21 +49,15 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     ------
     FlightError
         If there is no flight in it.
-    FlightFileError
-        If it is a tracker log that cannot be read.
     OSError
         If it cannot be read at all.
     """
-    is_tracker_log = options.columns is None and kind_of(files[0]) is FileKind.FOREIGN
-    own = read_flight(files[0]) if is_tracker_log else None
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)
-    cells = [] if is_tracker_log else _cells(table.plain_rows, aircraft)
+    cells = _cells(table.plain_rows, aircraft)
     for remark in table.remarks:
         log.warning(remark)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    if own is not None:
-        return replace(own, gps_latency_s=latency_s)
     columns = np.array(cells, float).reshape(-1, len(COLUMNS))
     try:
         return RecordedFlight.from_columns(dict(zip(COLUMNS, columns.T, strict=True)), latency_s)
@@ -84,7 +75,12 @@ def _cells(rows: Iterable[TableRow], aircraft: AircraftSettings) -> list[list[fl
             cells[BARO] = pressure_altitude_m(row.baro.pressure_pa)
         if (fix := row.gps) is not None and fix.fix_ok:
             place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
-            cells[GPS:] = (fix.time_us / US_PER_S, *place, fix.alt_amsl_m, *fix.vel_n_mps)
+            north_mps, east_mps, down_mps = fix.vel_n_mps
+            if math.isnan(down_mps):
+                # A receiver sends a whole velocity or none; speed and course are of a level one.
+                down_mps = 0.0
+            velocity = (north_mps, east_mps, down_mps)
+            cells[GPS:] = (fix.time_us / US_PER_S, *place, fix.alt_amsl_m, *velocity)
         imu = _imu(row, chain)
         if imu is None or (found and row.time_us / US_PER_S <= found[-1][0]):
             continue

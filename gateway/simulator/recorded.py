@@ -86,7 +86,7 @@ class RecordedFlight:
     gps_lon_deg: FloatArray
     gps_alt_m: FloatArray
     gps_vel_n_mps: FloatArray
-    """Shape (M, 3); NaN where the recording has neither velocity nor speed and course."""
+    """Shape (M, 3); NaN where the recording has none."""
     gps_latency_s: float
     """From a fix's validity to its arrival; used for its time of week and UTC alone."""
 
@@ -111,7 +111,7 @@ class RecordedFlight:
         columns : mapping of str to ndarray, each (N,)
             `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s are required. Optional:
             `mx` `my` `mz` in uT, `baro_alt_m`, `gps_time_s`, `gps_lat`, `gps_lon`, `gps_alt_m`,
-            `gps_vn` `gps_ve` `gps_vd` or `gps_speed_ms` and `gps_course_deg`. NaN is "no new one".
+            `gps_vn` `gps_ve` `gps_vd`. NaN is "no new one".
         gps_latency_s : float
             GPS latency given in the log.
 
@@ -154,7 +154,7 @@ class RecordedFlight:
             gps_lat_deg=columns.get("gps_lat", blank)[fixes],
             gps_lon_deg=columns.get("gps_lon", blank)[fixes],
             gps_alt_m=columns.get("gps_alt_m", blank)[fixes],
-            gps_vel_n_mps=_velocity(columns, blank)[fixes],
+            gps_vel_n_mps=stack("gps_vn", "gps_ve", "gps_vd")[fixes],
             gps_latency_s=gps_latency_s,
         )
 
@@ -269,15 +269,6 @@ def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
         yield dataclasses.replace(
             flight, time_s=flight.time_s + begin_s, gps_time_s=flight.gps_time_s + begin_s
         )
-
-
-def _velocity(columns: Mapping[str, FloatArray], blank: FloatArray) -> FloatArray:
-    """Return the GPS velocity, or compute it from speed and course; shape (N, 3)."""
-    vel = np.column_stack([columns.get(name, blank) for name in ("gps_vn", "gps_ve", "gps_vd")])
-    speed = columns.get("gps_speed_ms", blank)
-    course_rad = np.radians(columns.get("gps_course_deg", blank))
-    level = np.column_stack([speed * np.cos(course_rad), speed * np.sin(course_rad), 0.0 * speed])
-    return np.where(_complete(vel)[:, np.newaxis], vel, level)
 
 
 def _imu_sensors(flight: RecordedFlight) -> int:

@@ -81,11 +81,22 @@ def test_an_autopilots_tlog(tmp_path: Path) -> None:
     np.testing.assert_allclose(flight.gps_lat_deg[-1], 47.000029, atol=1e-7)
 
 
-def test_a_tracker_log_stays_one(tmp_path: Path) -> None:
+def test_another_programs_csv(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "log.csv"
-    rows = "".join(f"{k / 50},0,0,-9.8,0,0,0\n" for k in range(9))
-    path.write_text("# gps_latency_s=0.15\ntime_s,ax,ay,az,gx,gy,gz\n" + rows)
-    assert open_flown([path], OPTIONS).gps_latency_s == 0.15
+    rows = [f"{k / 50},{k},0,-9.8,0,0,0,{100 + k},90,7\n" for k in range(9)]
+    rows[3] = "oops" + rows[3]
+    names = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_course_deg,gps_speed_ms"
+    for name, value in {"gps_lat": 47, "gps_lon": 8}.items():
+        names += f",{name}"
+        rows[5] = rows[5].replace("\n", f",{value}\n")
+    path.write_text(f"# gps_latency_s=0.17\n{names}\n" + "".join(rows))
+    flight = open_flown([path], OPTIONS)
+    assert flight.accel_b_mps2[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+    np.testing.assert_allclose(flight.time_s, flight.accel_b_mps2[:, 0] / 50)
+    np.testing.assert_allclose(flight.baro_alt_m, 100 + flight.accel_b_mps2[:, 0])
+    np.testing.assert_allclose(flight.gps_vel_n_mps, [[0.0, 7.0, 0.0]], atol=1e-9)
+    assert (flight.gps_latency_s, flight.gps_time_s.tolist()) == (0.17, [0.1])
+    assert "1 lines cannot be read" in caplog.text
 
 
 def test_what_holds_no_flight_is_refused(tmp_path: Path) -> None:

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from gateway.edges.disk.tracker_csv import read_flight
+from gateway.config import GatewaySettings
+from gateway.flights.flown import open_flown
+from gateway.flights.reading import ReadOptions
+from gateway.pipeline import PipelineSettings
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
 from gateway.simulator.recorded import RecordedFlight, in_rounds, replay
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -143,14 +146,6 @@ class TestRanges:
 
 
 class TestGpsGaps:
-    def test_velocity_from_speed_and_course(self) -> None:
-        speed, course = np.full(ROWS, 10.0), np.full(ROWS, 90.0)
-        table = columns(
-            gps_vn=None, gps_ve=None, gps_vd=None, gps_speed_ms=speed, gps_course_deg=course
-        )
-        fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
-        assert fixes[0].vel_n_mps == pytest.approx((0.0, 10.0, 0.0))
-
     def test_what_is_missing_is_reported_as_unknown(self) -> None:
         table = columns(gps_vn=None, gps_alt_m=None)
         fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
@@ -186,7 +181,8 @@ class TestRefusals:
 
 @pytest.mark.io
 def test_real_flight_comes_through(data_dir) -> None:  # type: ignore[no-untyped-def]
-    flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
+    options = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+    flight = open_flown([data_dir / "arduplane_testlog2.csv.gz"], options)
     assert flight.gps_latency_s == 0.28
     link, fixes = Link(), []
     for frame in replay(QUIET, flight).frames(60.0):

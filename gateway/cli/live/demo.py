@@ -39,7 +39,6 @@ from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
-from gateway.edges.disk.tracker_csv import FlightFileError
 from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import with_reference
 from gateway.flights.reading import ReadOptions
@@ -100,7 +99,7 @@ def demo(
         else:
             line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
             aircraft = calibrated_aircraft(settings)
-    except (FlightFileError, BenchError, ValueError) as error:
+    except (BenchError, ValueError) as error:
         refuse(str(error))
     # Settings that a ground station stores in the demo must not become the real aircraft's.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
