@@ -10,13 +10,19 @@ An upload, seen from here:
 | upload | the item asked for, well        | REQUEST_INT of the next           | upload |
 | upload | the last item, well             | store all, ACK accepted           | idle   |
 | upload | the item asked for, bad         | ACK with what is bad              | idle   |
-| upload | another item                    | REQUEST_INT of the one asked for  | upload |
+| upload | one that it had before          |                                   | upload |
+| upload | one further on                  | REQUEST_INT of the one asked for  | upload |
 | upload | MISSION_COUNT, same client      | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK (cancelled)         |                                   | idle   |
-| upload | 250 ms without the item         | REQUEST_INT again, five times     | upload |
-| upload | 250 ms more                     | ACK cancelled                     | idle   |
+| upload | a while without the item        | REQUEST_INT again, five times     | upload |
+| upload | a while more                    | ACK cancelled                     | idle   |
 | idle   | the last item once more         | ACK accepted again                | idle   |
+
+A while is 250 ms, and on a slow link as long as an item takes, up to a second: what is asked for
+too soon comes twice, and if that were answered, so would be all that follow. Where a request comes
+twice or late, MAVSDK goes back to its item and then ignores requests beyond the next. So what is
+asked for again is the item after the one that came last.
 
 What is stored changes only when an upload is complete. A download has no state: each request is
 answered from the store.
@@ -28,6 +34,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.units import US_PER_S
 from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.services.missions.mission_items import (
     ACCEPTED,
@@ -42,6 +49,9 @@ from gateway.vehicle.services.missions.mission_items import (
 )
 
 ITEM_TIMEOUT_US: Final = 250_000
+LONGEST_TIMEOUT_US: Final = US_PER_S
+MARGIN: Final = 1.5
+"""A request is repeated after so many times what the item before took."""
 MAX_RETRIES: Final = 5
 KINDS: Final = (MISSION, FENCE, RALLY)
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
@@ -64,6 +74,11 @@ class _Upload:
     count: int
     due_us: int
     items: list[Item] = field(default_factory=list)
+    wanted: int = 0
+    """What is asked for: the first that is missing, or before it what the client goes on with."""
+    asked_us: int = 0
+    """When the first that is missing was asked for first."""
+    timeout_us: int = ITEM_TIMEOUT_US
     retries: int = 0
 
 
@@ -178,14 +193,14 @@ class MissionService:
         self._upload = self._finished = None
         if count == 0:
             return [mission_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
-        self._upload = _Upload(request, kind, count, now_us)
+        self._upload = _Upload(request, kind, count, now_us, asked_us=now_us)
         return self._ask(self._upload, now_us)
 
     def _ask(self, upload: _Upload, now_us: int) -> list[Answer]:
-        upload.due_us = now_us + ITEM_TIMEOUT_US
+        upload.due_us = now_us + upload.timeout_us
         request = upload.request
         wanted = mavlink.MAVLink_mission_request_int_message(
-            request.system_id, request.component_id, len(upload.items), upload.kind
+            request.system_id, request.component_id, upload.wanted, upload.kind
         )
         return [request.reply(wanted)]
 
@@ -194,6 +209,9 @@ class MissionService:
         upload = self._upload
         if upload is None or upload.request.client_id != request.client_id:
             return self._stray_item(request)
+        if message.seq < len(upload.items) and message.mission_type == upload.kind:
+            was_wanted, upload.wanted = message.seq == upload.wanted, message.seq + 1
+            return self._ask(upload, now_us) if was_wanted else []
         if message.seq != len(upload.items) or message.mission_type != upload.kind:
             return self._ask(upload, now_us)
         item = read_item(message)
@@ -202,7 +220,9 @@ class MissionService:
             self._upload = None
             return [mission_ack(request, result)]
         upload.items.append(item)
-        upload.retries = 0
+        taken_us = round(MARGIN * (now_us - upload.asked_us))
+        upload.timeout_us = min(max(taken_us, ITEM_TIMEOUT_US), LONGEST_TIMEOUT_US)
+        upload.wanted, upload.asked_us, upload.retries = len(upload.items), now_us, 0
         if len(upload.items) < upload.count:
             return self._ask(upload, now_us)
         self._upload, self._finished = None, upload
@@ -210,16 +230,17 @@ class MissionService:
         return [mission_ack(request, ACCEPTED), *stored]
 
     def _stray_item(self, request: Request) -> list[Answer]:
-        """Acknowledge a last item that comes again because the ACK was lost; deny any other."""
-        done = self._finished
-        message = request.message
-        if (
+        """Acknowledge a last item that comes again because the ACK was lost; deny what is new."""
+        done, message = self._finished, request.message
+        is_known = (
             done is not None
             and done.request.client_id == request.client_id
-            and (message.seq, message.mission_type) == (done.count - 1, done.kind)
-        ):
-            return [mission_ack(request, ACCEPTED)]
-        return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
+            and message.mission_type == done.kind
+            and message.seq < done.count
+        )
+        if done is None or not is_known:
+            return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
+        return [mission_ack(request, ACCEPTED)] if message.seq == done.count - 1 else []
 
     def _store(self, kind: int, items: tuple[Item, ...], now_us: int) -> list[Answer]:
         self.items[kind] = items
