@@ -236,6 +236,14 @@ class TestNonsense:
         assert NavFlags.SENSOR_FAULT in state.flags
         np.testing.assert_array_equal(estimator.state.q_nb, before)
 
+    def test_samples_that_are_lost_on_their_way_are_no_fault_of_a_sensor(
+        self, estimator: KernelEstimator
+    ) -> None:
+        feed(estimator, [*still(0, 3.0), fix(3_000_000)])
+        for lost_s in (0.3, 0.6, 5.0):
+            states = feed(estimator, still(estimator.state.time_us + round(lost_s * 1e6), 1.0))
+            assert not [each for each in states if NavFlags.SENSOR_FAULT in each.flags]
+
     @pytest.mark.parametrize("jump_us", [5_000_000, -60_000_000])
     def test_a_jump_in_time_is_survived(self, estimator: KernelEstimator, jump_us: int) -> None:
         start = 100_000_000

@@ -72,7 +72,7 @@ SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)
 def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
     dt = min(dt, LONGEST_SILENCE_S)
-    s.fault, s.sound_s = 1, 0.0
+    s.sound_s = 0.0
     still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)

@@ -226,7 +226,7 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     dt = min(dt, LONGEST_SILENCE_S)
     propagate(s, p)
-    s.fault, s.sound_s = 1, 0.0
+    s.sound_s = 0.0
     still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.gyro_bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)

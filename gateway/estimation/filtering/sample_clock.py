@@ -65,7 +65,7 @@ def is_silent(
     Parameters
     ----------
     s : FilterState
-        Changed in place: a silence may end.
+        Changed in place: a silence may end, and sensors that hang are a fault.
     p : FilterGains
         Constants.
     gyro, accel : tuple of 3 floats
@@ -76,7 +76,10 @@ def is_silent(
         Time since the sample before, s.
     """
     may_rest = is_sound(gyro, p.bias_limit_radps) and not moving
-    if dt > GAP_S or is_hanging(s, gyro, accel, may_rest, dt):
+    hangs = dt <= GAP_S and is_hanging(s, gyro, accel, may_rest, dt)
+    if dt > GAP_S or hangs:
+        # Samples that are lost on their way are no fault of the sensors.
+        s.fault = 1 if hangs else 0
         begin_turn(s, (0.0, 0.0, 0.0))
         return True
     s.silent_s, s.silent_rad, s.silent_rest = 0.0, 0.0, 0
