@@ -203,6 +203,20 @@ def test_gravity_is_found_through_any_shaking_that_gets_nowhere() -> None:
     assert known < 0.8 * fitted
 
 
+def test_what_no_manoeuvre_does_is_no_pair() -> None:
+    """A first height of zero, and the true one a second later, say 500 m/s."""
+    state = new_record(AlignmentState)
+    feed(state, Rotation.from_euler("ZYX", [1.0, 0.1, 0.2]), 1)
+    before = solve_alignment(state)
+    at_s = state.pair_s
+    for late_s, climb_mps in ((1.0, -500.0), (2.0, 0.0)):
+        vel = (state.pair_vel[0], state.pair_vel[1], climb_mps)
+        x, y, z = state.pair_force
+        force_i = (x, y, z - STANDARD_GRAVITY_MPS2)
+        assert align_by_velocity(state, at_s + late_s, vel, force_i, 0.6) == 0.0
+    assert level_difference(solve_alignment(state), before) < 1e-6
+
+
 class TestVelocityOfFix:
     def test_told_is_taken(self) -> None:
         state = new_record(WayState)

@@ -5,6 +5,7 @@ from typing import Annotated, Final
 
 from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray, write_vec
+from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import NAN, Vec3
 
@@ -21,7 +22,14 @@ class WayState:
     """Where the way from fix to fix is measured from."""
 
     way_s: float
+    """When the aircraft was there; `NEVER_S` before the first fix."""
     way_from: Annotated[FloatArray, (3,)]
+
+
+@compiled
+def forget_way(s: WayState) -> None:
+    """Measure no way from a fix that was never there, or on another clock."""
+    s.way_s = NEVER_S
 
 
 @compiled

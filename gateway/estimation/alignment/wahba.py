@@ -28,6 +28,8 @@ PAIR_S: Final = 0.45
 PAIR_WINDOW_S: Final = 1.0
 """Differences of successive velocities share their noise; over this time it averages out."""
 MAX_PAIR_S: Final = 2.5
+HARDEST_MPS2: Final = 100.0
+"""What GPS tells beyond this is no manoeuvre: one such pair would outweigh all others."""
 JITTER_S: Final = 0.065
 """How much the latency of a fix varies: in manoeuvres the larger part of the error."""
 GRAVITY_NOISE_MPS2: Final = 1.0
@@ -136,6 +138,10 @@ def align_by_velocity(
         (vel[1] - v[1]) / dt,
         (vel[2] - v[2]) / dt - STANDARD_GRAVITY_MPS2,
     )
+    climb = reference[2] + STANDARD_GRAVITY_MPS2
+    if math.hypot(climb, math.hypot(reference[0], reference[1])) > HARDEST_MPS2:
+        begin_pair(s, valid_s, vel, force_i)
+        return 0.0
     late_sq = JITTER_S * JITTER_S * (reference[0] ** 2 + reference[1] ** 2)
     weight = dt * PAIR_WINDOW_S / (2.0 * (noise_mps * noise_mps + late_sq))
     s.pull_mps2 = max(math.hypot(reference[0], reference[1]), PULL_KEPT * s.pull_mps2)

@@ -5,6 +5,7 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
+from gateway.estimation.alignment.gps_velocity import forget_way
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
@@ -97,6 +98,7 @@ def forget_times(s: ComplementaryState) -> None:
     s.mag_s = s.fix_s = s.fix_valid_s = s.pair_s = s.baro_s = NEVER_S
     s.reject_last[0] = NEVER_S
     forget_velocities(s)
+    forget_way(s)
     s.reject_s = s.rest_s = s.epoch_s = 0.0
     s.ring_count = s.at_rest = 0
 

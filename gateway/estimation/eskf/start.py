@@ -5,7 +5,7 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
-from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
+from gateway.estimation.alignment.gps_velocity import FASTEST_MPS, forget_way
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import propagate, renew, update_scalar
@@ -79,6 +79,7 @@ def forget_times(s: EskfState) -> None:
     s.pair_s = s.baro_s = s.pseudo_s = NEVER_S
     s.reject_last[0] = NEVER_S
     forget_velocities(s)
+    forget_way(s)
     s.reject_s = s.rest_s = 0.0
     s.ring_count = s.at_rest = 0
 

@@ -1,0 +1,39 @@
+"""The first fixes of a receiver that tells no velocity: the way between them is one."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.estimation.columns import GPS_VEL
+from gateway.estimation.kernel import SampleLog
+from tests.estimation.test_without_compass import STANDS_S, estimator_of, flight
+
+SEEDS = range(3)
+MOST_RAD = math.radians(3.0)
+
+
+def without_velocity(seed: int, first_s: float) -> SampleLog:
+    """Let the fixes begin at `first_s` and tell no velocity."""
+    log, _ = flight(seed, "good")
+    told = log.gps_time_us >= first_s * 1e6
+    gps = log.gps[told]
+    gps[:, GPS_VEL : GPS_VEL + 3] = math.nan
+    return replace(log, gps=gps, gps_time_us=log.gps_time_us[told])
+
+
+def tilt_rad(name: str, log: SampleLog) -> np.ndarray:
+    """Tell the tilt while it stands."""
+    out = estimator_of(name).run(log)
+    stands = (log.imu_time_us > 3e6) & (log.imu_time_us < STANDS_S * 1e6)
+    up = Rotation.from_quat(out[stands, :4], scalar_first=True).apply([0.0, 0.0, 1.0])[:, 2]
+    return np.arccos(np.clip(up, -1.0, 1.0))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("first_s", [0.3, 1.2, 2.0, 5.0])
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_the_first_fix_was_not_reached_from_anywhere(name: str, first_s: float, seed: int) -> None:
+    assert tilt_rad(name, without_velocity(seed, first_s)).max() < MOST_RAD
