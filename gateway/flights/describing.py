@@ -55,27 +55,27 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found
-    if kind in (FileKind.FOREIGN, FileKind.OTHER):
-        return _describe_foreign(file, kind, options())
+    if kind in (FileKind.CSV, FileKind.OTHER):
+        return _describe_by_rows(file, kind, options())
     table, reader = TableSummary(), TableReader()
     for block in read_blocks(file, reader, progress):
         table.add(block, reader.header)
     return table.result(size)
 
 
-def _describe_foreign(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
+def _describe_by_rows(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
     # They import every stage, which a summary of a recording of our own does not need.
     from gateway.flights.joined import shifted
     from gateway.flights.reading import is_table, open_rows
 
-    foreign, table = open_rows(file, options), TableSummary()
+    recorded, table = open_rows(file, options), TableSummary()
     own = is_table(file)
-    zero_us = 0 if own else foreign.header.unix_us_at_zero or 0
-    for block in foreign.blocks:
-        table.add(shifted(block, zero_us), foreign.header)
+    zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
+    for block in recorded.blocks:
+        table.add(shifted(block, zero_us), recorded.header)
     return replace(
         table.result(file.stat().st_size),
         kind=other_format(file) if kind is FileKind.OTHER else kind.value,
-        header=foreign.header if own else None,
-        remarks=tuple(foreign.remarks),
+        header=recorded.header if own else None,
+        remarks=tuple(recorded.remarks),
     )

@@ -135,9 +135,9 @@ def _in_words(latency: GpsLatency) -> str:
 
 
 def facts_of(file: Path) -> dict[str, float]:
-    """Read the `key=value` words of a foreign file's comments; raises FlightError for no number."""
+    """Read `key=value` in the comments of another program's CSV; FlightError if no number."""
     facts: dict[str, float] = {}
-    if kind_of(file) is not FileKind.FOREIGN:
+    if kind_of(file) is not FileKind.CSV:
         return facts
     head = next(read_chunks(file), b"").decode("utf-8-sig", errors="replace")
     for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):

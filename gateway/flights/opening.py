@@ -14,7 +14,7 @@ from gateway.flightlog.tlog.recorded_commands import FIRST_GROUND_STATION, is_st
 from gateway.flightlog.track import Source, Track
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.flights.reading import ReadOptions
-from gateway.flights.refusion import Refusion, end_of
+from gateway.flights.recorded_fusion import RecordedFusion, end_of
 
 
 @dataclass(slots=True)
@@ -91,13 +91,13 @@ def open_flights(
                 opened.callback(tlog.close)
                 flight.sources.append(tlog)
         else:
-            refusion = Refusion(parts, options)
-            for frame in refusion.introduction():
+            fusion = RecordedFusion(parts, options)
+            for frame in fusion.introduction():
                 flight.answers.note_frame(frame, 0)
-            fused = FusedTlog(refusion.frames(), end_of(parts[-1], options), flight.answers)
+            fused = FusedTlog(fusion.frames(), end_of(parts[-1], options), flight.answers)
             opened.callback(fused.close)
             flight.sources.append(fused)
-            flight.remarks += [f"{parts[0]}: {remark}" for remark in refusion.remarks]
+            flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
         for source, file in zip(flight.sources, parts, strict=False):
             if not source.index.count:
                 raise FlightError(f"{file}: {NO_RECORDING}")

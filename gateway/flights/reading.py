@@ -30,7 +30,7 @@ from gateway.edges.disk.recording_streams import (
 from gateway.flightlog.damaged_times import ORDER_US
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.cells import TIMES
-from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
+from gateway.flightlog.table.column_map import ColumnMap, CsvReader
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import (
     HEAD_LINES,
@@ -162,7 +162,7 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     Parameters
     ----------
     path : Path
-        A table, a foreign CSV, or an autopilot's tlog.
+        A table, another program's CSV, or an autopilot's tlog.
     options : ReadOptions
         Column map, vehicle, settings.
 
@@ -181,8 +181,8 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     match kind_of(path):
         case FileKind.TABLE:
             return _open_table(path, options)
-        case FileKind.FOREIGN:
-            return _open_foreign(path, options)
+        case FileKind.CSV:
+            return _open_csv(path, options)
         case FileKind.TLOG:
             return _open_autopilot(path, options)
         case FileKind.OTHER:
@@ -211,10 +211,10 @@ def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterato
     return heapq.merge(*streams, key=lambda record: record.time_us)
 
 
-def foreign_reader(options: ReadOptions) -> ForeignReader:
+def csv_reader(options: ReadOptions) -> CsvReader:
     """Make the reader of another program's CSV."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
-    return ForeignReader(known, options.system_id or 1, lenient=options.columns is None)
+    return CsvReader(known, options.system_id or 1, lenient=options.columns is None)
 
 
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
@@ -254,8 +254,8 @@ def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock
     raise FlightError(f"{path}: holds no row")
 
 
-def _open_foreign(path: Path, options: ReadOptions) -> RecordedTable:
-    reader = foreign_reader(options)
+def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
+    reader = csv_reader(options)
     rows = reader.rows(_lines(path, options.progress))
     try:
         first = next(rows, None)

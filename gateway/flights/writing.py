@@ -27,7 +27,7 @@ from gateway.flights.reading import (
     open_rows,
     recorded_frames,
 )
-from gateway.flights.refusion import Refusion
+from gateway.flights.recorded_fusion import RecordedFusion
 
 
 class FlightToWrite:
@@ -73,7 +73,7 @@ class FlightToWrite:
         self.is_mavlink = kinds == {FileKind.TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
-        self._refusions: list[Refusion] = []
+        self._fusions: list[RecordedFusion] = []
         self._remarks: list[str] = []
 
     def frames(self) -> Iterator[TlogRecord]:
@@ -112,17 +112,17 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user, complete once all is written."""
-        fused = (remark for refusion in self._refusions for remark in refusion.remarks)
+        fused = (remark for fusion in self._fusions for remark in fusion.remarks)
         return [*self._remarks, *fused]
 
     def remark(self, text: str) -> None:
         """Add a remark for the user."""
         self._remarks.append(text)
 
-    def fused(self) -> Refusion:
+    def fused(self) -> RecordedFusion:
         """Return these files fused again."""
-        self._refusions.append(Refusion(self.files, self.options, smooth=self._smooth))
-        return self._refusions[-1]
+        self._fusions.append(RecordedFusion(self.files, self.options, smooth=self._smooth))
+        return self._fusions[-1]
 
     def _sent(self) -> Iterator[TlogRecord]:
         """Yield the frames that the gateway would send for all aircraft, stamped as in one file."""

@@ -1,4 +1,4 @@
-"""A stretch of IMU samples as arrays: calibrated, with their filtered twins."""
+"""A stretch of IMU samples as arrays: calibrated, and the same filtered."""
 
 from dataclasses import dataclass
 

@@ -12,7 +12,7 @@ from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.contest import with_value
 from gateway.edges.disk.recording_streams import read_chunks
-from gateway.flightlog.table.foreign import ColumnMap, ForeignReader
+from gateway.flightlog.table.column_map import ColumnMap, CsvReader
 from gateway.flightlog.table.table import block_of
 from gateway.flights.reading import TRACKER_LOG
 from gateway.sensing.calibration import NodeCalibration
@@ -29,7 +29,7 @@ def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
     ):  # fmt: skip
         fusion = with_value(fusion, f"estimation.reference.{name}", value)
     flight = flight_of_blocks(
-        [block_of(ForeignReader(columns).rows(text.splitlines()))],
+        [block_of(CsvReader(columns).rows(text.splitlines()))],
         NodeCalibration(), fusion, name="arduplane", story="",
     )  # fmt: skip
     table = blend_table(flight, fusion, sense(flight, fusion.sensing), 1.0)

@@ -15,7 +15,7 @@ from gateway.config import GatewaySettings
 from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import aircraft_for
 from gateway.flights.reading import ReadOptions, open_rows
-from gateway.flights.refusion import Refusion
+from gateway.flights.recorded_fusion import RecordedFusion
 from gateway.pipeline import PipelineSettings
 from gateway.replay import settings_of
 from gateway.season.batch.flight_tasks import read_season_flight
@@ -42,10 +42,10 @@ def test_every_command_takes_the_latency_that_the_manoeuvres_tell(untold: Path) 
     assert "s is estimated from its manoeuvres" in table.remarks[0]
     assert load_flight(untold, Loading(GatewaySettings())).latency_s == latency_s
     assert read_season_flight([untold], OPTIONS, "log").flight.latency_s == latency_s
-    refusion = Refusion([untold], OPTIONS)
-    assert refusion.remarks == table.remarks
+    fusion = RecordedFusion([untold], OPTIONS)
+    assert fusion.remarks == table.remarks
     assert open_flown([untold], OPTIONS).gps_latency_s == latency_s
-    settings = settings_of(refusion.table().header)
+    settings = settings_of(fusion.table().header)
     assert settings.estimation.reference.gps_latency_s == latency_s
 
 
@@ -96,9 +96,9 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     table = open_rows(out, OPTIONS)
     latency_s = settings_of(table.header).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
-    refusion = Refusion([path], OPTIONS, smooth=True)
-    assert told in refusion.remarks[0]
-    settings = settings_of(refusion.table().header)
+    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    assert told in fusion.remarks[0]
+    settings = settings_of(fusion.table().header)
     assert settings.estimation.reference.gps_latency_s == latency_s
     case = make_case(load_flight(path, Loading(GatewaySettings())), smooth=True)
     assert case.smoothed_latency_s == latency_s

@@ -387,7 +387,7 @@ def _move_in_time(page: Page, row: object) -> None:
     for icon in ("pause", "play_arrow"):
         page.keyboard.press("Space")
         expect(view.get_by_label("Play or pause")).to_have_text(icon)
-    view.get_by_text("re-fused twin").click()
+    view.get_by_text("fused again beside it").click()
     # The table is fused by a process that may have to compile first.
     page.wait_for_function(
         "Object.values(mavgate.vehicles).filter((v) => v.origin === 're-fused').length === 2",

@@ -36,7 +36,7 @@ from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
 from gateway.flights.reading import ReadOptions, RecordedTable, open_rows
-from gateway.flights.refusion import SETTLES
+from gateway.flights.recorded_fusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new

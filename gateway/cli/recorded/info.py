@@ -157,7 +157,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
-    kind = "another program's CSV" if found.kind == "foreign" else found.kind
+    kind = "another program's CSV" if found.kind == FileKind.CSV else found.kind
     console.print(f"{file}: {kind}, {found.size / 1e6:.3f} MB")
     console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:

@@ -115,9 +115,9 @@ def play(
     """Play recordings to the ground stations, several at once if you like.
 
     Messages of the vehicles of a tlog are sent byte for byte, and requests are answered from the
-    recording. A table is fused again while it plays, so the recorded and the re-fused flight can
-    be compared on one map; the parts of a recording are one flight. `mavgate seek` and `mavgate
-    player` control it meanwhile.
+    recording. A table is fused again while it plays, so what was recorded and what other settings
+    make of it can be compared on one map. The parts of a recording are one flight. `mavgate seek`
+    and `mavgate player` control it meanwhile.
     """
     gateway = with_endpoints(read_settings(config), endpoint)
     if with_commands and not yes:

@@ -47,7 +47,7 @@ SystemOption = Annotated[
 
 STORIES: Final = {
     FileKind.TABLE: "Recorded by mavgate.",
-    FileKind.FOREIGN: "Recorded by another program; its samples count as calibrated.",
+    FileKind.CSV: "Recorded by another program; its samples count as calibrated.",
     FileKind.OTHER: "Recorded by another program; its samples count as calibrated.",
     FileKind.TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
 }

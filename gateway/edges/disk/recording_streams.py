@@ -36,8 +36,8 @@ class FileKind(StrEnum):
 
     TLOG = "tlog"
     TABLE = "table"
-    FOREIGN = "foreign"
-    """Text with columns that are not ours."""
+    CSV = "csv"
+    """Of another program, with columns of its own."""
     OTHER = "other"
     """A format in `OTHER_FORMATS`."""
 
@@ -63,7 +63,7 @@ def kind_of(path: Path) -> FileKind:
     if head.startswith((b"# mavgate table", b"time_us,")):
         return FileKind.TABLE
     is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
-    return FileKind.TLOG if is_binary or b"," not in head else FileKind.FOREIGN
+    return FileKind.TLOG if is_binary or b"," not in head else FileKind.CSV
 
 
 def other_format(path: Path) -> str:

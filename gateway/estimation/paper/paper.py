@@ -198,7 +198,7 @@ class PaperEstimator:
         Parameters
         ----------
         sample : ImuSample
-            The filtered twins are used: the paper filters before it fuses.
+            Its filtered values are used: the paper filters before it fuses.
 
         Returns
         -------

@@ -99,7 +99,7 @@ class RecordingsView:
     def _build_player(self) -> None:
         with ui.element("div").classes("line"):
             self._title = ui.label().classes("title spring")
-            self._twin = ui.switch("re-fused twin", on_change=self._on_twin)
+            self._twin = ui.switch("fused again beside it", on_change=self._on_twin)
             ui.button(icon="close", on_click=self._close).props(
                 'flat round dense aria-label="Close the recording"'
             )

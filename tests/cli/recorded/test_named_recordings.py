@@ -158,7 +158,7 @@ def test_info_takes_another_programs_csv(tmp_path: Path) -> None:
     path = tmp_path / "log.csv.gz"
     path.write_bytes(gzip.compress("\n".join(lines).encode() + b"\n"))
     found = json.loads(run("info", path, "--json"))
-    assert (found["kind"], found["records"], found["duration_s"]) == ("foreign", 501, 5.0)
+    assert (found["kind"], found["records"], found["duration_s"]) == ("csv", 501, 5.0)
 
 
 def test_a_glance_reads_the_ends_alone(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
-from gateway.flights.reading import ReadOptions, RecordedTable, foreign_reader, is_table, open_rows
+from gateway.flights.reading import ReadOptions, RecordedTable, csv_reader, is_table, open_rows
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import (
     SmoothedStates,
@@ -31,7 +31,7 @@ from gateway.replay import InterpolatedPosition, Replay, header_for, heard_of
 SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
-class Refusion:
+class RecordedFusion:
     """Flights in sequence, fused again.
 
     Parameters
@@ -114,9 +114,9 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
     if kind is FileKind.OTHER:
         return None
     head, tail = read_ends(file)
-    if kind is FileKind.FOREIGN:
+    if kind is FileKind.CSV:
         lines = (head + tail).decode(errors="replace").splitlines()
-        rows = list(foreign_reader(options).rows(lines))
+        rows = list(csv_reader(options).rows(lines))
         zero_us = 0
     else:
         reader = TableReader()

@@ -34,7 +34,7 @@ _SCALE_M: Final = 44_330.769
 
 
 class Column(Settings, frozen=True):
-    """One column of a foreign file: value = column * scale + offset."""
+    """One column of a file: value = column * scale + offset."""
 
     column: Annotated[str, setting("Name of the column.")]
     scale: Annotated[float, setting("Factor to our unit.")] = 1.0
@@ -42,7 +42,7 @@ class Column(Settings, frozen=True):
 
 
 class ColumnMap(Settings, frozen=True):
-    """Which columns of a foreign file correspond to which of ours."""
+    """Which columns of another program's file correspond to which of ours."""
 
     columns: Annotated[
         dict[str, Column | str],
@@ -58,8 +58,8 @@ class ColumnMap(Settings, frozen=True):
             raise ValueError("time_us must be mapped")
 
 
-class ForeignReader:
-    """Turn the lines of a foreign file into rows.
+class CsvReader:
+    """Turn the lines of another program's CSV into rows.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateway.flightlog.table.foreign import Column, ColumnMap, ForeignReader
+from gateway.flightlog.table.column_map import Column, ColumnMap, CsvReader
 from gateway.flights.reading import TRACKER_LOG
 from gateway.records import GpsFixType, ImuFlags
 from gateway.sensing.chain import pressure_altitude_m
@@ -16,8 +16,8 @@ NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon
 NAMES += "gps_vn,gps_ve,gps_vd,note,gps_speed_ms,gps_course_deg"
 
 
-def read(*lines: str) -> tuple[ForeignReader, list[Any]]:
-    reader = ForeignReader(TRACKER)
+def read(*lines: str) -> tuple[CsvReader, list[Any]]:
+    reader = CsvReader(TRACKER)
     return reader, list(reader.rows(["# made by somebody", NAMES, *lines]))
 
 
@@ -64,7 +64,7 @@ def test_lines_that_cannot_be_read_are_counted() -> None:
 
 def test_scale_and_offset() -> None:
     columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
-    (row,) = ForeignReader(ColumnMap(columns=columns)).rows(["t,p", "2,95000"])
+    (row,) = CsvReader(ColumnMap(columns=columns)).rows(["t,p", "2,95000"])
     assert row.time_us == 2005
     assert row.baro is not None
     assert row.baro.pressure_pa == 95_000.0
@@ -72,7 +72,7 @@ def test_scale_and_offset() -> None:
 
 def test_a_file_without_the_columns_is_refused() -> None:
     with pytest.raises(ValueError, match="no column ax, ay"):
-        list(ForeignReader(TRACKER).rows(["time_s,az", "1,2"]))
+        list(CsvReader(TRACKER).rows(["time_s,az", "1,2"]))
 
 
 @pytest.mark.parametrize(
