@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -13,7 +12,13 @@ from rich.table import Table
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
-from gateway.cli.support.terminal import NEGATIVE_NUMBERS, JsonOption, console_of, table_of
+from gateway.cli.support.terminal import (
+    NEGATIVE_NUMBERS,
+    JsonOption,
+    console_of,
+    print_json,
+    table_of,
+)
 from gateway.units import US_PER_S
 
 PANEL: Final = "A running gateway"
@@ -39,7 +44,7 @@ def status(*, json: JsonOption = False) -> None:
     """Show the status of the gateway: receiver, nodes, aircraft, clients."""
     snapshot = ask("status")
     if json:
-        print(msgspec.json.encode(snapshot).decode())
+        print_json(snapshot)
         return
     console = console_of()
     console.print(_summary(snapshot))
@@ -53,7 +58,7 @@ def status(*, json: JsonOption = False) -> None:
 def list_clients(*, json: JsonOption = False) -> None:
     """List the clients with the frames sent to them and dropped on this side."""
     if json:
-        print(msgspec.json.encode(ask("clients.list")).decode())
+        print_json(ask("clients.list"))
         return
     _print_clients(console_of(), ask("status"))
 

@@ -16,7 +16,7 @@ from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
-from gateway.cli.support.terminal import JsonOption, console_of, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.edges.operator.control_socket import ControlError, request
 from gateway.edges.operator.detached_output import detached_output
 from gateway.flightlog.moment import civil_time
@@ -81,7 +81,7 @@ def status(*, json: JsonOption = False) -> None:
     """Show sites and vehicles: ids, rates, age, loss, round trip."""
     found = ask("fleet.status", of="fleet")
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
         return
     console = console_of()
     role = "router at" if found["is_router"] else "connected to"
@@ -175,7 +175,7 @@ def recordings(
         return
     found = ask("fleet.recordings", {"site": site}, of="fleet")
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
         return
     grid = table_of("site", "recording", "files", "MB", "last written (UTC)", left=2)
     for name, listed in found.items():

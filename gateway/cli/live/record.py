@@ -14,7 +14,7 @@ from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
-from gateway.cli.support.terminal import JsonOption, console_of, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.edges.disk.recordings import (
     Recording,
     RecordingError,
@@ -61,7 +61,7 @@ def status(*, json: JsonOption = False) -> None:
     """Show the status of the recorder."""
     found = ask("record.status")
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
         _show(found)
 
@@ -125,7 +125,7 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
             msgspec.structs.asdict(look) | msgspec.to_builtins(recording, enc_hook=str)
             for recording, look in _looked_at(found)
         ]
-        print(msgspec.json.encode(listed).decode())
+        print_json(listed)
     elif found:
         _list(found)
     else:

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
@@ -14,7 +13,7 @@ from gateway.cli.support.errors import refuse
 from gateway.cli.support.named_recordings import folder_of
 from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
 from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
-from gateway.cli.support.terminal import JsonOption, console_of, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.flights.reading import ReadOptions
 from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
 from gateway.season.catalogue.indexing import index_folder
@@ -110,11 +109,11 @@ def list_flights(
     place = _place(folder, config)
     with _asking():
         if geojson:
-            print(msgspec.json.encode(geojson_of(place, where)).decode())
+            print_json(geojson_of(place, where))
             return
         rows = find_flights(place, where)
     if json:
-        print(msgspec.json.encode(rows).decode())
+        print_json(rows)
         return
     _show_table(rows)
 
@@ -137,10 +136,10 @@ def show(
         if not rows:
             refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
         if geojson:
-            print(msgspec.json.encode(geojson_of(place, where)).decode())
+            print_json(geojson_of(place, where))
             return
     if json:
-        print(msgspec.json.encode(rows).decode())
+        print_json(rows)
         return
     for number, row in enumerate(rows):
         print(end="\n" if number else "")

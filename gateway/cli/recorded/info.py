@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
@@ -22,7 +21,7 @@ from gateway.cli.support.recording_options import (
     refusing,
 )
 from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, print_json, table_of
 from gateway.edges.disk.recording_streams import (
     FileKind,
     Progress,
@@ -81,7 +80,7 @@ def info(
         found = [(each, describe(each, advance, options)) for each in files]
     for number, (each, info_of_file) in enumerate(found):
         if json:
-            print(msgspec.json.encode(info_of_file).decode())
+            print_json(info_of_file)
         else:
             print(end="\n" if number else "")
             _show(each, info_of_file)

@@ -20,7 +20,7 @@ from gateway.analysis.tuning.contest import (
 from gateway.cli.season.season_work import SeasonWork
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import refusing
-from gateway.cli.support.sweeping import SHOWN, SweepOptions, parse_axes
+from gateway.cli.support.sweeping import HEADINGS, SHOWN, SweepOptions, parse_axes
 from gateway.cli.support.terminal import console_of, table_of
 from gateway.config import GatewaySettings, render
 from gateway.flights.reading import ReadOptions
@@ -111,7 +111,9 @@ def _show(
     axes: Sequence[Axis], points: Sequence[Values], choice: Choice, column: str, flights: int
 ) -> None:
     console = console_of()
-    grid_ = table_of(*(axis.key.rsplit(".", 1)[-1] for axis in axes), f"mean {column}", left=0)
+    grid_ = table_of(
+        *(axis.key.rsplit(".", 1)[-1] for axis in axes), f"mean {HEADINGS[column]}", left=0
+    )
     for number in np.argsort(choice.means, kind="stable")[:SHOWN].tolist():
         cells = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in points[number]]
         grid_.add_row(*cells, f"{choice.means[number]:.4g}")

@@ -38,13 +38,14 @@ from gateway.output import check_output, write_new
 
 SHOWN: Final = 10
 HEADINGS: Final = {
-    "north_m": "latitude\nerror, m",
-    "east_m": "longitude\nerror, m",
-    "held_m": "withheld\nfixes, m",
-    "interpolated_m": "interpolated\nGPS, m",
-    "reference_m": "reference\nm",
-    "attitude_deg": "attitude\ndeg",
+    "north_m": "latitude error, m",
+    "east_m": "longitude error, m",
+    "held_m": "error at withheld fixes, m",
+    "interpolated_m": "error against interpolated GPS, m",
+    "reference_m": "error against the reference, m",
+    "attitude_deg": "attitude error, deg",
 }
+"""By the columns of a sweep's scores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +169,8 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
     judged = COLUMN_OF[metric]
     others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
     names = [*contest.keys, judged, *(name for name in others if name != judged)]
-    shown = Table(box=box.SIMPLE_HEAD, title=f"Best of {len(results)} trials, by {judged}")
+    title = f"Best of {len(results)} trials, by the {HEADINGS[judged].rpartition(',')[0]}"
+    shown = Table(box=box.SIMPLE_HEAD, title=title)
     for name in names:
         shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
     for row in results[names].head(SHOWN).itertuples(index=False):

@@ -17,6 +17,8 @@ ENDLESS: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
+_C1_IN_JSON: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
+"""Control characters that JSON may hold as they are, and terminals obey."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 
@@ -39,6 +41,14 @@ def console_of(*, stderr: bool = False) -> Console:
     if not console.is_terminal:
         console.width = ENDLESS
     return console
+
+
+def print_json(value: object) -> None:
+    """Print a value as one line of JSON that no terminal obeys."""
+    # Imported late, because a service prints nothing.
+    import msgspec
+
+    print(msgspec.json.encode(value).decode().translate(_C1_IN_JSON))
 
 
 def table_of(*columns: str, left: int = 1) -> Table:

@@ -274,7 +274,9 @@ def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:
     assert r"a\x1b[31m[red].csv: table" in told
     refused = run("info", tmp_path / "b\x1b[31m.csv", code=2)
     assert r"b\x1b[31m.csv: No such file" in refused
-    assert not set("\x1b\x07\x9b") & set(told + refused)
+    as_json = run("info", recorded, "--json")
+    assert msgspec.json.decode(as_json)["marks"][0]["text"] == evil
+    assert not set("\x1b\x07\x9b") & set(told + refused + as_json)
 
 
 def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ def test_the_best_settings_become_a_settings_file(recording: Path, tmp_path: Pat
     ]
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 0, result.output
+    assert "Best of 6 trials, by the error at withheld fixes" in result.output
     trials = pd.read_csv(table)
     assert len(trials) == 6
     assert trials["held_m"].is_monotonic_increasing
