@@ -10,8 +10,6 @@ from xml.sax import saxutils
 
 from gateway.units import US_PER_S
 
-INTERVAL_US: Final = US_PER_S // 5
-"""A map shows no more than five points a second."""
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -54,15 +52,6 @@ class VehicleTrack:
     name: str
     points: list[TrackPoint] = field(default_factory=list)
     places: list[MapPlace] = field(default_factory=list)
-
-
-def thin_out(points: Iterable[TrackPoint], interval_us: int = INTERVAL_US) -> Iterator[TrackPoint]:
-    """Leave out points that follow the last one sooner than an interval."""
-    last_us: int | None = None
-    for point in points:
-        if last_us is None or not 0 <= point.time_us - last_us < interval_us:
-            last_us = point.time_us
-            yield point
 
 
 FIRST_US: Final = 0

@@ -3,12 +3,12 @@
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.aircraft import AircraftSettings
-from gateway.flightlog.mapshape import INTERVAL_US, MapPlace, PlaceKind, TrackPoint, VehicleTrack
+from gateway.flightlog.mapshape import MapPlace, PlaceKind, TrackPoint, VehicleTrack
 from gateway.flightlog.summary import payload_of
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import REMARK, TableMark
@@ -17,7 +17,7 @@ from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.reading import RecordedTable
 from gateway.geometry.quaternion import to_euler
 from gateway.records import FusionState, NavFlags, Quat
-from gateway.units import DEG_PER_DEGE7, M_PER_MM
+from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 from gateway.vehicle.home import is_good_enough, place_of
 from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of
 
@@ -38,6 +38,8 @@ INFO: Final = 6
 """MAV_SEVERITY_INFO; what is less is for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
 """The gateway's STATUSTEXT for a marked place."""
+INTERVAL_US: Final = US_PER_S // 5
+"""A map shows no more than five points a second."""
 MAX_PLACES: Final = 10_000
 """Of one vehicle; a flood of texts must not fill the memory."""
 
@@ -82,18 +84,6 @@ class _Drawn:
     def put(self, kind: PlaceKind, name: str, at: TrackPoint) -> None:
         if len(self.track.places) < MAX_PLACES:
             self.track.places.append(MapPlace(kind, name, at))
-
-
-def points_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> Iterator[TrackPoint]:
-    """Yield the positions that one vehicle reported; by default the first that reports one."""
-    for record in records:
-        if message_id_of(record.frame) != GLOBAL_POSITION_INT_ID:
-            continue
-        sender = origin_of(record.frame)[0]
-        system_id = sender if system_id is None else system_id
-        _, lat, lon, alt = _POSITION.unpack(payload_of(record.frame, _POSITION.size))
-        if sender == system_id and (lat or lon):
-            yield _point(record.time_us, lat, lon, alt, None)
 
 
 def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:

@@ -223,31 +223,24 @@ class SensorChain:
             flags=flags,
         )
 
-    def imu_log(self, time_us: IntArray, counts: FloatArray, flags: IntArray) -> ImuLog:
-        """Turn many IMU payloads into samples; bit for bit what `imu` gives for each.
+    def calibrated(
+        self, counts: FloatArray, flags: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Calibrate many IMU payloads without filtering them.
 
         Parameters
         ----------
-        time_us : ndarray of int, shape (n,)
-            Gateway clock.
         counts : ndarray, shape (n, 13)
             Whole numbers: three of the accelerometer, of the gyroscope and of the magnetometer,
             the temperature, and the three ranges, as in `ImuRaw`.
         flags : ndarray of int, shape (n,)
             `ImuFlags`.
-        """
-        accel, gyro, mag, temperature_degc = self.calibrated(counts, flags)
-        return self.imu_si_log(time_us, accel, gyro, mag, temperature_degc, flags)
-
-    def calibrated(
-        self, counts: FloatArray, flags: IntArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Calibrate many IMU payloads without filtering them; see `imu_log`.
 
         Returns
         -------
         accel, gyro, mag : ndarray, shape (n, 3)
-            In body FRD; the field NaN unless it is new, the others where they were not told.
+            In m/s2, rad/s and uT, body FRD; the field NaN unless it is new, the others NaN where
+            the node could not read them.
         temperature_degc : ndarray, shape (n,)
         """
         accel = vectors_from_counts(accel_from_counts, counts[:, 0:3], counts[:, 10])
@@ -270,7 +263,18 @@ class SensorChain:
         temperature_degc: FloatArray,
         flags: IntArray,
     ) -> ImuLog:
-        """Filter many samples that are calibrated already; as `imu_si` each."""
+        """Filter many samples that are calibrated already; bit for bit what `imu_si` gives.
+
+        Parameters
+        ----------
+        time_us : ndarray of int, shape (n,)
+            Gateway clock.
+        accel_b_mps2, gyro_b_radps, mag_b_ut : ndarray, shape (n, 3)
+            As `calibrated` returns them.
+        temperature_degc : ndarray, shape (n,)
+        flags : ndarray of int, shape (n,)
+            `ImuFlags`.
+        """
         accel, gyro = self.filter_log(time_us, accel_b_mps2, gyro_b_radps, flags)
         return ImuLog(
             time_us, accel_b_mps2, gyro_b_radps, accel, gyro, mag_b_ut, temperature_degc, flags

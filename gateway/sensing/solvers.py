@@ -66,8 +66,6 @@ class SphereFit:
     matrix: Matrix3
     residual: float
     """RMS of the radius after the correction, in the unit of the samples."""
-    residual_before: float
-    """The same without it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,12 +268,6 @@ def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
     return _matrix(np.array([x, np.cross(z, x), z]))
 
 
-def level_residual_deg(mounting: Matrix3, level: Vec3) -> float:
-    """Return by what angle a level pose seems tilted under a mounting."""
-    force_b = np.array(mounting) @ np.array(level)
-    return _angle_deg(force_b, np.array([0.0, 0.0, -1.0]))
-
-
 def _fit_sphere(
     points: FloatArray, radius: float, *, skew: bool, start: FloatArray | None = None
 ) -> SphereFit:
@@ -289,12 +281,10 @@ def _fit_sphere(
         return np.asarray(np.linalg.norm(moved, axis=1) - radius)
 
     found = least_squares(off, guess, x_scale=np.maximum(np.abs(guess), 1e-3))
-    before = np.linalg.norm(points, axis=1) - radius
     return SphereFit(
         bias=_vec3(found.x[:3]),
         matrix=_matrix(_symmetric(found.x[3:])),
         residual=float(np.sqrt(np.mean(off(found.x) ** 2))),
-        residual_before=float(np.sqrt(np.mean(before**2))),
     )
 
 

@@ -10,7 +10,6 @@ from gateway.flightlog.mapshape import (
     PlaceKind,
     TrackPoint,
     VehicleTrack,
-    thin_out,
     to_gpx,
     to_kml,
 )
@@ -79,12 +78,6 @@ def test_gpx_holds_the_same() -> None:
     attitude = points[5].find("g:extensions/a:attitude", GPX)
     assert attitude is not None
     assert attitude.attrib == {"roll": "-10.0", "pitch": "5.0", "yaw": "270.0"}
-
-
-def test_points_too_near_in_time_are_left_out() -> None:
-    assert list(thin_out(POINTS, 200_000)) == POINTS[::2]
-    back = TrackPoint(5, 0.0, 0.0, 0.0)
-    assert list(thin_out([*POINTS[:1], back], 200_000)) == [POINTS[0], back]
 
 
 def test_no_points_is_still_a_file() -> None:

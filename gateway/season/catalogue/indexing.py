@@ -37,8 +37,6 @@ LATEST_NS: Final = 2**63 - 1
 KEEP_S: Final = 1.0
 """What is read is stored so often: an interruption costs no more than that."""
 
-Known = tuple[int, int, str]
-"""Size, time of modification and digest."""
 Wanted = tuple[str, str]
 """Path from the folder on, and the digest that is known of it or nothing."""
 

@@ -66,13 +66,6 @@ def uint32(value: float, unknown: int = 0) -> int:
     return whole(value, 0, UINT32_MAX, unknown)
 
 
-def real(value: float) -> float:
-    """Fit a 32-bit float: NaN and infinities pass, a finite value beyond its range saturates."""
-    if math.isfinite(value):
-        return max(-FLOAT32_MAX, min(FLOAT32_MAX, value))
-    return value
-
-
 def compass_cdeg(angle_rad: float) -> int:
     """Turn an angle from north into 0 to 35999 hundredths of a degree, 65535 if not known."""
     if not math.isfinite(angle_rad):
