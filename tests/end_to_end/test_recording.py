@@ -21,7 +21,7 @@ from gateway.flightlog.table.table import TableReader
 from gateway.flightlog.tlog.tlog import TlogScanner
 from gateway.flightlog.track import Track
 from gateway.flights.reading import ReadOptions
-from gateway.flights.refusion import Refusion
+from gateway.flights.recorded_fusion import RecordedFusion
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
 from gateway.replay import header_for
@@ -153,7 +153,7 @@ async def test_the_table_alone_gives_the_recorded_states_to_the_last_bit(
         assert reader.header.cold_start is (number == 0)
     assert repr([row.state for row in rows if row.state is not None]) == repr(states)
     wishes = ReadOptions(PipelineSettings(flight.settings.default_aircraft))
-    again = [row for row in Refusion(paths, wishes).table().rows if isinstance(row, TableRow)]
+    again = [row for row in RecordedFusion(paths, wishes).table().rows if isinstance(row, TableRow)]
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.
     out = folder / "again.csv"
