@@ -104,7 +104,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 4.7
     mag_bias_ut: Annotated[
         float, setting("Iron that the calibration has left, per axis.", "uT", ge=0.001, le=50.0)
-    ] = 0.5
+    ] = 1.5
     mag_bias_walk_utprs: Annotated[
         float, setting("Random walk of it.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.005

@@ -65,8 +65,9 @@ REST_VELOCITY_VAR: Final = 0.2**2
 REST_RATE_VAR: Final = 0.002**2
 UNAIDED_CORRELATION_S: Final = 1.0
 """The true speed that is taken for noise changes in about this time."""
-COMPASS_CORRELATION_S: Final = 0.6
-"""The errors of soft iron and current change with the attitude, so in about this time."""
+COMPASS_CORRELATION_S: Final = 1.0
+"""The errors of soft iron and current change with the attitude, so in about this time: recorded
+compasses were 3 to 5 deg off, for half a second to two."""
 STRENGTH_NOISE: Final = 0.03
 """Share by which the field's strength varies with no iron to find: soft iron, scale, currents."""
 MISFIT_S: Final = 20.0
@@ -335,7 +336,12 @@ def update_by_compass(
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
     noise = repeated * (p.mag_var / weight + late_var(s)) + lasting
-    update_scalar(s, wrap_pi(measured), noise, p.gate_sq)
+    off = wrap_pi(measured)
+    beyond = off * off / p.gate_sq - innovation_variance(s, noise)
+    if beyond > 0.0:
+        # What is off beyond the gate lasts as long as any error of the compass.
+        noise += repeated * beyond
+    update_scalar(s, off, noise, p.gate_sq)
     s.compass_share = 1.0 - (1.0 - s.compass_share) * s.P[TILT + 2, TILT + 2] / before
     inject(s)
 

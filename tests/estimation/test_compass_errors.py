@@ -1,0 +1,48 @@
+"""What a calibration leaves in a compass: iron that turns along, found beside GPS."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from gateway.estimation.columns import IMU_COLUMNS, MAG, NAV_ATTITUDE_STD
+from tests.estimation.test_receiver_noise import FIELD_N_UT
+from tests.estimation.test_without_compass import (
+    RATE_HZ,
+    SEEDS,
+    STANDS_S,
+    estimator_of,
+    flight,
+    heading_off,
+)
+
+IRON_UT = 4.0
+SETTLED_S = 20.0
+
+
+def field_of(seed: int, heading: np.ndarray) -> np.ndarray:
+    """Make what a compass beside iron and of skewed axes tells, 25 times a second, in uT."""
+    rng = np.random.default_rng(3000 + seed)
+    north, _, down = FIELD_N_UT
+    field = np.column_stack([north * np.cos(heading), -north * np.sin(heading)])
+    field = np.column_stack([field, np.full(len(heading), down)])
+    field = field @ (np.eye(3) + 0.02 * rng.standard_normal((3, 3))) + rng.normal(0.0, IRON_UT, 3)
+    field += rng.normal(0.0, 0.5, field.shape)
+    field[np.arange(len(field)) % 4 != 0] = math.nan
+    return np.asarray(field)
+
+
+def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure() -> None:
+    off, told = [], []
+    settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
+    for seed in SEEDS:
+        log, heading = flight(seed, "good")
+        imu = np.empty((len(log.imu), IMU_COLUMNS))
+        imu[:] = log.imu
+        imu[:, MAG : MAG + 3] = field_of(seed, heading)
+        out = estimator_of("eskf").run(replace(log, imu=imu))
+        off.append(heading_off(out, heading)[settled:])
+        told.append(out[settled:, NAV_ATTITUDE_STD + 2])
+    errors, std = np.concatenate(off), np.concatenate(told)
+    assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
+    assert np.mean(errors < 2.0 * std) > 0.88
