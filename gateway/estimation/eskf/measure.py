@@ -337,10 +337,8 @@ def update_by_compass(
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
     noise = repeated * (p.mag_var / weight + late_var(s)) + lasting
     off = wrap_pi(measured)
-    beyond = off * off / p.gate_sq - innovation_variance(s, noise)
-    if beyond > 0.0:
-        # What is off beyond the gate lasts as long as any error of the compass.
-        noise += repeated * beyond
+    # What is off beyond the gate lasts as long as any error of the compass.
+    noise += repeated * max(off * off / p.gate_sq - innovation_variance(s, noise), 0.0)
     update_scalar(s, off, noise, p.gate_sq)
     s.compass_share = 1.0 - (1.0 - s.compass_share) * s.P[TILT + 2, TILT + 2] / before
     inject(s)
