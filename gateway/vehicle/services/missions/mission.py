@@ -14,7 +14,7 @@ An upload, seen from here:
 | upload | one further on                  | REQUEST_INT of the one asked for  | upload |
 | upload | MISSION_COUNT, same client      | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
-| upload | MISSION_ACK (cancelled)         |                                   | idle   |
+| upload | MISSION_ACK, not accepted       |                                   | idle   |
 | upload | a while without the item        | REQUEST_INT again, five times     | upload |
 | upload | a while more                    | ACK cancelled                     | idle   |
 | idle   | the last item once more         | ACK accepted again                | idle   |
@@ -265,9 +265,13 @@ class MissionService:
         return answers
 
     def _end(self, request: Request, _now_us: int) -> list[Answer]:
-        """Handle a client's MISSION_ACK: the end of its download, or of its own upload."""
+        """Handle a client's MISSION_ACK: the end of its download, or of its own upload.
+
+        What it accepts is a download, also if that comes late, after the begin of an upload.
+        """
         upload = self._upload
-        if upload is not None and upload.request.client_id == request.client_id:
+        is_own = upload is not None and upload.request.client_id == request.client_id
+        if is_own and request.message.type != ACCEPTED:
             self._upload = None
         return []
 

@@ -278,6 +278,13 @@ def test_an_upload_can_be_cancelled(station: GroundStation) -> None:
     assert "MISSION_REQUEST_INT" not in kinds(station.wait(2.0))
 
 
+def test_a_late_end_of_a_download_ends_no_upload(station: GroundStation) -> None:
+    station.send(count(2))
+    station.send(mavlink.MAVLink_mission_ack_message(1, 1, ACCEPTED, MISSION))
+    [wanted] = station.send(item(0))
+    assert (wanted.get_type(), wanted.seq) == ("MISSION_REQUEST_INT", 1)
+
+
 def test_two_uploads_do_not_mix(station: GroundStation) -> None:
     other = GroundStation(station.vehicle, station.clock, client_id=8, system_id=254)
     station.send(count(2))
