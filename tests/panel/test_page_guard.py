@@ -72,6 +72,19 @@ async def test_own_names_are_let_in(host: str) -> None:
     assert answer.headers["x-frame-options"] == "DENY"
 
 
+async def test_head_is_answered_as_get_is() -> None:
+    """Its body is left out by the server in front of the guard."""
+
+    async def tells_the_method(scope: Scope, receive: Receive, send: Send) -> None:
+        await PlainTextResponse(scope["method"])(scope, receive, send)
+
+    guard = guarded()
+    guard.app = tells_the_method
+    async with client_of(guard) as client:
+        answer = await client.head("/")
+    assert answer.headers["content-length"] == str(len("GET"))
+
+
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", "", "[::1", "[x]"]
 )

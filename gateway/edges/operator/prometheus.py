@@ -5,6 +5,7 @@ import logging
 import re
 import socket
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Final
 
 from gateway.edges.accepting import accept_each
@@ -24,7 +25,7 @@ RETRY_S: Final = 5.0
 
 
 class MetricsServer:
-    """Answer an HTTP GET with the present metrics, unless a page asks under a name of its own.
+    """Answer an HTTP GET or HEAD with the present metrics, unless a page asks under a name of its own.
 
     Parameters
     ----------
@@ -36,14 +37,14 @@ class MetricsServer:
         self._text = text
         self._wanted = 0
         self._reason = ""
-        self._socket: socket.socket | None = None
+        self._sockets: list[socket.socket] = []
         self._retry: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def port(self) -> int:
         """The port that is bound, or 0."""
-        return self._socket.getsockname()[1] if self._socket else 0
+        return self._sockets[0].getsockname()[1] if self._sockets else 0
 
     def listen(self, port: int) -> None:
         """Serve on a loopback port, now or as soon as it is free; 0 ends it."""
@@ -59,10 +60,10 @@ class MetricsServer:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
-        if self._socket is not None:
-            asyncio.get_running_loop().remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
+        for each in self._sockets:
+            asyncio.get_running_loop().remove_reader(each)
+            each.close()
+        self._sockets = []
 
     def listeners(self) -> tuple[ListenerStats, ...]:
         """Return the port's state, if one is configured."""
@@ -75,14 +76,19 @@ class MetricsServer:
 
     def _bind(self) -> None:
         try:
-            self._socket = socket.create_server(("127.0.0.1", self._wanted))
+            self._sockets.append(socket.create_server(("127.0.0.1", self._wanted)))
         except OSError as error:
             self._report(error)
             self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._bind)
             return
+        # Some machines have no IPv6.
+        with suppress(OSError):
+            second = socket.create_server(("::1", self._wanted), family=socket.AF_INET6)
+            self._sockets.append(second)
         self._report(None)
-        self._socket.setblocking(False)
-        accept_each(self._socket, self._on_connection, self._report)
+        for each in self._sockets:
+            each.setblocking(False)
+            accept_each(each, self._on_connection, self._report)
 
     def _report(self, error: OSError | None) -> None:
         reason = "" if error is None else reason_of(error)
@@ -90,7 +96,7 @@ class MetricsServer:
             log.warning("no metrics on port %d yet: %s", self._wanted, reason)
         self._reason = reason
 
-    def _on_connection(self, connection: socket.socket, _: tuple[str, int]) -> None:
+    def _on_connection(self, connection: socket.socket, _: object) -> None:
         if len(self._tasks) >= MAX_CONNECTIONS:
             connection.close()
             return
@@ -114,7 +120,8 @@ class MetricsServer:
                 log.debug("metrics request failed: %s", error)
 
     async def _respond(self, request: bytes) -> bytes:
-        if not request.startswith(b"GET "):
+        method = request.partition(b" ")[0]
+        if method not in (b"GET", b"HEAD"):
             return b"HTTP/1.1 405 Method Not Allowed\r\nContent-Length: 0\r\n\r\n"
         host = HOST.search(request)
         if host is not None and not names_loopback(host[1].decode("latin-1")):
@@ -130,4 +137,4 @@ class MetricsServer:
             f"HTTP/1.1 200 OK\r\nContent-Type: {CONTENT_TYPE}\r\n"
             f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
         )
-        return head.encode() + body
+        return head.encode() + (body if method == b"GET" else b"")

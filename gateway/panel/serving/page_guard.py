@@ -84,6 +84,9 @@ class PageGuard:
             await self._serve_login(scope, receive, send)
         elif role is not None or scope["path"] == "/web/panel.css":
             scope[ROLE] = role
+            if scope.get("method") == "HEAD":
+                # Answered as GET; the server, which has the scope itself, leaves the body out.
+                scope = {**scope, "method": "GET"}
             await self._pass_on(scope, receive, send)
         elif scope["type"] == "http" and scope["path"] == "/":
             await RedirectResponse("/login", HTTPStatus.SEE_OTHER)(scope, receive, send)

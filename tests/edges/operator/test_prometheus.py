@@ -144,8 +144,8 @@ def test_another_program_reads_it() -> None:
 
 @pytest.mark.io
 class TestServer:
-    async def ask(self, port: int, request: bytes) -> bytes:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async def ask(self, port: int, request: bytes, host: str = "127.0.0.1") -> bytes:
+        reader, writer = await asyncio.open_connection(host, port)
         writer.write(request)
         answer = await asyncio.wait_for(reader.read(), LIMIT_S)
         writer.close()
@@ -159,6 +159,8 @@ class TestServer:
         assert head.startswith(b"HTTP/1.1 200 OK")
         assert f"Content-Length: {len(body)}".encode() in head
         assert body.decode() == TEXT
+        only_head = await self.ask(server.port, b"HEAD /metrics HTTP/1.1\r\n\r\n")
+        assert only_head == head + b"\r\n\r\n"
         assert (await self.ask(server.port, b"POST / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 405")
         port = server.port
         server.close()
@@ -185,6 +187,14 @@ class TestServer:
             request = f"GET / HTTP/1.1\r\nAccept: */*\r\n{name}: {host}\r\n\r\n"
             answer = await server._respond(request.encode("latin-1"))
             assert answer.startswith(b"HTTP/1.1 " + status)
+
+    @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="needs IPv6")
+    async def test_serves_ipv6_too(self) -> None:
+        server = MetricsServer(lambda: iter(["text"]))
+        server.listen(free_port())
+        answer = await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n", "::1")
+        server.close()
+        assert answer.endswith(b"text")
 
     async def test_the_loop_goes_on_between_two_families(self) -> None:
         called: list[int] = []
