@@ -2,18 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 
 
 @pytest.fixture
 def start_gateway(tmp_path: Path) -> Iterator[Callable[..., Gateway]]:
     started: list[Gateway] = []
 
-    def start(command: str, *options: str, config: str = CONFIG) -> Gateway:
-        started.append(Gateway(tmp_path, command, *options, config=config))
+    def start(command: str, *options: str, **more: Any) -> Gateway:
+        started.append(Gateway(tmp_path, command, *options, **more))
         return started[-1]
 
     yield start

@@ -1,5 +1,6 @@
 """The gateway as its users start it: a process of its own, and a bare client of it."""
 
+import fcntl
 import os
 import re
 import select
@@ -7,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,9 +44,16 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class Gateway:
-    """A running `mavgate` process."""
+    """A running `mavgate` process, in a session of its own on a terminal if there is one."""
 
-    def __init__(self, folder: Path, command: str, *options: str, config: str = CONFIG) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        command: str,
+        *options: str,
+        config: str = CONFIG,
+        terminal: int | None = None,
+    ) -> None:
         self.port, self.listen_port = free_ports(2)
         self.log = folder / "mavgate.log"
         file = folder / "gateway.toml"
@@ -55,6 +64,9 @@ class Gateway:
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, *arguments],
+                stdin=subprocess.DEVNULL if terminal is None else terminal,
+                start_new_session=terminal is not None,
+                preexec_fn=None if terminal is None else _take_terminal,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=os.environ | {"COLUMNS": "200"},
@@ -63,6 +75,10 @@ class Gateway:
     def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(START_LIMIT_S)
+
+
+def _take_terminal() -> None:
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 def make_room(sock: socket.socket) -> None:

@@ -1,6 +1,7 @@
 """The gateway as a service: readiness, metrics, settings changed while it flies."""
 
 import itertools
+import os
 import queue
 import signal
 import socket
@@ -112,6 +113,30 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     systemd.is_alive()
     assert gateway.stop() == 0
     assert systemd.told() == b"STOPPING=1"
+
+
+def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
+    start_gateway: Callable[..., Gateway], tmp_path: Path
+) -> None:
+    master, terminal = os.openpty()
+    config = f'{CONFIG}\n[recording]\nfolder = "{tmp_path}"\n'
+    gateway = start_gateway("demo", "--record", config=config, terminal=terminal)
+    os.close(terminal)
+    until(lambda: any(path.stat().st_size > 0 for path in tmp_path.glob("*.csv")))
+    os.close(master)
+    assert gateway.process.wait(START_LIMIT_S) == 0, gateway.log.read_text()
+    assert "the simulated receiver has ended" not in gateway.log.read_text()
+    [table] = tmp_path.glob("*.csv")
+    assert table.read_bytes().endswith(b"\n")
+
+    def is_gone() -> bool:
+        try:
+            os.killpg(gateway.process.pid, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    until(is_gone)
 
 
 def test_a_reload_changes_the_signing(

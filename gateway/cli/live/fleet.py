@@ -146,7 +146,7 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
     from gateway.fleet.fleet_server import FleetServer
 
     stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     try:
         server = FleetServer(settings, hub_settings)

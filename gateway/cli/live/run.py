@@ -100,7 +100,10 @@ async def serve(
     panel: PanelProcess | None = None,
     compiling: Compilation | None = None,
 ) -> None:
-    """Run a daemon until SIGINT or SIGTERM, showing its status; SIGHUP reloads the settings.
+    """Run a daemon until SIGINT or SIGTERM, showing its status.
+
+    SIGHUP tells that the terminal has gone, which ends the daemon as well; without a terminal, as
+    in a service, it reloads the settings.
 
     Parameters
     ----------
@@ -118,7 +121,10 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
-    _reload_on_hangup(daemon)
+    if sys.stdin.isatty():
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, stopped.set)
+    else:
+        _reload_on_hangup(daemon)
     if compiling is not None:
         compiling.watch()
     with loop_comes_first(daemon.start):

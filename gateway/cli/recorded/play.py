@@ -212,7 +212,7 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> No
     daemon = daemon_of()
     if attached:
         on_parent_gone(daemon.ended.set)
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
     with detached_output():
         try:

@@ -45,7 +45,8 @@ def _take(receiver: Connection) -> Iterator[TimedFrame]:
 
 
 def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
-    # A terminal's Ctrl+C is for the gateway, which ends this process.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A terminal's Ctrl+C, and its end, are for the gateway, which ends this process.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
         sender.send(made)

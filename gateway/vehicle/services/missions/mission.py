@@ -22,7 +22,7 @@ An upload, seen from here:
 A while is 250 ms, and on a slow link as long as an item takes, up to a second: what is asked for
 too soon comes twice, and if that were answered, so would be all that follow. Where a request comes
 twice or late, MAVSDK goes back to its item and then ignores requests beyond the next. So what is
-asked for again is the item after the one that came last.
+asked for again is the item after the one that came last, and in the end those before it.
 
 What is stored changes only when an upload is complete. A download has no state: each request is
 answered from the store.
@@ -53,6 +53,8 @@ LONGEST_TIMEOUT_US: Final = US_PER_S
 MARGIN: Final = 1.5
 """A request is repeated after so many times what the item before took."""
 MAX_RETRIES: Final = 5
+GO_BACK: Final = 3
+"""From this retry on, each asks for the item before."""
 KINDS: Final = (MISSION, FENCE, RALLY)
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
 CHANGING: Final = frozenset(
@@ -135,6 +137,8 @@ class MissionService:
             self._upload = None
             return [mission_ack(upload.request, mavlink.MAV_MISSION_OPERATION_CANCELLED)]
         upload.retries += 1
+        if upload.retries >= GO_BACK and upload.wanted:
+            upload.wanted -= 1
         return self._ask(upload, now_us)
 
     def next_due_us(self) -> int | None:
