@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import socket
+import ssl
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -91,6 +92,7 @@ def run_panel(
         If the port or the certificate cannot be used.
     """
     os.nice(NICENESS)
+    certificate, key = tls_files(settings)
     sock = _bound(settings, or_any=attached)
     parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
@@ -104,15 +106,39 @@ def run_panel(
         limit_concurrency=MAX_CONNECTIONS,
         ws_max_size=1 << 20,
         timeout_graceful_shutdown=1,
-        ssl_certfile=settings.certificate or None,
-        ssl_keyfile=settings.certificate_key or None,
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
     )
-    try:
-        config.load()
-    except OSError as error:
-        raise PanelError(f"certificate {settings.certificate}: {error.strerror}") from error
+    config.load()
     on_open = partial(on_link, _link(settings, sock))
     asyncio.run(_serve(config, sock, parts, on_open, attached=attached))
+
+
+def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
+    """Return the files of certificate and key, both None for no TLS.
+
+    Raises
+    ------
+    PanelError
+        If they cannot be used.
+    """
+    if not settings.certificate:
+        return None, None
+    certificate = Path(settings.certificate).expanduser()
+    key = Path(settings.certificate_key).expanduser() if settings.certificate_key else certificate
+    try:
+        for file in (certificate, key):
+            # The library of TLS does not say which one is missing.
+            file.read_bytes()
+        # It asks for no password of the key: a service has no terminal.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except ssl.SSLError as error:
+        why = (error.reason or "not that").lower().replace("_", " ")
+        wanted = "a certificate and its key, in PEM, without a password"
+        raise PanelError(f"{certificate} and {key} must be {wanted}: {why}") from error
+    except OSError as error:
+        raise PanelError(f"{error.filename}: {error.strerror}") from error
+    return certificate, key
 
 
 def without_traceback(record: logging.LogRecord) -> bool:

@@ -57,9 +57,13 @@ class PanelSettings(Settings, frozen=True):
         ),
     ] = ""
     certificate: Annotated[
-        str, setting("PEM file of the TLS certificate, with its chain; empty for no TLS.")
+        str,
+        setting("PEM file of the TLS certificate, with its chain; empty for no TLS.", path=True),
     ] = ""
-    certificate_key: Annotated[str, setting("PEM file of its private key.")] = ""
+    certificate_key: Annotated[
+        str,
+        setting("PEM file of its private key; empty if it is in the same file.", path=True),
+    ] = ""
     insecure: Annotated[
         bool,
         setting("Allow other addresses than loopback without TLS; then all traffic is readable."),
@@ -106,7 +110,9 @@ class PanelSettings(Settings, frozen=True):
     )
 
     def __post_init__(self) -> None:
-        """Refuse to be open to other machines without a password."""
+        """Refuse to be open to other machines without a password, and a key of nothing."""
+        if self.certificate_key and not self.certificate:
+            raise ValueError("certificate_key is set: it needs a certificate")
         if self.address in LOOPBACK:
             return
         if not self.password:

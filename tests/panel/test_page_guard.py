@@ -3,6 +3,7 @@
 import http
 import logging
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import httpx
 import pytest
@@ -10,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
-from gateway.panel.panel_server import without_traceback
+from gateway.panel.panel_server import PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.serving.page_guard import COOKIE, MAX_BODY, ROLE, PageGuard
 from gateway.panel.serving.page_lock import MAX_FAILURES, PageLock, hash_password, matches
@@ -194,11 +195,33 @@ def test_hash_matches_its_password_alone() -> None:
         ({"address": "0.0.0.0"}, "password"),
         ({"address": "192.168.1.7", "password": OPERATOR}, "certificate"),
         ({"address": "::", "insecure": True}, "password"),
+        ({"certificate_key": "panel.key"}, "certificate"),
     ],
 )
 def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: str) -> None:
     with pytest.raises(ValueError, match=missing):
         PanelSettings(**settings)
+
+
+@pytest.mark.io
+@pytest.mark.parametrize(
+    ("certificate", "key", "told"),
+    [
+        ("gone.pem", "here.pem", r"^\S*gone.pem: No such file"),
+        ("here.pem", "gone.pem", r"^\S*gone.pem: No such file"),
+        ("here.pem", "", r"here.pem and \S*here.pem must be a certificate and its key"),
+    ],
+)
+def test_a_certificate_that_cannot_be_used_is_named(
+    tmp_path: Path, certificate: str, key: str, told: str
+) -> None:
+    (tmp_path / "here.pem").write_text("junk")
+    settings = PanelSettings(
+        certificate=str(tmp_path / certificate),
+        certificate_key=str(tmp_path / key) if key else "",
+    )
+    with pytest.raises(PanelError, match=told):
+        tls_files(settings)
 
 
 @pytest.mark.parametrize(
