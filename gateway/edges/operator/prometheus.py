@@ -25,7 +25,7 @@ RETRY_S: Final = 5.0
 
 
 class MetricsServer:
-    """Answer an HTTP GET or HEAD with the present metrics, unless a page asks under a name of its own.
+    """Answer HTTP with the present metrics, unless a page asks under a name of its own.
 
     Parameters
     ----------
