@@ -67,6 +67,9 @@ def test_installed_and_purged(package: Path, tmp_path: Path) -> None:
     assert f"{GROUP}:" in members
     assert any(line.startswith("dialout:") and "mavgate" in line for line in members.splitlines())
     settings = root / "etc/mavgate/gateway.toml"
+    [group] = [line.split(":")[2] for line in members.splitlines() if line.startswith(f"{GROUP}:")]
+    found = settings.stat()
+    assert (found.st_uid, found.st_gid, found.st_mode & 0o777) == (0, int(group), 0o640)
     settings.write_text(settings.read_text() + "# my own\n")
     flights = root / "var/lib/mavgate/recordings"
     flights.mkdir(parents=True)

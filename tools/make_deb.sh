@@ -28,6 +28,8 @@ mv "$lib/share" "$work/"
 rm -rf "$lib/bin" "$lib"/mavgate-*.dist-info/direct_url.json
 [ -z "$lock" ] || install --requirement "$lock"
 rm -rf "$lib/bin" "$lib/share"
+# A seventh of all that it would install are the tests of other packages.
+find "$lib" -type d -name tests -prune -exec rm -r {} +
 version=$(PYTHONPATH=$lib "$python" -c 'import gateway; print(gateway.__version__)')
 minor=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 next=${minor%.*}.$((${minor#*.} + 1))

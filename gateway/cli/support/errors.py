@@ -1,11 +1,15 @@
 """Errors of a command."""
 
 import sys
-from typing import NoReturn
+from pathlib import Path
+from typing import Final, NoReturn
 
 import typer
 
 from gateway.cli.support.terminal import console_of
+
+DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
+"""Where `make deb` puts all; what is installed by pip is not found from there."""
 
 
 def refuse(text: str) -> NoReturn:
@@ -22,5 +26,7 @@ def refuse(text: str) -> NoReturn:
 
 
 def how_to_add(extra: str) -> str:
-    """Return the command line that installs an optional part."""
+    """Return the command line that installs an optional part, if one can."""
+    if Path(__file__).is_relative_to(DEBIAN_PACKAGE):
+        return "the Debian package has it not; /usr/share/doc/mavgate/service.md: Elsewhere"
     return f"{sys.executable} -m pip install 'mavgate[{extra}]'"
