@@ -131,11 +131,17 @@ class StreamClient(QueuedClient):
             self._drop(self._outbox.expire(now_us - FRESH_US))
 
     def _next_chunk(self) -> bytes:
-        frames, size = [], 0
+        messages, frames, size = [], b"", 0
         while size < self._chunk_bytes and (waiting := self._outbox.pop()) is not None:
-            frames.append(self.wrap(self._numbering.leave(*waiting)))
-            size += len(frames[-1])
-        return b"".join(frames)
+            frame = self._numbering.leave(*waiting)
+            if frames and len(frames) + len(frame) > self.endpoint.pack_bytes:
+                messages.append(self.wrap(frames))
+                frames = b""
+            frames += frame
+            size += len(frame)
+        if frames:
+            messages.append(self.wrap(frames))
+        return b"".join(messages)
 
     def _on_readable(self, sock: socket.socket) -> None:
         try:

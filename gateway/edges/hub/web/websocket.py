@@ -194,22 +194,6 @@ class WebStream(StreamClient):
         if self._socket is not None and not self._partial:
             self._on_writable(self._socket)
 
-    def _next_chunk(self) -> bytes:
-        pack_bytes = self.endpoint.pack_bytes
-        if not pack_bytes:
-            return super()._next_chunk()
-        messages, frames, size = [], b"", 0
-        while size < self._chunk_bytes and (waiting := self._outbox.pop()) is not None:
-            frame = self._numbering.leave(*waiting)
-            if frames and len(frames) + len(frame) > pack_bytes:
-                messages.append(self.wrap(frames))
-                frames = b""
-            frames += frame
-            size += len(frame)
-        if frames:
-            messages.append(self.wrap(frames))
-        return b"".join(messages)
-
 
 class WsClient(WebStream, TcpClient):
     """A connection that the gateway makes, and remakes when it breaks."""
