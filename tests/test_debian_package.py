@@ -95,6 +95,21 @@ def test_the_program_starts_from_its_own_packages(unpacked: Path) -> None:
     assert f'MADE_FOR = "{major}.{minor}"' in script
 
 
+def test_what_the_program_starts_runs_from_its_packages_too(unpacked: Path) -> None:
+    program = str(unpacked / "usr/bin/mavgate")
+    code = f"""
+import atexit, runpy, subprocess, sys
+where = "import gateway; print(gateway.__file__)"
+atexit.register(subprocess.run, [sys.executable, "-c", where])
+sys.argv[:] = [{program!r}, "--version"]
+runpy.run_path({program!r}, run_name="__main__")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=unpacked
+    )
+    assert done.stdout.splitlines()[1].startswith(str(unpacked))
+
+
 def test_the_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None:
     settings = load(unpacked / "etc/mavgate/gateway.toml")
     unit = (unpacked / UNIT).read_text()
