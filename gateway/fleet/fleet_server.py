@@ -101,6 +101,11 @@ class FleetServer:
         """Where it can be asked."""
         return self._control.path
 
+    @property
+    def place(self) -> str:
+        """Where the router is, or where this one listens as the router."""
+        return self._session.place
+
     async def start(self) -> None:
         """Open everything; a router that is not there yet is waited for.
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
 from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
-from gateway.cli.support.errors import refuse
+from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
@@ -141,7 +141,6 @@ def _add_site(table: Any, site: Mapping[str, Any]) -> None:
 
 
 async def _serve(settings: Any, hub_settings: Any) -> None:
-    from gateway.edges.hub.fleet_link.zenoh_session import HOW_TO_ADD
     from gateway.edges.operator.control_socket import ControlError
     from gateway.fleet.fleet_server import FleetServer
 
@@ -152,9 +151,10 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
         server = FleetServer(settings, hub_settings)
         await server.start()
     except ModuleNotFoundError:
-        refuse(HOW_TO_ADD)
+        refuse(f"the fleet is an extra: {how_to_add('fleet')}")
     except (ValueError, ControlError) as error:
         refuse(str(error))
+    log.info("sites by %s, ground stations by %s", server.place, ", ".join(hub_settings.endpoints))
     with detached_output():
         try:
             await stopped.wait()
