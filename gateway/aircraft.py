@@ -164,7 +164,7 @@ class Aircraft:
             case ImuRaw():
                 return self._take_imu(record, self._chain.imu(record), now_us)
             case ImuCalibrated():
-                return self._take_imu(None, self._filter(record), now_us)
+                return self._take_imu(None, self._chain.imu_calibrated(record), now_us)
             case BaroRaw():
                 baro = self._chain.baro(record)
                 self._estimator.update_baro(baro)
@@ -214,16 +214,6 @@ class Aircraft:
             known = map(nav_state, log.time_us.tolist(), states)
             states = np.array([nav_row(self._correct(state)) for state in known])
         return states.reshape(-1, NAV_COLUMNS)
-
-    def _filter(self, imu: ImuCalibrated) -> ImuSample:
-        return self._chain.imu_si(
-            imu.time_us,
-            imu.accel_b_mps2,
-            imu.gyro_b_radps,
-            imu.mag_b_ut,
-            imu.temperature_degc,
-            imu.flags,
-        )
 
     def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
         state = self._estimator.update_imu(sample)

@@ -266,7 +266,7 @@ def flight_of_records(
                 bare_mag.append(turned.apply(counts) if counts and is_new else UNKNOWN_VEC3)
                 node_times.append(record.node_time_us)
             case ImuCalibrated():
-                samples.append(_filtered(chain, record))
+                samples.append(chain.imu_calibrated(record))
             case BaroRaw():
                 baros.append(chain.baro(record))
             case GpsFix():
@@ -336,17 +336,6 @@ def track_of_states(states: list[NavState]) -> FlightTrack:
         vel_n_mps=np.array([s.vel_n_mps for s in states], np.float64).reshape(-1, 3),
     )
     return track.where_valid(flags)
-
-
-def _filtered(chain: SensorChain, imu: ImuCalibrated) -> ImuSample:
-    return chain.imu_si(
-        imu.time_us,
-        imu.accel_b_mps2,
-        imu.gyro_b_radps,
-        imu.mag_b_ut,
-        imu.temperature_degc,
-        imu.flags,
-    )
 
 
 def _mag_of(samples: list[ImuSample]) -> FloatArray:

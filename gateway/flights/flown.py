@@ -14,8 +14,9 @@ from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for
 from gateway.flights.reading import ReadOptions, open_rows
+from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.records import ImuCalibrated
-from gateway.sensing.chain import SensorChain, pressure_altitude_m
+from gateway.sensing.chain import SensorChain
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 

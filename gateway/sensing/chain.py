@@ -6,10 +6,12 @@ from typing import Annotated, Final
 import msgspec
 import numpy as np
 
+from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.records import (
     UNKNOWN_VEC3,
     BaroRaw,
     BaroSample,
+    ImuCalibrated,
     ImuFlags,
     ImuRaw,
     ImuSample,
@@ -46,9 +48,8 @@ RATE_WINDOW: Final = 64
 RETUNE_RATIO: Final = 0.1
 """Difference of measured and designed rate that makes a new design worth its small step."""
 
-ICAO_PRESSURE_PA: Final = 101_325.0
 BLANK: Final = (0, 0, 0)
-"""The accelerometer's counts from an MPU6050 that was reset, which then tells no rate either."""
+"""The accelerometer's counts after a reset of the MPU6050; its gyroscope gives none then either."""
 _Memory = tuple[float, FilterState | None, FilterState | None, int | None, tuple[int, int]]
 """Rate, low-pass, high-pass, time of the last sample, window of the rate."""
 
@@ -79,24 +80,6 @@ class SensingSettings(Settings, frozen=True):
         float,
         setting("IMU rate to design for until the true one is measured.", "Hz", ge=1.0, le=2000.0),
     ] = 100.0
-
-
-def pressure_altitude_m(pressure_pa: float) -> float:
-    """Convert pressure to height in the ICAO standard atmosphere (troposphere).
-
-    Parameters
-    ----------
-    pressure_pa : float
-        Static pressure.
-
-    Returns
-    -------
-    float
-        Height in metres above the 1013.25 hPa level, positive up; NaN for no pressure.
-    """
-    if not pressure_pa > 0.0:
-        return math.nan
-    return 44_330.769 * (1.0 - float((pressure_pa / ICAO_PRESSURE_PA) ** 0.190263))
 
 
 class SensorChain:
@@ -157,7 +140,7 @@ class SensorChain:
         Returns
         -------
         ImuSample
-            Calibrated SI values, unfiltered and filtered; NaN where the sensor told none.
+            Calibrated SI values, unfiltered and filtered; NaN where the sensor could not be read.
         """
         accel = gyro = UNKNOWN_VEC3
         if raw.accel_raw != BLANK:
@@ -174,6 +157,17 @@ class SensorChain:
             mag,
             temperature_from_counts(raw.temperature_raw),
             raw.flags,
+        )
+
+    def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
+        """Filter a sample that is calibrated already; see `imu_si`."""
+        return self.imu_si(
+            imu.time_us,
+            imu.accel_b_mps2,
+            imu.gyro_b_radps,
+            imu.mag_b_ut,
+            imu.temperature_degc,
+            imu.flags,
         )
 
     def imu_si(
@@ -309,9 +303,10 @@ class SensorChain:
         bare_gyro = (flags & int(ImuFlags.GYRO_FILTERED)) == 0
         begin = 0
         for k, now_us in enumerate([*time_us.tolist(), None]):
-            rate_hz = None if now_us is None else self._measured(now_us)
+            rate_hz = None if now_us is None else self._rate_to_restart_with(now_us)
             if now_us is not None and rate_hz is None:
                 continue
+            # The filters run without a break up to here.
             for chosen, values, vector_filter in (
                 (bare_accel, accel, self._lowpass),
                 (bare_gyro, gyro, self._highpass),
@@ -320,21 +315,13 @@ class SensorChain:
                 values[part] = _filtered_array(vector_filter, values[part])
             begin = k
             if rate_hz is not None:
-                self._begin_anew(rate_hz)
+                self._restart(rate_hz)
         return accel, gyro
 
     def baro(self, raw: BaroRaw) -> BaroSample:
         """Add the pressure altitude to a barometer payload.
 
-        Parameters
-        ----------
-        raw : BaroRaw
-            Compensated pressure.
-
-        Returns
-        -------
-        BaroSample
-            The same with its height.
+        It is above the 1013.25 hPa level, m; NaN for no pressure.
         """
         return BaroSample(
             time_us=raw.time_us,
@@ -352,11 +339,11 @@ class SensorChain:
 
     def _track_rate(self, time_us: int) -> None:
         """Measure the sample rate; reset the filters after a gap, redesign them if it changed."""
-        rate_hz = self._measured(time_us)
+        rate_hz = self._rate_to_restart_with(time_us)
         if rate_hz is not None:
-            self._begin_anew(rate_hz)
+            self._restart(rate_hz)
 
-    def _begin_anew(self, rate_hz: float) -> None:
+    def _restart(self, rate_hz: float) -> None:
         """Redesign the filters for another rate, or reset them if it is the same."""
         if rate_hz == self._rate_hz:
             self._lowpass.reset()
@@ -366,8 +353,8 @@ class SensorChain:
         self._lowpass.retune(rate_hz)
         self._highpass.retune(rate_hz)
 
-    def _measured(self, time_us: int) -> float | None:
-        """Return the rate to restart with: another one, or after a gap the same; else None."""
+    def _rate_to_restart_with(self, time_us: int) -> float | None:
+        """Measure the rate, Hz; return it where it changed, the old one after a gap, else None."""
         last, self._last_us = self._last_us, time_us
         if last is None:
             return None
@@ -393,7 +380,7 @@ def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:
 
 
 def _filtered_array(vector_filter: VectorFilter, values: FloatArray) -> FloatArray:
-    """Do the same for an array."""
+    """Do what `_filtered` does, for vectors of shape (n, 3)."""
     finite = np.isfinite(values).all(axis=1)
     if finite.all():
         return vector_filter.run(values)

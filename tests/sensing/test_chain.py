@@ -3,9 +3,10 @@ import math
 import pytest
 from msgspec.structs import replace
 
+from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.records import BaroRaw, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain, pressure_altitude_m
+from gateway.sensing.chain import SensingSettings, SensorChain
 
 NODE = NodeId(1, 0)
 LEVEL = ImuRaw(

@@ -209,8 +209,7 @@ def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSett
 def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
     """Score a flight with unchanged settings, by the same fixes."""
     judge = rejudged(contest.judge, fusion)
-    track = fuse(judge.fused, fusion)
-    return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
+    return _scores(fuse(judge.fused, fusion), judge)
 
 
 class Trials:
@@ -232,12 +231,11 @@ class Trials:
         judge = rejudged(self._contest.judge, settings)
         if self._sensed is None or self._sensed[0] != settings.sensing:
             self._sensed = (settings.sensing, sense(judge.fused, settings.sensing))
-        track = fuse(judge.fused, settings, self._sensed[1])
-        return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
+        return _scores(fuse(judge.fused, settings, self._sensed[1]), judge)
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
-    """Return the judge with the trial's own latency, because another would reveal the answer."""
+    """Return the judge with a trial's own latency: by the recording's, that one would win."""
     if settings.estimation.reference == judge.fused.fusion.estimation.reference:
         return judge
     fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))
@@ -371,6 +369,11 @@ def optimise(
         updating="deferred", workers=many, callback=report_progress, tol=1e-3,
     )  # fmt: skip
     return tuple(float(v) for v in found.x)
+
+
+def _scores(track: FlightTrack, judge: Judge) -> dict[str, float]:
+    """Return the errors of a track by the columns of `COLUMN_OF` and of `blending.score`."""
+    return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
 
 
 def _attitude_deg(track: FlightTrack, judge: Judge) -> float:

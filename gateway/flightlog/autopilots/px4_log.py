@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gateway.flightlog.table.autopilot import VELOCITY_AGE_US
 from gateway.flightlog.table.autopilot_cells import UNIX_YEAR_2000_US, UT_PER_GAUSS
-from gateway.flightlog.table.column_map import pressure_at_height
 from gateway.flightlog.table.row import LARGEST_WHOLE, Imported
+from gateway.geometry.atmosphere import pressure_at_height
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 
 from gateway.flightlog.damaged_times import is_damaged
 from gateway.flightlog.table.row import COLUMNS, TableRow, check_times
+from gateway.geometry.atmosphere import pressure_at_height
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -27,10 +28,6 @@ NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
 """Without these there is nothing to fuse."""
 LATE_US: Final = 60 * US_PER_S
 """What was measured so long before or after its line has a damaged time, or another clock's."""
-SEA_LEVEL_PA: Final = 101_325.0
-_EXPONENT: Final = 1.0 / 0.190263
-_SCALE_M: Final = 44_330.769
-"""Where the standard atmosphere's formula ends: no pressure belongs to a greater height."""
 
 
 class Column(Settings, frozen=True):
@@ -215,16 +212,6 @@ class CsvReader:
 def _measured_us(own_us: float, row_us: int) -> int:
     """Return when a value was measured; its line's time if that cannot be, or on another clock."""
     return round(own_us) if abs(own_us - row_us) <= LATE_US else row_us
-
-
-def pressure_at_height(alt_m: float) -> float:
-    """Return the pressure in Pa at this height in the standard atmosphere.
-
-    NaN for a height beyond its formula.
-    """
-    if not alt_m < _SCALE_M:
-        return NAN
-    return float(SEA_LEVEL_PA * (1.0 - alt_m / _SCALE_M) ** _EXPONENT)
 
 
 def _velocity(value: Mapping[str, float]) -> Vec3:

@@ -8,8 +8,8 @@ import pytest
 
 from gateway.flightlog.table.column_map import Column, ColumnMap, CsvReader
 from gateway.flights.reading import TRACKER_LOG
+from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.records import GpsFixType, ImuFlags
-from gateway.sensing.chain import pressure_altitude_m
 
 TRACKER = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
 NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"
