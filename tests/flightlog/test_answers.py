@@ -81,8 +81,8 @@ def test_parameters_are_whole_and_numbered_anew(day: Day) -> None:
 def test_a_parameter_holds_from_when_it_was_sent_and_the_first_before(day: Day) -> None:
     day.say(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
     moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
-    told = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
-    assert [decode(frame).param_value for frame in told] == [1.0, 1.0, 2.0]
+    answers = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
+    assert [decode(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
 
 
 def test_a_value_keeps_its_bits_whatever_its_type(day: Day) -> None:
@@ -140,11 +140,11 @@ def test_home_is_that_of_the_moment(day: Day) -> None:
             lat, 85_000_000, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, since_us
         )
         day.say(day.vehicle, home)
-    told = []
+    latitudes = []
     for second in (0, 1, 2):
         (frame,) = day.answers(START_US + second * SECOND_US).frames(242)
-        told.append(decode(frame).latitude)
-    assert told == [470_000_000, 470_000_000, 480_000_000]
+        latitudes.append(decode(frame).latitude)
+    assert latitudes == [470_000_000, 470_000_000, 480_000_000]
 
 
 def test_what_was_not_sent_is_not_known(day: Day) -> None:

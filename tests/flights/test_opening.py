@@ -98,12 +98,12 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
         (track,) = flight.tracks
         while not track.prepare(rows[-1].time_us):
             pass
-    told = {}
+    answered = {}
     for at_us in (rows[0].time_us, rows[-1].time_us):
         answers = VehicleAnswers(flight.answers, 1, 1, lambda at_us=at_us: at_us).parameters()
         (cutoff,) = (frame for name, frame in answers.items() if "ACC_CUTOFF" in name)
-        told[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
-    assert list(told.values()) == [then.sensing.accel_cutoff_hz, 3.5]
+        answered[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
+    assert list(answered.values()) == [then.sensing.accel_cutoff_hz, 3.5]
 
 
 def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:

@@ -249,20 +249,22 @@ def _raise(marker: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("work", "told"),
+    ("work", "text"),
     [(_die_once, "once"), (_die_always, "its process died"), (_raise, "IndexError: no such thing")],
 )
 def test_a_process_that_dies_is_made_up_for(
-    work: Callable[[Path], str], told: str, tmp_path: Path
+    work: Callable[[Path], str], text: str, tmp_path: Path
 ) -> None:
     items = [tmp_path / name for name in ("a", "b", "bad", "c", "d", "e")]
     for item in items:
-        if told != "once" or item.name != "bad":
+        if text != "once" or item.name != "bad":
             item.touch()
     found = dict(LocalProcesses(2).run(work, items))
     assert [found[k] for k in (0, 1, 3, 4, 5)] == ["a", "b", "c", "d", "e"]
     bad = found[2]
-    assert bad == "bad" if told == "once" else isinstance(bad, WorkFailed) and told in bad.reason
+    assert (
+        bad == "bad" if message == "once" else isinstance(bad, WorkFailed) and message in bad.reason
+    )
 
 
 @pytest.fixture
@@ -308,10 +310,10 @@ class _Elsewhere(MemoryFileSystem):
         )
 
     def info(self, path: str, **more: Any) -> dict[str, Any]:
-        told = super().info(path, **more)
-        if told["type"] == "file":
-            told["ETag"] = sha256(self.store[path].getvalue()).hexdigest()
-        return told
+        about = super().info(path, **more)
+        if about["type"] == "file":
+            about["ETag"] = sha256(self.store[path].getvalue()).hexdigest()
+        return about
 
     def _open(self, path: str, mode: str = "rb", **more: Any) -> Any:
         if mode == "rb":
@@ -348,8 +350,8 @@ def test_what_is_elsewhere_is_fetched_once_and_only_if_it_changed(
         assert [r.place for r in results[:2]] == [
             f"elsewhere://host/flights/{n}" for n in FLIGHTS[:2]
         ]
-        told = "elsewhere://host/flights/locked.csv: "
-        assert (results[2].error or "").startswith(told)
+        place = "elsewhere://host/flights/locked.csv: "
+        assert (results[2].error or "").startswith(place)
         assert "secret" not in str(results)
         return _Elsewhere.fetched.copy()
 
@@ -406,6 +408,6 @@ def test_no_passphrase_leaves_the_machine() -> None:
 
     vehicle = msgspec.structs.replace(AircraftSettings().vehicle, signing_passphrase="secret word")
     aircraft = msgspec.structs.replace(AircraftSettings(), vehicle=vehicle)
-    told = without_secrets(ReadOptions(PipelineSettings(aircraft, {2: aircraft})))
-    assert b"secret word" not in FuseTask(told).fingerprint
-    assert told.current.aircraft[2].vehicle.signing_passphrase == ""
+    options = without_secrets(ReadOptions(PipelineSettings(aircraft, {2: aircraft})))
+    assert b"secret word" not in FuseTask(options).fingerprint
+    assert options.current.aircraft[2].vehicle.signing_passphrase == ""

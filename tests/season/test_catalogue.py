@@ -236,7 +236,7 @@ def test_a_half_written_table_is_read_as_far_as_it_goes(tmp_path: Path, folder: 
 
 
 @pytest.mark.parametrize(
-    ("where", "told"),
+    ("where", "message"),
     [
         ("altitude > 3", "no such column: altitude"),
         ("duration >", "syntax error|incomplete"),
@@ -250,11 +250,11 @@ def test_a_half_written_table_is_read_as_far_as_it_goes(tmp_path: Path, folder: 
          "too long|not authorized|prohibited"),
     ],
 )  # fmt: skip
-def test_a_condition_can_only_read(folder: Path, where: str, told: str) -> None:
-    if not told:
+def test_a_condition_can_only_read(folder: Path, where: str, message: str) -> None:
+    if not message:
         assert len(find_flights(folder, where)) == 4
         return
-    with pytest.raises(CatalogueError, match=f"(?s)({told}).*duration > 300"):
+    with pytest.raises(CatalogueError, match=f"(?s)({message}).*duration > 300"):
         find_flights(folder, where)
     assert len(find_flights(folder)) == 6
 
@@ -279,11 +279,11 @@ def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "told"),
+    ("code", "message"),
     [(sqlite3.SQLITE_FULL, "make room"), (sqlite3.SQLITE_IOERR | 9 << 8, "delete it and index")],
 )
 def test_a_catalogue_that_cannot_be_written_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, message: str
 ) -> None:
     def fail(*_: object) -> None:
         (tmp_path / CATALOGUE_NAME).touch()
@@ -292,7 +292,7 @@ def test_a_catalogue_that_cannot_be_written_says_what_to_do(
         raise error
 
     monkeypatch.setattr(Catalogue, "_make", fail)
-    with pytest.raises(CatalogueError, match=f"no luck; .*{told}"):
+    with pytest.raises(CatalogueError, match=f"no luck; .*{message}"):
         Catalogue(tmp_path)
     with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)

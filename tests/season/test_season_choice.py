@@ -83,8 +83,8 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
     rows = errors_by_group(
         [flight("a", 1, eskf=1.0), flight("b", 1, eskf=3.0), flight("c", 2, eskf=8.0, paper=1.0)]
     )
-    told = [(r.vehicle, r.estimator, r.flights, r.median_m, r.worst_m) for r in rows]
-    assert told == [
+    summary = [(r.vehicle, r.estimator, r.flights, r.median_m, r.worst_m) for r in rows]
+    assert summary == [
         (None, "eskf", 3, 3.0, 8.0),
         (None, "paper", 1, 1.0, 1.0),
         (1, "eskf", 2, 2.0, 3.0),

@@ -62,5 +62,6 @@ def _facts(case: Case) -> list[Fact]:
         *([] if figures is None else pilot_facts(figures)),
         Fact(f"{flight.duration_s:.0f} s", "recorded"),
         Fact(f"{len(flight.time_us)}", f"IMU samples, {flight.rate_hz:.0f} a second"),
-        Fact(f"{len(fixes_of(flight))}", f"usable GPS fixes; estimator {case.chosen}"),
+        Fact(f"{len(fixes_of(flight))}", "usable GPS fixes"),
+        Fact(case.chosen, "estimator"),
     ]

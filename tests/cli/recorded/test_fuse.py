@@ -138,10 +138,10 @@ def test_a_latency_that_neither_log_nor_settings_tell_is_estimated(tmp_path: Pat
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     words = " ".join(result.output.split())
-    told = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
-    assert told is not None, words
-    assert float(told[1]) == pytest.approx(0.16, abs=0.02)
-    assert f'"gps_latency_s":{told[1][:4]}' in out.read_text().replace(" ", "")
+    estimate = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
+    assert estimate is not None, words
+    assert float(estimate[1]) == pytest.approx(0.16, abs=0.02)
+    assert f'"gps_latency_s":{estimate[1][:4]}' in out.read_text().replace(" ", "")
 
 
 @pytest.mark.io
@@ -150,5 +150,5 @@ def test_a_latency_that_no_manoeuvre_tells_is_assumed(log: Path) -> None:
     arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
     words = " ".join(CliRunner().invoke(app, arguments).output.split())
     assert "0.15 s is assumed, since no manoeuvre shows it" in words
-    told = CliRunner().invoke(app, [*arguments, "--gps-latency", "0.2"])
-    assert "gives no GPS latency" not in told.output
+    result = CliRunner().invoke(app, [*arguments, "--gps-latency", "0.2"])
+    assert "gives no GPS latency" not in result.output

@@ -72,18 +72,18 @@ def table(path: Path, **head: object) -> Path:
 )
 def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
     out = tmp_path / "out.csv"
-    told = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
-    assert "samples fused" in told
-    assert "10 lines cannot be read and were left out" in told
-    assert "out.csv: 90 samples" in told
+    printed = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
+    assert "samples fused" in printed
+    assert "10 lines cannot be read and were left out" in printed
+    assert "out.csv: 90 samples" in printed
 
 
 @pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])
 def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
     tmp_path: Path, height: str
 ) -> None:
-    told = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
-    assert "100 samples fused" in told
+    printed = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
+    assert "100 samples fused" in printed
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,8 @@ def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
 def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
     path = log(tmp_path / "log.csv")
     path.write_bytes(text + path.read_bytes())
-    told = run("fuse", path, "-o", tmp_path / "out.csv", code=0 if "fused" in words else 2)
-    assert words in told
+    printed = run("fuse", path, "-o", tmp_path / "out.csv", code=0 if "fused" in words else 2)
+    assert words in printed
 
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover", "play"])
@@ -111,8 +111,8 @@ def test_what_has_no_end_is_not_read(tmp_path: Path, command: str, kind: str) ->
     elif kind == "link":
         path.symlink_to("/dev/zero")
     words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "recover") else []
-    told = run(command, path, *words, code=2)
-    assert f"{path}: is a pipe or a device; save its bytes as a file" in told
+    printed = run(command, path, *words, code=2)
+    assert f"{path}: is a pipe or a device; save its bytes as a file" in printed
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -124,9 +124,9 @@ def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> Non
     damaged = {"cut": whole[:-100], "checksum": whole[:-8] + bytes(8)}
     path.write_bytes(damaged[how])
     words = ["-o", tmp_path / "out.csv"] if command != "info" else []
-    told = run(command, path, *words, code=2)
-    assert "log.csv.gz: is a damaged gzip file" in told
-    assert "gzip -dc" in told
+    printed = run(command, path, *words, code=2)
+    assert "log.csv.gz: is a damaged gzip file" in printed
+    assert "gzip -dc" in printed
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -147,10 +147,10 @@ def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
         for _ in range(64):
             file.write(b"1" * (1 << 20))
     tracemalloc.start()
-    told = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
+    printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert "line 2 is longer than 1 MB" in told
+    assert "line 2 is longer than 1 MB" in printed
     assert peak < 32 << 20
 
 
@@ -159,8 +159,8 @@ def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
 def test_times_beyond_the_calendar(tmp_path: Path, end: str, zero_us: int) -> None:
     path = table(tmp_path / "table.csv", unix_us_at_zero=zero_us)
     run("convert", path, "-o", tmp_path / f"out{end}")
-    told = run("info", path)
-    assert ("no day of the calendar" in told) == (zero_us != 0)
+    printed = run("info", path)
+    assert ("no day of the calendar" in printed) == (zero_us != 0)
 
 
 def test_a_tlog_of_the_far_future(tmp_path: Path) -> None:
@@ -172,16 +172,16 @@ def test_a_tlog_of_the_far_future(tmp_path: Path) -> None:
 def test_a_table_of_a_newer_version_is_not_read_as_if_it_were_known(tmp_path: Path) -> None:
     path = table(tmp_path / "table.csv")
     path.write_text(path.read_text().replace(FORMAT_LINE, "# mavgate table 2"))
-    told = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
-    assert "table.csv: line 1: table version '2'; this mavgate reads 1" in told
+    printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
+    assert "table.csv: line 1: table version '2'; this mavgate reads 1" in printed
 
 
 @pytest.mark.parametrize("vehicle_id", [-5, 0, 300])
 def test_a_table_of_no_vehicle(tmp_path: Path, vehicle_id: int) -> None:
     path = table(tmp_path / "table.csv", vehicle_id=vehicle_id)
-    told = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
-    assert "table.csv: line 2: Expected `int`" in told
-    assert "mavgate recover" in told
+    printed = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
+    assert "table.csv: line 2: Expected `int`" in printed
+    assert "mavgate recover" in printed
 
 
 def test_a_table_with_a_byte_order_mark_is_a_table(tmp_path: Path) -> None:
@@ -209,8 +209,8 @@ def test_a_column_map_that_is_none(tmp_path: Path, content: bytes, words: str) -
 @pytest.mark.parametrize("moment", ["9" * 400, "inf", "nan", "1e400", "9999-99-99T00:00:00Z", ""])
 def test_a_moment_that_is_none(tmp_path: Path, moment: str) -> None:
     path = table(tmp_path / "table.csv")
-    told = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
-    assert "write 80, 1:20" in told
+    printed = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
+    assert "write 80, 1:20" in printed
 
 
 @pytest.mark.parametrize("words", [("nan", "nan"), ("inf", "0"), ("47", "8", "--alt", "nan")])
@@ -246,14 +246,14 @@ def test_a_log_whose_clock_begins_anew_goes_on(tmp_path: Path) -> None:
     path = log(tmp_path / "log.csv")
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, *rows, *rows[:50], *rows, ""]))
-    once, told = tmp_path / "once.csv", run("info", path)
-    assert "250 records in 0:02.480" not in told
-    assert "its clock went back" not in told
+    once, printed = tmp_path / "once.csv", run("info", path)
+    assert "250 records in 0:02.480" not in printed
+    assert "its clock went back" not in printed
     late = [f"{float(row.partition(',')[0]) + 60:.2f},{row.partition(',')[2]}" for row in rows]
     path.write_text("\n".join([head, *late, *rows, *late, ""]))
-    told = run("info", path)
-    assert "300 records in 1:01.980" in told
-    assert "its clock went back 1 times" in told
+    printed = run("info", path)
+    assert "300 records in 1:01.980" in printed
+    assert "its clock went back 1 times" in printed
     run("convert", path, "-o", once)
     times_us = [
         int(line.partition(",")[0])
@@ -269,14 +269,14 @@ def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:
     mark = msgspec.json.encode({"time_us": 1000, "text": evil}).decode()
     with recorded.open("a") as file:
         file.write(f"# mark: {mark}\n")
-    told = run("info", recorded)
-    assert r"\x1b]0;owned\x07 \x9b2J [red] :bomb:" in told
-    assert r"a\x1b[31m[red].csv: table" in told
+    printed = run("info", recorded)
+    assert r"\x1b]0;owned\x07 \x9b2J [red] :bomb:" in printed
+    assert r"a\x1b[31m[red].csv: table" in printed
     refused = run("info", tmp_path / "b\x1b[31m.csv", code=2)
     assert r"b\x1b[31m.csv: No such file" in refused
     as_json = run("info", recorded, "--json")
     assert msgspec.json.decode(as_json)["marks"][0]["text"] == evil
-    assert not set("\x1b\x07\x9b") & set(told + refused + as_json)
+    assert not set("\x1b\x07\x9b") & set(printed + refused + as_json)
 
 
 def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "text"),
     [
         ([], "nothing to vary"),
         (["--alpha", "1:2:3"], "alpha_accel = 1.5"),
@@ -92,10 +92,10 @@ def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: P
         (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the position"),
     ],
 )
-def test_what_cannot_be_done_is_reported(recording: Path, arguments: list[str], told: str) -> None:
+def test_what_cannot_be_done_is_reported(recording: Path, arguments: list[str], text: str) -> None:
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 2
-    assert told in result.output
+    assert text in result.output
 
 
 def test_a_file_that_is_not_there_is_reported(tmp_path: Path) -> None:

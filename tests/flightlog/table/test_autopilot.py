@@ -198,8 +198,8 @@ def test_a_lost_fix_makes_no_climb() -> None:
     assert [math.isfinite(fix.vel_n_mps[2]) for fix in fixes_of(flight)] == [False] * 4
     lost = fixes_of(flight)[1]
     assert not any(map(math.isfinite, lost.vel_n_mps))
-    told = [(at_us, position(at_us // 1000, 20)) for at_us, _ in flight]
-    both = [message for pair in zip(told, flight, strict=True) for message in pair]
+    positions = [(at_us, position(at_us // 1000, 20)) for at_us, _ in flight]
+    both = [message for pair in zip(positions, flight, strict=True) for message in pair]
     downs = [fix.vel_n_mps[2] for fix in fixes_of(both)]
     assert downs == pytest.approx([0.2, math.nan, 0.2, 0.2], nan_ok=True)
 

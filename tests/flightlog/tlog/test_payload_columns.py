@@ -59,11 +59,11 @@ def test_every_message_of_the_dialect(seed: int) -> None:
             for name in kind.ordered_fieldnames:
                 if row[name].dtype.kind == "S":
                     text = getattr(message, f"_{name}_raw", None) or getattr(message, name)
-                    told = text.encode("latin-1") if isinstance(text, str) else text
-                    assert row[name] == told.rstrip(b"\0"), (kind.msgname, name)
+                    expected = text.encode("latin-1") if isinstance(text, str) else text
+                    assert row[name] == expected.rstrip(b"\0"), (kind.msgname, name)
                 else:
-                    told = getattr(message, name)
-                    assert np.array_equal(row[name].tolist(), told, equal_nan=True), (
+                    expected = getattr(message, name)
+                    assert np.array_equal(row[name].tolist(), expected, equal_nan=True), (
                         kind.msgname,
                         name,
                     )

@@ -80,17 +80,17 @@ def test_what_was_logged_is_read(folder: Path, name: str) -> None:
     mags = [imu.mag_b_ut for imu in imus if imu.mag_b_ut]
     np.testing.assert_allclose(mags, [r.mag_b_ut for r in logged if r.mag_b_ut], atol=0.051)
     baros = [row.baro.pressure_pa for row in rows if row.baro]
-    told = [r.pressure_pa for r in flown.records() if isinstance(r, BaroRaw)]
-    np.testing.assert_allclose(baros, told, rtol=1e-6)
+    sent = [r.pressure_pa for r in flown.records() if isinstance(r, BaroRaw)]
+    np.testing.assert_allclose(baros, sent, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
     table, rows = whole(folder / name)
     fixes = [row.gps for row in rows if row.gps]
-    told = [r for r in flown.records() if isinstance(r, GpsFix)]
-    assert [f.fix_ok for f in fixes] == [r.fix_ok for r in told]
-    pairs = [(f, r) for f, r in zip(fixes, told, strict=True) if r.fix_ok]
+    sent = [r for r in flown.records() if isinstance(r, GpsFix)]
+    assert [f.fix_ok for f in fixes] == [r.fix_ok for r in sent]
+    pairs = [(f, r) for f, r in zip(fixes, sent, strict=True) if r.fix_ok]
     assert len(pairs) > 100
     for f, r in pairs:
         assert (f.lat_dege7, f.lon_dege7, f.satellites) == (
@@ -119,8 +119,8 @@ def test_what_the_autopilot_believed_is_there_to_compare_with(folder: Path, name
     states = [row.state for row in rows if row.state]
     assert len(states) > 0.9 * len(flown.believed())
     zero_us = flown.records()[0].time_us
-    told = {b.time_us - zero_us: b for b in flown.believed()}
-    near = [(s, told[s.time_us]) for s in states if s.time_us in told]
+    believed = {b.time_us - zero_us: b for b in flown.believed()}
+    near = [(s, believed[s.time_us]) for s in states if s.time_us in believed]
     assert len(near) > 0.9 * len(states)
     error = total_error_rad(
         rotation_error(np.array([s.q_nb for s, _ in near]), np.array([b.q_nb for _, b in near]))
