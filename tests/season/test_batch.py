@@ -262,9 +262,7 @@ def test_a_process_that_dies_is_made_up_for(
     found = dict(LocalProcesses(2).run(work, items))
     assert [found[k] for k in (0, 1, 3, 4, 5)] == ["a", "b", "c", "d", "e"]
     bad = found[2]
-    assert (
-        bad == "bad" if message == "once" else isinstance(bad, WorkFailed) and message in bad.reason
-    )
+    assert bad == "bad" if text == "once" else isinstance(bad, WorkFailed) and text in bad.reason
 
 
 @pytest.fixture
