@@ -30,6 +30,7 @@ from gateway.vehicle.services.calibrator import Calibrator
 from gateway.vehicle.services.commands import ACCEPTED, FAILED, CommandService, read_command
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import IntervalService
+from gateway.vehicle.services.log_list import LogListService
 from gateway.vehicle.services.missions.places import PlaceService
 from gateway.vehicle.services.parameters.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
 from gateway.vehicle.services.parameters.parameter_service import ParameterService
@@ -170,6 +171,7 @@ class Vehicle:
             self.places.missions,
             self._ftp,
             TimingService(),
+            LogListService(),
         )
         self._services = {kind: service for service in services for kind in service.types}
         self._timed = (

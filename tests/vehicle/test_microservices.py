@@ -170,6 +170,11 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     # ping.html and timesync.html
     "ping": (lambda: mavlink.MAVLink_ping_message(5, 6, 0, 0), "PING", {"seq": 6}),
     "timesync": (lambda: mavlink.MAVLink_timesync_message(0, 7), "TIMESYNC", {"ts1": 7}),
+    # log.html
+    "log/list": (
+        lambda: mavlink.MAVLink_log_request_list_message(*ME, 0, 0xFFFF),
+        "LOG_ENTRY", {"id": 0, "num_logs": 0},
+    ),
 }  # fmt: skip
 
 

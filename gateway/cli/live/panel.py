@@ -16,6 +16,8 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.routing.endpoint import parse_endpoint
 
+log = logging.getLogger(__name__)
+
 
 def register(app: typer.Typer) -> None:
     """Add the command of this file."""
@@ -44,6 +46,8 @@ def panel(
     Without --connect it shows the gateway that runs on this machine, and reconnects whenever that
     is restarted.
     """
+    if not (attached or hash_password):
+        log.info("the panel is loading; its address follows")
     try:
         from gateway.panel.panel_server import PanelError, run_panel
     except ModuleNotFoundError as error:
