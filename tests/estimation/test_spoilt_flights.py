@@ -370,6 +370,14 @@ def test_a_heading_by_compass_alone_is_as_unsure_as_the_iron_left(
     assert share(two_sigma(flight, run_eskf(flight))["heading"]) > 0.95
 
 
+@pytest.mark.parametrize(("name", "most_deg"), [("complementary", 1.4), ("eskf", 1.25)])
+def test_a_real_compass_is_not_followed_into_its_slow_errors(
+    data_dir: Path, name: str, most_deg: float
+) -> None:
+    flight = read_flight(data_dir / "broad_15_undisturbed_fast_translation_A.csv.gz")
+    assert attitude_scores(flight, RUNS[name](flight)[:, :4])["total"] < most_deg
+
+
 def test_the_level_needs_no_heading(data_dir: Path) -> None:
     """Turned for minutes without compass and GPS."""
     flight = read_flight(data_dir / "broad_30_disturbed_stationary_magnet_C.csv.gz")

@@ -51,7 +51,7 @@ class ComplementarySettings(Settings, frozen=True):
     heading_noise_deg: Annotated[
         float,
         setting("Slow error of the compass: iron, and the place.", "deg", ge=0.1, le=45.0),
-    ] = 3.0
+    ] = 3.5
     gps_velocity_noise_mps: Annotated[
         float,
         setting(
