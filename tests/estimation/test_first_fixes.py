@@ -1,4 +1,4 @@
-"""The first fixes of a receiver that tells no velocity: the way between them is one."""
+"""The first fixes of a receiver: no way leads to them, and their height may be nonsense."""
 
 import math
 from dataclasses import replace
@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import GPS_VEL
+from gateway.estimation.columns import GPS_ALT, GPS_VEL, NAV_ALT
 from gateway.estimation.kernel import SampleLog
+from tests.estimation.samples import ALT_M
+from tests.estimation.test_steady_motion import LOST_S, drive
 from tests.estimation.test_without_compass import STANDS_S, estimator_of, flight
 
 SEEDS = range(3)
@@ -37,3 +39,17 @@ def tilt_rad(name: str, log: SampleLog) -> np.ndarray:
 @pytest.mark.parametrize("name", ["complementary", "eskf"])
 def test_the_first_fix_was_not_reached_from_anywhere(name: str, first_s: float, seed: int) -> None:
     assert tilt_rad(name, without_velocity(seed, first_s)).max() < MOST_RAD
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("off_m", [-500.0, 60.0])
+def test_first_heights_that_are_wrong_are_given_up(off_m: float, seed: int) -> None:
+    log, _ = drive(seed, stops=False)
+    gps, at = log.gps.copy(), np.arange(0, len(log.imu_time_us), 4)
+    gps[:5, GPS_ALT] += off_m
+    told = ALT_M + np.random.default_rng(seed).normal(0.0, 0.25, len(at))
+    baro_us = log.imu_time_us[at]
+    spoilt = replace(log, gps=gps, baro_time_us=baro_us, baro_alt_m=told)
+    out = estimator_of("eskf").run(spoilt)
+    late = (log.imu_time_us > 20e6) & (log.imu_time_us < LOST_S * 1e6)
+    assert np.abs(out[late, NAV_ALT] - ALT_M).max() < 3.0

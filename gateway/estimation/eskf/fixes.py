@@ -1,6 +1,7 @@
 """GPS fixes: the first heading, starts and restarts, and the update by a late fix."""
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_velocity import (
@@ -10,10 +11,11 @@ from gateway.estimation.alignment.gps_velocity import (
 )
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import EskfState
+from gateway.estimation.eskf.eskf_state import POS, EskfState
 from gateway.estimation.eskf.measure import (
     lag_integrals,
     place_distance_sq,
+    place_variance,
     set_wander_variance,
     update_by_fix,
 )
@@ -38,6 +40,9 @@ from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.estimation.local_position import is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
+
+LONGEST_S: Final = 1.0
+"""A fix speaks for no longer than this."""
 
 
 @compiled
@@ -107,6 +112,7 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
         pos[2] - past_pos[2] - w[2],
     )
     off_vel = (vel[0] - past_vel[0], vel[1] - past_vel[1], vel[2] - past_vel[2])
+    watch_height(s, p, row, off_pos[2])
     unlikely = place_distance_sq(s, p, row, off_pos, once, twice, lag) > p.gate_sq
     off_m = math.hypot(off_pos[0], off_pos[1])
     note_contradiction(s, off_m if unlikely else 0.0)
@@ -118,6 +124,21 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
     update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
     if not far:
         accept_fix(s)
+
+
+@compiled
+def watch_height(s: EskfState, p: EskfGains, row: FloatArray, off_m: float) -> None:
+    """Give a height up that the fixes contradict for long: the next one tells it anew.
+
+    The first heights of a receiver may be hundreds of metres off, and agree with one another.
+    """
+    if not math.isfinite(off_m):
+        return
+    known = s.P[POS + 2, POS + 2] + s.wander_var[2] + place_variance(p, row, 2)
+    near = abs(off_m) < p.gate_m or off_m * off_m < p.gate_sq * known
+    s.height_off_s = 0.0 if near else s.height_off_s + min(s.time_s - s.weighed_s, LONGEST_S)
+    if s.height_off_s > p.gps_relock_s:
+        s.has_height, s.doubt_pos_sq = 0, 0.0
 
 
 @compiled

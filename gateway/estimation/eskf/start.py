@@ -178,7 +178,7 @@ def start_height(s: EskfState, p: EskfGains, down_m: float) -> None:
     if s.has_height == 1 or not math.isfinite(down_m):
         return
     start_position(s, 2, down_m, p.gps_height_var)
-    s.has_height = 1
+    s.has_height, s.height_off_s = 1, 0.0
     if s.baro_known == 1:
         restart_baro(s, p)
 
