@@ -161,14 +161,17 @@ def test_a_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
     assert flows[2] > 0.7 * flows[0]
 
 
-def test_answers_come_first() -> None:
+@pytest.mark.parametrize("how", ["answer", "deliver"])
+def test_answers_come_first(how: str) -> None:
+    """Our own answers, and frames that others address to who is behind the link."""
     flight = Flight("udp:h:1?budget=3000")
+    send = getattr(flight.fanout, how)
     flight.run(10)
     answer = b"\xfd\xc8\0\0\0\1\1\x16\0\0" + bytes(202)
     begin_us = flight.now_us
     for _ in range(100):
         for _ in range(10):
-            flight.fanout.answer(answer, [0])
+            send(answer, [0])
         flight.run(1)
     frames = flight.sinks[0].since(begin_us + 90 * US_PER_S)
     telemetry = [frame for frame in frames if message_id_of(frame) != 22]
