@@ -42,6 +42,14 @@ def test_a_living_way_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
     assert table.ways_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]
 
 
+def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None:
+    table.hear(4, (20, 1), 0)
+    assert table.is_shared((20, 1), ROUTE_FRESH_US)
+    table.hear(4, (20, 1), ROUTE_FRESH_US + 1)
+    assert not table.is_shared((20, 1), ROUTE_FRESH_US + 1)
+    assert not table.is_shared((10, 1), 0)
+
+
 def test_a_client_that_left_is_no_way(table: RoutingTable) -> None:
     table.forget(1)
     table.forget(1)
