@@ -77,6 +77,16 @@ def test_a_last_record_that_is_being_written_is_no_damage() -> None:
     assert (wrong.damaged_bytes, wrong.unfinished_bytes) == (4, 0)
 
 
+def test_a_cut_record_that_others_follow_is_damage() -> None:
+    """Also where the file ends before its length would be over."""
+    flight = make_flight(20, 1)
+    message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251)
+    frame = bytes(message.pack(mavlink.MAVLink(None, 1, 1)))
+    cut = make_tlog([TlogRecord(flight[-1].time_us, frame)])[:100]
+    info = sum_up(make_tlog(flight[:-1]) + cut + make_tlog(flight[-1:]))
+    assert (info.records, info.damaged_bytes, info.unfinished_bytes) == (40, len(cut), 0)
+
+
 @pytest.mark.parametrize(
     ("tail", "damaged", "unfinished"),
     [(b"1000,0,", 0, 7), (b"1000," + bytes(3), 8, 0), (b"1000,0,\n", 8, 0)],

@@ -176,7 +176,7 @@ class TlogScanner:
         begins, ends = runs[:, :damaged].tolist()
         damage = [Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True)]
         unfinished = 0
-        if final and damage and (begins[-1] or was_in_step):
+        if final and damage and ends[-1] == len(data) and (begins[-1] or was_in_step):
             rest = np.frombuffer(data, np.uint8)[begins[-1] :]
             unfinished = damage.pop().size if lacks_end(rest) else 0
         starts, sizes, times, origins, message_ids = found
