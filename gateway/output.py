@@ -8,7 +8,6 @@ of it or nothing under that name: not after a power loss, and not after it was k
 import contextlib
 import errno
 import os
-import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -152,25 +151,30 @@ def written_together(folder: Path) -> Iterator[Path]:
     """
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(dir=folder, prefix="."))
-    try:
-        yield fresh
-        files = [*fresh.iterdir()]
-        for file in files:
-            check_output(folder / file.name, overwrite=True)
-        for file in files:
-            file.replace(folder / file.name)
-        sync_folder(folder)
-    except OSError as error:
-        if error.filename is not None and Path(error.filename).parent == fresh:
-            error.filename = str(folder / Path(error.filename).name)
-        raise
-    finally:
-        shutil.rmtree(fresh)
+    with contextlib.ExitStack() as undo:
         if is_new:
-            # It is still empty where something failed.
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+            undo.callback(_remove_if_empty, folder)
+        with _named(folder, "."):
+            made = tempfile.TemporaryDirectory(dir=folder, prefix=".")
+        fresh = Path(undo.enter_context(made))
+        try:
+            yield fresh
+            files = [*fresh.iterdir()]
+            for file in files:
+                check_output(folder / file.name, overwrite=True)
+            for file in files:
+                file.replace(folder / file.name)
+            sync_folder(folder)
+        except OSError as error:
+            if error.filename is not None and Path(error.filename).parent == fresh:
+                error.filename = str(folder / Path(error.filename).name)
+            raise
+
+
+def _remove_if_empty(folder: Path) -> None:
+    """Remove a folder that was made for files that did not come."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 @contextlib.contextmanager

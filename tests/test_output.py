@@ -183,6 +183,19 @@ def test_files_that_belong_together_get_their_names_together(
     }
 
 
+def test_a_folder_that_takes_no_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_suffix: object, prefix: str, folder: Path) -> str:
+        raise OSError(errno.ENOSPC, "full", str(folder / f"{prefix}x"))
+
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
+    with pytest.raises(OSError, match="full") as caught, written_together(tmp_path / "new"):
+        pytest.fail("nothing can be written")
+    assert caught.value.filename == str(tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def test_what_cannot_be_read_keeps_its_own_name(tmp_path: Path) -> None:
     def pieces() -> Iterator[bytes]:
         yield b"1"
