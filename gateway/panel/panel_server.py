@@ -133,9 +133,9 @@ def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
         # It asks for no password of the key: a service has no terminal.
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
     except ssl.SSLError as error:
-        why = (error.reason or "not that").lower().replace("_", " ")
+        why = f" ({error.reason.lower().replace('_', ' ')})" if error.reason else ""
         wanted = "a certificate and its key, in PEM, without a password"
-        raise PanelError(f"{certificate} and {key} must be {wanted}: {why}") from error
+        raise PanelError(f"{certificate} and {key} must be {wanted}{why}") from error
     except OSError as error:
         raise PanelError(f"{error.filename}: {error.strerror}") from error
     return certificate, key
