@@ -21,7 +21,7 @@ from gateway.units import US_PER_S
 PROFILE_POINTS: Final = 400
 HEIGHT_GAP_US: Final = US_PER_S // 5
 RECORDED: Final = "recorded"
-TWIN: Final = "re-fused"
+FUSED_AGAIN: Final = "fused again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class RecordedAircraft:
     recorded_id: int
     """Its recorded MAVLink system id."""
     origin: str
-    """`RECORDED`, or `TWIN` for one that is fused again while it plays."""
+    """`RECORDED`, or `FUSED_AGAIN` for one that is fused again while it plays."""
     profile: Profile
     """Empty if no height was recorded."""
 
@@ -123,7 +123,7 @@ def _of_tables(parts: Sequence[Path]) -> RecordedAircraft:
                 elif isinstance(event, TableRow):
                     begin_us = event.time_us if begin_us is None else begin_us
                     _note_height(event, points)
-    return RecordedAircraft(vehicle_id, TWIN, _profile(points, begin_us or 0))
+    return RecordedAircraft(vehicle_id, FUSED_AGAIN, _profile(points, begin_us or 0))
 
 
 def _note_height(row: TableRow, points: list[TrackPoint]) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Final
 from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.edges.operator.control_socket import ControlError
 from gateway.panel.control_client import ControlClient
-from gateway.panel.recorded_aircraft import TWIN, RecordedAircraft, free_ids, look_into
+from gateway.panel.recorded_aircraft import FUSED_AGAIN, RecordedAircraft, free_ids, look_into
 from gateway.panel.state.fleet_picture import FleetPicture, Origin
 from gateway.panel.uplink import Uplink
 
@@ -64,11 +64,11 @@ class Playback:
         self._opening, self._ordering = asyncio.Lock(), asyncio.Lock()
 
     @property
-    def has_twin(self) -> bool:
+    def has_fused_again(self) -> bool:
         """Whether some of it is fused again."""
-        return any(one.origin == TWIN for one in self.aircraft.values())
+        return any(one.origin == FUSED_AGAIN for one in self.aircraft.values())
 
-    async def open(self, folder: Path, name: str, *, twin: bool) -> None:
+    async def open(self, folder: Path, name: str, *, fused_again: bool) -> None:
         """Open a recording, instead of the present one.
 
         Parameters
@@ -77,8 +77,8 @@ class Playback:
             Of the recordings.
         name : str
             Name of an existing one.
-        twin : bool
-            Whether to play a re-fused copy beside it too.
+        fused_again : bool
+            Whether to play a copy that is fused again beside it too.
 
         Raises
         ------
@@ -87,16 +87,16 @@ class Playback:
         """
         async with self._opening:
             self.close()
-            await self._open(folder, name, twin=twin)
+            await self._open(folder, name, fused_again=fused_again)
 
-    async def _open(self, folder: Path, name: str, *, twin: bool) -> None:
+    async def _open(self, folder: Path, name: str, *, fused_again: bool) -> None:
         try:
             files = find_recording(folder, name).files
         except RecordingError as error:
             raise PlaybackError(str(error)) from error
         tlogs = [file for file in files if file.suffix == ".tlog"]
         tables = [file for file in files if file.suffix == ".csv"]
-        played = [*tlogs, *(tables if twin or not tlogs else [])]
+        played = [*tlogs, *(tables if fused_again or not tlogs else [])]
         try:
             flights = await asyncio.to_thread(look_into, played)
             firsts = self._number(flights)

@@ -390,7 +390,7 @@ def _move_in_time(page: Page, row: object) -> None:
     view.get_by_text("fused again beside it").click()
     # The table is fused by a process that may have to compile first.
     page.wait_for_function(
-        "Object.values(mavgate.vehicles).filter((v) => v.origin === 're-fused').length === 2",
+        "Object.values(mavgate.vehicles).filter((v) => v.origin === 'fused again').length === 2",
         timeout=START_LIMIT_MS,
     )
     expect(slider).to_be_visible()

@@ -11,7 +11,7 @@ from gateway.config import GatewaySettings
 from gateway.flightlog.table.row import row_to_line
 from gateway.flightlog.table.table import encode_head
 from gateway.flightlog.tlog.tlog import encode_record
-from gateway.panel.recorded_aircraft import RECORDED, TWIN, free_ids, look_into
+from gateway.panel.recorded_aircraft import FUSED_AGAIN, RECORDED, free_ids, look_into
 from gateway.units import US_PER_S
 from tests.test_replay import fly, make_flight, read
 
@@ -44,16 +44,16 @@ def test_every_aircraft_of_a_tlog_has_its_heights(tmp_path: Path) -> None:
     assert second.profile.alt_amsl_m == (300.0,) * 5
 
 
-def test_table_tells_of_its_twin(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_table_is_fused_again(tmp_path: Path, rng: np.random.Generator) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
     table = tmp_path / "a_01_v1.csv"
     table.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
-    ((twin,),) = look_into([table])
-    assert (twin.recorded_id, twin.origin) == (header.vehicle_id, TWIN)
-    assert twin.profile.time_s[-1] == pytest.approx(10.0, abs=0.5)
+    ((found,),) = look_into([table])
+    assert (found.recorded_id, found.origin) == (header.vehicle_id, FUSED_AGAIN)
+    assert found.profile.time_s[-1] == pytest.approx(10.0, abs=0.5)
     heights = [row.state.alt_amsl_m for row in rows if row.state is not None]
-    assert set(twin.profile.alt_amsl_m) <= set(heights)
-    assert 40 < len(twin.profile.alt_amsl_m) <= 50
+    assert set(found.profile.alt_amsl_m) <= set(heights)
+    assert 40 < len(found.profile.alt_amsl_m) <= 50
 
 
 def test_played_aircraft_get_ids_that_nobody_has() -> None:

@@ -113,7 +113,7 @@ async def test_a_player_that_does_not_answer_at_once_is_waited_for(
         playback_port = 1
 
     playback = Playback(Uplink(), FleetPicture())  # type: ignore[arg-type]
-    await playback.open(tmp_path, "day", twin=False)
+    await playback.open(tmp_path, "day", fused_again=False)
     assert playback.status == {"state": "playing", "position_s": 0.0}
     playback.close()
     assert playback.status is None

@@ -21,7 +21,7 @@ class Origin:
     """Origin of an aircraft that is not live."""
 
     word: str
-    """`recorded` or `re-fused`."""
+    """`recorded` or `fused again`."""
     recorded_id: int
     """Its recorded system id."""
 

@@ -25,7 +25,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     model: str
     """`plane`, `copter`, `heli`, `rover`, `boat` or `none`; see `VehiclePicture`."""
     origin: str
-    """`live`, `recorded` or `re-fused`."""
+    """`live`, `recorded` or `fused again`."""
     generation: int
     """How often its path was restarted."""
     silent_s: float

@@ -50,7 +50,7 @@ class VehiclePicture:
     system_id : int
         MAVLink system.
     origin : str
-        `live`, `recorded` or `re-fused`.
+        `live`, `recorded` or `fused again`.
     number : int, optional
         Its displayed number, if it is not the system id.
     """

@@ -99,7 +99,7 @@ class RecordingsView:
     def _build_player(self) -> None:
         with ui.element("div").classes("line"):
             self._title = ui.label().classes("title spring")
-            self._twin = ui.switch("fused again beside it", on_change=self._on_twin)
+            self._fused_again = ui.switch("fused again beside it", on_change=self._on_fused_again)
             ui.button(icon="close", on_click=self._close).props(
                 'flat round dense aria-label="Close the recording"'
             )
@@ -145,7 +145,7 @@ class RecordingsView:
         if status is None:
             return
         self._title.set_text(playback.name)
-        self._twin.set_value(playback.has_twin)
+        self._fused_again.set_value(playback.has_fused_again)
         playing = status["state"] == "playing"
         self._toggle.props(f"icon={'pause' if playing else 'play_arrow'}")
         new = {
@@ -199,18 +199,20 @@ class RecordingsView:
         ui.notify(event.args["text"], type="positive" if event.args["ok"] else "negative")
         await self.refresh()
 
-    async def _open(self, name: str, *, twin: bool = False) -> None:
+    async def _open(self, name: str, *, fused_again: bool = False) -> None:
         context = self._context
         with notify_failure(context):
             context.check_may_change()
             ui.notify(f"Opening {name}…")
-            await context.parts.playback.open(context.parts.recordings_folder, name, twin=twin)
+            await context.parts.playback.open(
+                context.parts.recordings_folder, name, fused_again=fused_again
+            )
             self._show_place()
 
-    async def _on_twin(self, event: Any) -> None:
+    async def _on_fused_again(self, event: Any) -> None:
         playback = self._context.parts.playback
-        if playback.name and event.value != playback.has_twin:
-            await self._open(playback.name, twin=event.value)
+        if playback.name and event.value != playback.has_fused_again:
+            await self._open(playback.name, fused_again=event.value)
 
     def _close(self) -> None:
         with notify_failure(self._context):

@@ -10,7 +10,7 @@ const AIRCRAFT = {
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
   none: "M16 3l9 25-9-6-9 6z",
 };
-const COLOURS = { recorded: "recorded", "re-fused": "twin" };
+const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
 const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
 const at = (spot) => [spot.lat_deg, spot.lon_deg];
 
@@ -98,7 +98,7 @@ export default {
       </div>
       <div class="map-legend" v-if="full">
         <span class="key track">fused</span><span class="key fix">GPS</span>
-        <span v-for="origin in played" :key="origin" class="key" :class="origin">{{ origin }}</span>
+        <span v-for="origin in played" :key="origin" class="key" :class="origin.replace(' ', '-')">{{ origin }}</span>
         <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
       </div>

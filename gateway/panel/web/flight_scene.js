@@ -13,7 +13,7 @@ const SLOWEST_MS = 400;
 const LATE_MS = 45; // between two turns of the browser's own
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "Beside" };
 const SPAN_M = 2; // of the models
-const COLOURS = { recorded: "recorded", "re-fused": "twin" };
+const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
 const rad = Math.PI / 180;
 
 // Whether the machine's processor draws, which has instruments to draw and perhaps a gateway to run.
