@@ -2,6 +2,7 @@
 
 import http
 import logging
+import subprocess
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -222,6 +223,22 @@ def test_a_certificate_that_cannot_be_used_is_named(
     )
     with pytest.raises(PanelError, match=told):
         tls_files(settings)
+
+
+@pytest.mark.io
+def test_a_key_may_be_in_the_certificates_file_but_needs_no_password(tmp_path: Path) -> None:
+    key, certificate, locked = (tmp_path / name for name in ("key", "certificate", "locked"))
+    for words in (
+        ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
+         "-days", "30", "-subj", "/CN=mavgate", "-keyout", key, "-out", certificate],
+        ["ec", "-in", key, "-aes256", "-passout", "pass:secret", "-out", locked],
+    ):  # fmt: skip
+        subprocess.run(["openssl", *words], check=True, capture_output=True)
+    settings = PanelSettings(certificate=str(certificate), certificate_key=str(locked))
+    with pytest.raises(PanelError, match="without a password$"):
+        tls_files(settings)
+    certificate.write_text(certificate.read_text() + key.read_text())
+    assert tls_files(PanelSettings(certificate=str(certificate))) == (certificate, certificate)
 
 
 @pytest.mark.parametrize(
