@@ -235,7 +235,7 @@ def test_a_key_may_be_in_the_certificates_file_but_needs_no_password(tmp_path: P
     ):  # fmt: skip
         subprocess.run(["openssl", *words], check=True, capture_output=True)
     settings = PanelSettings(certificate=str(certificate), certificate_key=str(locked))
-    with pytest.raises(PanelError, match="without a password$"):
+    with pytest.raises(PanelError, match=r"without a password$"):
         tls_files(settings)
     certificate.write_text(certificate.read_text() + key.read_text())
     assert tls_files(PanelSettings(certificate=str(certificate))) == (certificate, certificate)

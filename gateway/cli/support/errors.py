@@ -28,5 +28,5 @@ def refuse(text: str) -> NoReturn:
 def how_to_add(extra: str) -> str:
     """Return the command line that installs an optional part, if one can."""
     if Path(__file__).is_relative_to(DEBIAN_PACKAGE):
-        return "the Debian package has it not; /usr/share/doc/mavgate/service.md: Elsewhere"
+        return "the Debian package does not have it: /usr/share/doc/mavgate/service.md, Elsewhere"
     return f"{sys.executable} -m pip install 'mavgate[{extra}]'"
