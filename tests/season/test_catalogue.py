@@ -361,16 +361,18 @@ def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:
 def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> None:
     (tmp_path / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "one_02_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "bad.csv").write_text("")
     run = CliRunner().invoke
     done = run(app, ["catalogue", str(tmp_path), "--jobs", "1"])
     assert done.exit_code == 0, done.output
-    assert "3 files read (1 of them broken), 0 unchanged, 0 gone" in done.output
+    assert "4 files read (1 of them broken), 0 unchanged, 0 gone" in done.output
     listed = run(app, ["catalogue", "list", "--folder", str(tmp_path)])
     assert "one_01_v1.csv" in listed.output
-    assert re.search(r"1 flight, \S+ h, in 3 files; 1 broken", listed.output)
+    assert re.search(r"2 flights, \S+ h, in 4 files; 1 broken", listed.output)
     wanted = ["catalogue", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
-    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one", "one"]
+    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one"] * 3
     shown = run(app, ["catalogue", "show", "one", "-d", str(tmp_path)])
     assert re.search(r"fastest +\d+\.\d +m/s", shown.output)
     geo = json.loads(

@@ -235,7 +235,7 @@ class Trials:
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
-    """Return the judge with a trial's own latency: by the recording's, that one would win."""
+    """Return the judge with a trial's own latency: judged by the recording's, that would win."""
     if settings.estimation.reference == judge.fused.fusion.estimation.reference:
         return judge
     fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))

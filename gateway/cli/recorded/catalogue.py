@@ -193,15 +193,16 @@ def _show_table(rows: list[Row]) -> None:
     )
 
 
-def _durations_s(rows: list[Row]) -> dict[tuple[str, int | None], float]:
-    """Return how long each flight lasted, by recording and aircraft.
+def _durations_s(rows: list[Row]) -> dict[tuple[Path, int | None], float]:
+    """Return how long each flight lasted, by recording, with its folder, and aircraft.
 
     The tables of a recording hold the same flight as its tlogs; its parts follow one another.
     """
-    found: dict[tuple[str, int | None], dict[str, float]] = {}
+    found: dict[tuple[Path, int | None], dict[str, float]] = {}
     for row in rows:
         if row["error"] is None:
-            of_kind = found.setdefault((row["name"], row["vehicle"]), {})
+            flight = Path(row["path"]).with_name(row["name"]), row["vehicle"]
+            of_kind = found.setdefault(flight, {})
             of_kind[row["kind"]] = of_kind.get(row["kind"], 0.0) + (row["duration"] or 0.0)
     return {flight: max(of_kind.values()) for flight, of_kind in found.items()}
 
