@@ -54,7 +54,7 @@ NUMBERS: Final = (
 MESSAGES: Final = tuple(mavlink.mavlink_map.values())
 HEAD: Final = encode_head(TableHeader(vehicle_id=1, unix_us_at_zero=1_780_000_000_000_000))
 ULOG_HEAD: Final = b"ULog\x01\x12\x35\x01" + bytes(8)
-CSV_HEAD: Final = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
+HEADING: Final = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
 
 Property = Callable[[], None]
 
@@ -341,7 +341,7 @@ def dataflash_messages(draw: st.DrawFn) -> bytes:
 @st.composite
 def files(draw: st.DrawFn) -> tuple[str, bytes]:
     """Make a file such as people hand over, and the ending of its name."""
-    rows = [CSV_HEAD]
+    rows = [HEADING]
     for number in range(draw(st.integers(0, 30))):
         cells = [f"{number / 100}", "0", "0", "-9.8", "0", "0", "0", "20", "0", "40", "100"]
         cells += [f"{number / 100}", "47", "8", "500"]
