@@ -6,7 +6,6 @@ import hashlib
 import inspect
 import logging
 import os
-import signal
 import socket
 import ssl
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.edges.clock import GatewayClock
-from gateway.edges.operator.attachment import on_parent_gone
+from gateway.edges.operator.attachment import on_end_signals, on_parent_gone
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.doors.rest_door import RestDoor
@@ -222,7 +221,7 @@ async def _serve(
     attached: bool,
 ) -> None:
     server = _Server(config)
-    _end_with_signals(server)
+    on_end_signals(partial(setattr, server, "should_exit", True))
     if attached:
         on_parent_gone(partial(setattr, server, "should_exit", True))
     parts.uplink.start()
@@ -250,14 +249,6 @@ class _Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
         yield
-
-
-def _end_with_signals(server: uvicorn.Server) -> None:
-    def end() -> None:
-        server.should_exit = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, end)
 
 
 def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:

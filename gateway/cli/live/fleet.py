@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,6 +16,7 @@ from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
+from gateway.edges.operator.attachment import on_end_signals
 from gateway.edges.operator.control_socket import ControlError, request
 from gateway.edges.operator.detached_output import detached_output
 from gateway.flightlog.moment import civil_time
@@ -145,8 +145,7 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
     from gateway.fleet.fleet_server import FleetServer
 
     stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    on_end_signals(stopped.set)
     try:
         server = FleetServer(settings, hub_settings)
         await server.start()

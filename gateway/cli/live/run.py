@@ -24,6 +24,7 @@ from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import ConfigError, GatewaySettings
 from gateway.daemon import Daemon
+from gateway.edges.operator.attachment import on_end_signals
 from gateway.edges.operator.detached_output import detached_output
 from gateway.edges.operator.keyboard import Keyboard
 from gateway.edges.operator.log_line import summary_line
@@ -117,13 +118,10 @@ async def serve(
         From `make_ready`.
     """
     stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    on_end_signals(stopped.set)
     view = None if plain or not sys.stdout.isatty() else _open_view()
     daemon = daemon_of()
-    if sys.stdin.isatty():
-        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, stopped.set)
-    else:
+    if not sys.stdin.isatty():
         _reload_on_hangup(daemon)
     if compiling is not None:
         compiling.watch()

@@ -1,7 +1,6 @@
 """`mavgate play`, and commands for a running player."""
 
 import asyncio
-import signal
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -41,7 +40,7 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.edges.disk.player_edge import PlayerStatus
-from gateway.edges.operator.attachment import on_parent_gone
+from gateway.edges.operator.attachment import on_end_signals, on_parent_gone
 from gateway.edges.operator.control_socket import ControlError
 from gateway.edges.operator.detached_output import detached_output
 from gateway.edges.operator.keyboard import Keyboard
@@ -212,8 +211,7 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> No
     daemon = daemon_of()
     if attached:
         on_parent_gone(daemon.ended.set)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, daemon.ended.set)
+    on_end_signals(daemon.ended.set)
     with detached_output():
         try:
             await daemon.start()

@@ -1,11 +1,12 @@
-"""A child process that ends with its parent, however that ends: by the end of a pipe between them.
+"""What a process ends with: its signals, its terminal, and as a child with its parent.
 
-The parent gives it a pipe as standard input and keeps the other end open. The kernel closes that
-end even if the parent is killed.
+The parent gives a child a pipe as standard input and keeps the other end open. The kernel closes
+that end even if the parent is killed.
 """
 
 import asyncio
 import os
+import signal
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -30,3 +31,19 @@ def on_parent_gone(end: Callable[[], None]) -> None:
             end()
 
     loop.add_reader(source, read)
+
+
+def on_end_signals(end: Callable[[], None]) -> None:
+    """Call back on the running event loop on SIGINT, SIGTERM, and SIGHUP, with a terminal's end.
+
+    SIGHUP stays ignored where it is at the start, as by `nohup`.
+
+    Parameters
+    ----------
+    end : callable
+        Called at each of them.
+    """
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            loop.add_signal_handler(number, end)

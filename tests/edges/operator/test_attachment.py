@@ -1,5 +1,6 @@
-"""A process that ends with the one that started it."""
+"""A process that ends with the one that started it, by a signal, or with its terminal."""
 
+import asyncio
 import os
 import select
 import signal
@@ -7,6 +8,8 @@ import subprocess
 import sys
 
 import pytest
+
+from gateway.edges.operator.attachment import on_end_signals
 
 pytestmark = pytest.mark.io
 
@@ -43,3 +46,21 @@ def test_a_parent_that_is_killed_takes_its_child_along() -> None:
             assert select.select([child], [], [], 120)[0]
         finally:
             os.close(child)
+
+
+@pytest.mark.parametrize("is_ignored", [False, True])
+async def test_the_end_of_the_terminal_stays_ignored_where_it_is(is_ignored: bool) -> None:
+    """As `nohup` has it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
+    calls: list[bool] = []
+    on_end_signals(lambda: calls.append(True))
+    try:
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGTERM)
+        while not calls:
+            await asyncio.sleep(0)
+        assert len(calls) == (1 if is_ignored else 2)
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            asyncio.get_running_loop().remove_signal_handler(number)
+        signal.signal(signal.SIGHUP, before)
