@@ -8,8 +8,8 @@ import typer
 from msgspec.structs import replace
 
 from gateway.cli.support.asking import SocketOption
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.panel_process import HOW_TO_ADD, LINK
+from gateway.cli.support.errors import how_to_add, refuse
+from gateway.cli.support.panel_process import LINK
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
@@ -51,7 +51,7 @@ def panel(
     try:
         from gateway.panel.panel_server import PanelError, run_panel
     except ModuleNotFoundError as error:
-        refuse(f"{HOW_TO_ADD} ({error.name} is missing)")
+        refuse(f"the panel is an extra, and {error.name} is missing: {how_to_add('panel')}")
     if hash_password:
         from gateway.panel.serving.page_lock import hash_password as hashed
 

@@ -12,7 +12,6 @@ from typing import Final
 
 log = logging.getLogger(__name__)
 
-HOW_TO_ADD: Final = "the panel is an extra: pip install 'mavgate[panel]'"
 LINK: Final = "panel: "
 """Begin of the line with the page's address."""
 RESTART_S: Final = 5.0
