@@ -107,15 +107,15 @@ async def test_a_socket_that_is_closed_meanwhile_is_left_alone(
 async def test_metrics_keep_their_port_and_say_why_nobody_is_answered() -> None:
     server = MetricsServer(lambda: iter(["text"]))
     server.listen(free_port())
-    port, listening = server.port, server._socket
-    assert listening is not None
+    port, listening = server.port, list(server._sockets)
+    assert listening
     with socket.socket() as caller:
         with no_descriptors():
             caller.connect(("127.0.0.1", port))
             await until(lambda: server.listeners()[0].reason == "Too many open files")
             assert server.listeners()[0].state == "closed"
         await until(lambda: server.listeners()[0].clients == 1)
-        assert (server.listeners()[0].state, server._socket) == ("open", listening)
+        assert (server.listeners()[0].state, server._sockets) == ("open", listening)
     server.close()
 
 
