@@ -12,17 +12,22 @@ An upload, seen from here:
 | upload | the item asked for, bad         | ACK with what is bad              | idle   |
 | upload | one that it had before          |                                   | upload |
 | upload | one further on                  | REQUEST_INT of the one asked for  | upload |
-| upload | MISSION_COUNT, same client      | start again                       | upload |
+| upload | MISSION_COUNT once more         |                                   | upload |
+| upload | another MISSION_COUNT           | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK, not accepted       |                                   | idle   |
-| upload | a while without the item        | REQUEST_INT again, five times     | upload |
-| upload | a while more                    | ACK cancelled                     | idle   |
+| upload | 400 ms without the item         | REQUEST_INT again                 | upload |
+| upload | 5 s without one that is missing | ACK cancelled                     | idle   |
+| idle   | 400 ms after an upload in which | REQUEST_INT of the last item,     | idle   |
+|        | a request had to be repeated    | three times: the ACK may be lost  |        |
 | idle   | the last item once more         | ACK accepted again                | idle   |
 
-A while is 250 ms, and on a slow link as long as an item takes, up to a second: what is asked for
-too soon comes twice, and if that were answered, so would be all that follow. Where a request comes
-twice or late, MAVSDK goes back to its item and then ignores requests beyond the next. So what is
-asked for again is the item after the one that came last, and in the end those before it.
+MAVSDK repeats no item by itself. It gives up when the half seconds it waited since it sent the
+newest item, and the times it was asked for older ones, add up to five: so a request is repeated a
+little sooner than in half a second, however slow the link is. Items that come twice for that are
+not answered twice, or so would be all that follow, and a second ACK would end the next upload.
+Where a request comes late, MAVSDK goes back to its item and then ignores requests beyond the next:
+what is asked for again is the item after the one that came last.
 
 What is stored changes only when an upload is complete. A download has no state: each request is
 answered from the store.
@@ -48,13 +53,10 @@ from gateway.vehicle.services.missions.mission_items import (
     write_item,
 )
 
-ITEM_TIMEOUT_US: Final = 250_000
-LONGEST_TIMEOUT_US: Final = US_PER_S
-MARGIN: Final = 1.5
-"""A request is repeated after so many times what the item before took."""
-MAX_RETRIES: Final = 5
-GO_BACK: Final = 3
-"""From this retry on, each asks for the item before."""
+REPEAT_US: Final = 400_000
+GIVE_UP_US: Final = 5 * US_PER_S
+CHECKS: Final = 3
+"""The last item is asked for so many times more where the ACK may have been lost."""
 KINDS: Final = (MISSION, FENCE, RALLY)
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
 CHANGING: Final = frozenset(
@@ -78,10 +80,14 @@ class _Upload:
     items: list[Item] = field(default_factory=list)
     wanted: int = 0
     """What is asked for: the first that is missing, or before it what the client goes on with."""
-    asked_us: int = 0
+    progress_us: int = 0
     """When the first that is missing was asked for first."""
-    timeout_us: int = ITEM_TIMEOUT_US
-    retries: int = 0
+    repeats: int = 0
+    """How often that was asked for again: so many copies of it may still come."""
+    loses: bool = False
+    """Whether any request had to be repeated."""
+    checks: int = 0
+    """How often the last item is still to be asked for, once all came."""
 
 
 class MissionService:
@@ -130,20 +136,28 @@ class MissionService:
 
     def poll(self, now_us: int) -> list[Answer]:
         """Request a missing item again; finally cancel the upload."""
-        upload = self._upload
+        upload = self._waiting()
         if upload is None or now_us < upload.due_us:
             return []
-        if upload.retries >= MAX_RETRIES:
+        if upload is self._finished:
+            upload.checks -= 1
+        elif now_us - upload.progress_us >= GIVE_UP_US:
             self._upload = None
             return [mission_ack(upload.request, mavlink.MAV_MISSION_OPERATION_CANCELLED)]
-        upload.retries += 1
-        if upload.retries >= GO_BACK and upload.wanted:
-            upload.wanted -= 1
+        else:
+            upload.loses = True
+            upload.repeats += 1
         return self._ask(upload, now_us)
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to do."""
-        return self._upload.due_us if self._upload else None
+        upload = self._waiting()
+        return None if upload is None else upload.due_us
+
+    def _waiting(self) -> _Upload | None:
+        """Return the upload for which a request is repeated when it is due."""
+        done = self._finished
+        return done if done is not None and done.checks else self._upload
 
     def forget_client(self, client_id: int) -> None:
         """Give up an upload whose client has gone."""
@@ -194,14 +208,17 @@ class MissionService:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if count > MAX_ITEMS[kind]:
             return [mission_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
+        begun = self._upload
+        if begun is not None and not begun.items and (begun.kind, begun.count) == (kind, count):
+            return []
         self._upload = self._finished = None
         if count == 0:
             return [mission_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
-        self._upload = _Upload(request, kind, count, now_us, asked_us=now_us)
+        self._upload = _Upload(request, kind, count, now_us, progress_us=now_us)
         return self._ask(self._upload, now_us)
 
     def _ask(self, upload: _Upload, now_us: int) -> list[Answer]:
-        upload.due_us = now_us + upload.timeout_us
+        upload.due_us = now_us + REPEAT_US
         request = upload.request
         wanted = mavlink.MAVLink_mission_request_int_message(
             request.system_id, request.component_id, upload.wanted, upload.kind
@@ -224,12 +241,11 @@ class MissionService:
             self._upload = None
             return [mission_ack(request, result)]
         upload.items.append(item)
-        taken_us = round(MARGIN * (now_us - upload.asked_us))
-        upload.timeout_us = min(max(taken_us, ITEM_TIMEOUT_US), LONGEST_TIMEOUT_US)
-        upload.wanted, upload.asked_us, upload.retries = len(upload.items), now_us, 0
         if len(upload.items) < upload.count:
+            upload.wanted, upload.progress_us, upload.repeats = len(upload.items), now_us, 0
             return self._ask(upload, now_us)
         self._upload, self._finished = None, upload
+        upload.due_us, upload.checks = now_us + REPEAT_US, CHECKS if upload.loses else 0
         stored = self._store(upload.kind, tuple(upload.items), now_us)
         return [mission_ack(request, ACCEPTED), *stored]
 
@@ -244,7 +260,11 @@ class MissionService:
         )
         if done is None or not is_known:
             return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
-        return [mission_ack(request, ACCEPTED)] if message.seq == done.count - 1 else []
+        is_last = message.seq == done.count - 1
+        if is_last and done.repeats:
+            done.repeats -= 1
+            return []
+        return [mission_ack(request, ACCEPTED)] if is_last else []
 
     def _store(self, kind: int, items: tuple[Item, ...], now_us: int) -> list[Answer]:
         self.items[kind] = items
