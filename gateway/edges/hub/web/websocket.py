@@ -163,7 +163,10 @@ class WebStream(StreamClient):
         except ssl.SSLError as error:
             with contextlib.suppress(OSError):
                 self._socket.send(self._tls.outgoing())
-            self.give_up(f"TLS: {error.reason or error}".replace("_", " ").lower())
+            text = f"tls: {error.reason or error}".replace("_", " ").lower()
+            if isinstance(error, ssl.SSLCertVerificationError):
+                text += f": {error.verify_message}"
+            self.give_up(text)
             return b""
         if reply:
             self._write(self._socket, reply)

@@ -14,7 +14,8 @@ An upload, seen from here:
 | upload | one further on                  | REQUEST_INT of the one asked for  | upload |
 | upload | MISSION_COUNT once more         |                                   | upload |
 | upload | another MISSION_COUNT           | start again                       | upload |
-| upload | MISSION_COUNT, another client   | ACK denied                        | upload |
+| upload | MISSION_COUNT, another client   | ACK denied; after 1.5 s without   | upload |
+|        |                                 | an item it starts its own         |        |
 | upload | MISSION_ACK, not accepted       |                                   | idle   |
 | upload | 400 ms without the item         | REQUEST_INT again                 | upload |
 | upload | 5 s without one that is missing | ACK cancelled                     | idle   |
@@ -54,6 +55,8 @@ from gateway.vehicle.services.missions.mission_items import (
 )
 
 REPEAT_US: Final = 400_000
+SILENT_US: Final = 1_500_000
+"""An upload that stands still for so long gives way to another client's."""
 GIVE_UP_US: Final = 5 * US_PER_S
 CHECKS: Final = 3
 """The last item is asked for so many times more where the ACK may have been lost."""
@@ -201,15 +204,16 @@ class MissionService:
 
     def _begin(self, request: Request, now_us: int) -> list[Answer]:
         kind, count = request.message.mission_type, request.message.count
-        busy = self._upload is not None and self._upload.request.client_id != request.client_id
-        if busy:
+        begun = self._upload
+        is_own = begun is None or begun.request.client_id == request.client_id
+        if begun is not None and not is_own and now_us - begun.progress_us < SILENT_US:
             return [mission_ack(request, mavlink.MAV_MISSION_DENIED)]
         if kind not in KINDS:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if count > MAX_ITEMS[kind]:
             return [mission_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
-        begun = self._upload
-        if begun is not None and not begun.items and (begun.kind, begun.count) == (kind, count):
+        is_same = begun is not None and (begun.kind, begun.count) == (kind, count)
+        if begun is not None and is_own and is_same and not begun.items:
             return []
         self._upload = self._finished = None
         if count == 0:

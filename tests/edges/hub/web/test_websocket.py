@@ -340,9 +340,17 @@ class TestTls:
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         hub = rig.hub(f"wss:127.0.0.1:{server.listening_ports()[0]}")
         await rig.until(lambda: hub.clients()[0].state == "refused")
-        assert "certificate verify failed" in hub.clients()[0].reason
+        assert hub.clients()[0].reason == "tls: certificate verify failed: self-signed certificate"
         await rig.until(lambda: server.listeners()[0].turned_away == 1)
         assert not server.clients()
+
+    async def test_a_certificate_of_another_is_named(self, rig: Rig, certificate: Path) -> None:
+        """What is wrong with it is not the same for who has to mend it: name, date, authority."""
+        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+        port = server.listening_ports()[0]
+        hub = rig.hub(f"wss:localhost:{port}", tls_authority=str(certificate))
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        assert "certificate is not valid for 'localhost'" in hub.clients()[0].reason
 
     async def test_plain_speech_is_refused(
         self, rig: Rig, plug: Visit, certificate: Path, caplog: pytest.LogCaptureFixture

@@ -310,6 +310,15 @@ def test_two_uploads_do_not_mix(station: GroundStation) -> None:
     assert upload(other, [item(0)]) == ACCEPTED
 
 
+def test_an_upload_that_stands_still_gives_way(station: GroundStation) -> None:
+    """A ground station that was started anew is another client, and its old upload never ends."""
+    other = GroundStation(station.vehicle, station.clock, client_id=8, system_id=254)
+    station.send(count(2))
+    station.send(item(0))
+    station.wait(1.6)
+    assert upload(other, [item(0)]) == ACCEPTED
+
+
 def test_a_count_that_comes_again_begins_anew(station: GroundStation) -> None:
     station.send(count(2))
     station.send(item(0))
