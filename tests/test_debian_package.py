@@ -126,6 +126,7 @@ def test_the_unit_starts_what_the_package_brings(unpacked: Path) -> None:
     assert os.access(program, os.X_OK)
     assert f"RuntimeDirectory={SERVICE_FOLDER.name}" in lines
     assert "User=mavgate" in lines
+    assert "StartLimitIntervalSec=0" in lines, "or it stays down after five bad starts"
     [guide] = (line for line in lines if line.startswith("Documentation=file://"))
     assert (unpacked / guide.removeprefix("Documentation=file:///")).is_file()
     sysusers = (unpacked / "usr/lib/sysusers.d/mavgate.conf").read_text()
@@ -142,6 +143,14 @@ def test_systemd_understands_the_unit(unpacked: Path, tmp_path: Path) -> None:
         ["systemd-analyze", "verify", "--man=no", unit], capture_output=True, text=True, check=False
     )
     assert "mavgate" not in done.stderr, done.stderr
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
+def test_systemd_finds_little_that_the_unit_may_do(unpacked: Path) -> None:
+    """Of 10, as `systemd-analyze security` counts; a service without any restriction has 9.6."""
+    words = ("security", "--offline=true", "--threshold=30", str(unpacked / UNIT))
+    done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 def test_every_known_adapter_has_its_rule(unpacked: Path) -> None:
