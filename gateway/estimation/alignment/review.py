@@ -19,6 +19,7 @@ from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.quaternion import multiply, normalise
 from gateway.records import Quat
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 FOUND_LEVEL_RAD: Final = 0.08
 FOUND_HEADING_RAD: Final = 0.2
@@ -158,13 +159,24 @@ def is_to_be_taken(
 
 
 @compiled
+def flown_level_rad(s: ReviewState) -> float:
+    """Return how far a flight may pull the mean force of the pairs from gravity, rad.
+
+    Over any time it gains no more than twice its speed: it turns back.
+    """
+    share = 2.0 * s.flown_mps / (STANDARD_GRAVITY_MPS2 * max(s.gathered_s, GRAVITY_PAIR_S))
+    return math.asin(share) if share < 1.0 else math.pi
+
+
+@compiled
 def is_contradicted(s: ReviewState, q_nb: Quat, level_told: float, heading_told: float) -> bool:
     """Return whether the alignment and the attitude cannot both be right."""
     found = as_quat(s.found_q_nb)
     allowed = DOUBT_SIGMA * math.hypot(s.level_std, level_told)
     off = level_difference(found, q_nb)
     if s.by_gps == 0:
-        return bool(off > max(DOUBT_GRAVITY_RAD, allowed) and s.pull_mps2 == 0.0)
+        allowed = max(DOUBT_GRAVITY_RAD, allowed, flown_level_rad(s))
+        return bool(off > allowed and s.pull_mps2 == 0.0)
     if off > max(DOUBT_LEVEL_RAD, allowed):
         return True
     if s.heading_known == 0:

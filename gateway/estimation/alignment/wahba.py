@@ -40,6 +40,8 @@ PULL_TAU_S: Final = 3.0
 SWING_TAU_S: Final = 1.8
 """Of either of two low-passes, where a hand's swings are to average out."""
 TURNING_TAU_S: Final = 20.0
+FLOWN_S: Final = 30.0
+"""The speed that a flight has shown is to be expected for about this time."""
 TURN_S: Final = 4.0
 """What flies pulls one way for about this time."""
 HAND_MPS: Final = 1.8
@@ -72,6 +74,8 @@ class AlignmentState(PairSums):
     """Low-pass of the specific force in the gyroscope's frame, and a second one of that."""
     turning_mps2: float
     """Mean of what gives itself away: of a hand little, of a flight in turns much."""
+    flown_mps: float
+    """Fastest speed that GPS has shown of late."""
     pull_mps2: float
     """Level acceleration recently: as GPS tells it, or what gives itself away without."""
     square: Annotated[FloatArray, (2, 4, 4)]
@@ -145,6 +149,8 @@ def align_by_velocity(
     late_sq = JITTER_S * JITTER_S * (reference[0] ** 2 + reference[1] ** 2)
     weight = dt * PAIR_WINDOW_S / (2.0 * (noise_mps * noise_mps + late_sq))
     s.pull_mps2 = max(math.hypot(reference[0], reference[1]), PULL_KEPT * s.pull_mps2)
+    speed = math.hypot(vel[2], math.hypot(vel[0], vel[1]))
+    s.flown_mps = max(speed, math.exp(-dt / FLOWN_S) * s.flown_mps)
     take_pair(s, mean_force(s, force_i, dt), reference, weight, dt)
     begin_pair(s, valid_s, vel, force_i)
     return dt

@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.wahba import TURN_S
+from gateway.estimation.alignment.wahba import FLOWN_S, TURN_S
 from gateway.estimation.eskf.covariance import level_variance
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import VEL, EskfState
@@ -22,8 +22,6 @@ SWING_S: Final = 0.1
 """A hand's motion, to and fro, keeps its velocity for about this time."""
 SETTLE_S: Final = 20.0
 """The velocity that an attitude began with is forgotten in about this time."""
-FLOWN_S: Final = 30.0
-"""The speed that a flight has shown is to be expected for about this time."""
 LEG_S: Final = 10.0
 """A flight that hardly turns is on the same leg for about this time."""
 ASSUMED_S: Final = 5.0

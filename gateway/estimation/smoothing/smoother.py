@@ -23,6 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.estimation.alignment.latency_of_log import latency_of_flight
+from gateway.estimation.alignment.wahba import FLOWN_S
 from gateway.estimation.columns import (
     NAV_ALT,
     NAV_ATTITUDE_STD,
@@ -39,7 +40,7 @@ from gateway.estimation.eskf.covariance import MOVED
 from gateway.estimation.eskf.eskf_output import LEVEL_VAR
 from gateway.estimation.eskf.eskf_settings import LASTING_RAD, EskfGains
 from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
-from gateway.estimation.eskf.unaided_velocity import FLOWN_S, WAY_S
+from gateway.estimation.eskf.unaided_velocity import WAY_S
 from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
