@@ -26,7 +26,7 @@ from tests.fleet.conftest import World, run
 
 pytestmark = pytest.mark.io
 
-STATUSTEXT, COMMAND_LONG = 253, 76
+STATUSTEXT = 253
 
 
 async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: World) -> None:

@@ -185,34 +185,3 @@ def _kind_of(message: Any) -> str:
     name: str = message.get_type()
     instance = getattr(message, "instance_field", None)
     return name if instance is None else f"{name}[{getattr(message, instance)}]"
-
-
-def thin_out(time_us: IntArray, values: FloatArray, columns: int) -> tuple[IntArray, FloatArray]:
-    """Keep the least and the greatest value of each column of a chart.
-
-    Parameters
-    ----------
-    time_us : ndarray of int64, shape (N,)
-        Growing.
-    values : ndarray of float64, shape (N,)
-        NaN stays NaN where a column holds nothing else.
-    columns : int
-        At least 1.
-
-    Returns
-    -------
-    time_us, values : ndarray
-        At most twice `columns` rows, the last one among them, in order.
-    """
-    if len(time_us) <= 2 * columns:
-        return time_us, values
-    edges = np.linspace(0, len(time_us), columns + 1).astype(int)
-    kept = {len(time_us) - 1}
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        part = values[begin:end]
-        if np.isnan(part).all():
-            kept.add(begin)
-        else:
-            kept |= {begin + int(np.nanargmin(part)), begin + int(np.nanargmax(part))}
-    order = sorted(kept)
-    return time_us[order], values[order]

@@ -32,9 +32,6 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """Since the newest heartbeat."""
     q_nb: tuple[float, float, float, float]
     """Attitude, scalar first, body FRD to NED."""
-    roll_rad: float
-    pitch_rad: float
-    yaw_rad: float
     rate_b_radps: tuple[float, float, float]
     lat_deg: float
     lon_deg: float
@@ -58,8 +55,3 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     mark: Spot | None
     mark_distance_m: float
     mark_bearing_deg: float
-    armed: bool
-    mode: int
-    """`custom_mode` of the heartbeat."""
-    battery_v: float
-    battery_percent: float

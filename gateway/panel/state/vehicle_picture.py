@@ -9,7 +9,7 @@ from typing import Any, Final
 import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.geometry.quaternion import from_euler, to_euler
+from gateway.geometry.quaternion import from_euler
 from gateway.panel.state.instant import Instant, Spot
 from gateway.panel.state.status_texts import StatusTexts
 from gateway.records import NAN, UNKNOWN_VEC3
@@ -135,9 +135,10 @@ class VehiclePicture:
 
     def instant(self, now_us: int) -> Instant:
         """Return the present state."""
-        get, roll_pitch_yaw, q_nb, rates = self.newest.get, *self._attitude()
+        get = self.newest.get
+        q_nb, rates = self._attitude()
         place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
-        heartbeat, fix, status = get("HEARTBEAT"), get("GPS_RAW_INT"), get("SYS_STATUS")
+        fix = get("GPS_RAW_INT")
         mark, distance_m, bearing_deg = self._mark()
         return Instant(
             system_id=self.system_id,
@@ -147,9 +148,6 @@ class VehiclePicture:
             generation=self.generation,
             silent_s=self.silent_s(now_us),
             q_nb=q_nb,
-            roll_rad=roll_pitch_yaw[0],
-            pitch_rad=roll_pitch_yaw[1],
-            yaw_rad=roll_pitch_yaw[2],
             rate_b_radps=rates,
             lat_deg=place.lat / DEGE7 if place else NAN,
             lon_deg=place.lon / DEGE7 if place else NAN,
@@ -168,28 +166,17 @@ class VehiclePicture:
             mark=mark,
             mark_distance_m=distance_m,
             mark_bearing_deg=bearing_deg,
-            armed=bool(heartbeat and heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
-            mode=heartbeat.custom_mode if heartbeat else 0,
-            battery_v=_known(status and status.voltage_battery, 65535) / 1000,
-            battery_percent=_known(status and status.battery_remaining, -1),
         )
 
-    def _attitude(
-        self,
-    ) -> tuple[
-        tuple[float, float, float],
-        tuple[float, float, float, float],
-        tuple[float, float, float],
-    ]:
+    def _attitude(self) -> tuple[tuple[float, float, float, float], tuple[float, float, float]]:
         quaternion, angles = self.newest.get("ATTITUDE_QUATERNION"), self.newest.get("ATTITUDE")
         age_us = self.heard_us.get("ATTITUDE", 0) - self.heard_us.get("ATTITUDE_QUATERNION", 0)
         if quaternion is not None and age_us < ATTITUDE_FRESH_US:
             q_nb = (quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4)
-            return to_euler(q_nb), q_nb, _rates(quaternion)
+            return q_nb, _rates(quaternion)
         if angles is None:
-            return UNKNOWN_VEC3, UNKNOWN_QUAT, UNKNOWN_VEC3
-        euler = (angles.roll, angles.pitch, angles.yaw)
-        return euler, from_euler(*euler), _rates(angles)
+            return UNKNOWN_QUAT, UNKNOWN_VEC3
+        return from_euler(angles.roll, angles.pitch, angles.yaw), _rates(angles)
 
     def _pos_std_m(self) -> float:
         """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
@@ -237,10 +224,6 @@ class VehiclePicture:
 
 def _rates(message: Any) -> tuple[float, float, float]:
     return (message.rollspeed, message.pitchspeed, message.yawspeed)
-
-
-def _known(value: float | None, unknown: int) -> float:
-    return NAN if value is None or value == unknown else float(value)
 
 
 def _airspeed_mps(hud: Any) -> float:

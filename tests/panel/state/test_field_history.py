@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.field_history import MAX_ROWS, SPAN_US, FieldHistory, thin_out
+from gateway.panel.state.field_history import MAX_ROWS, SPAN_US, FieldHistory
 from gateway.units import US_PER_S
 
 
@@ -62,22 +62,6 @@ def test_a_span_can_be_asked_for() -> None:
     time_us, values = history.series(1, "ATTITUDE.roll", 500 * 20_000, 510 * 20_000)
     assert values.tolist() == [float(n) for n in range(501, 511)]
     assert len(time_us) == 10
-
-
-def test_thinned_out_peaks_stay() -> None:
-    time_us = np.arange(10_000, dtype=np.int64)
-    values = np.zeros(10_000)
-    values[4321], values[4322] = 9.0, -9.0
-    thin_us, thin = thin_out(time_us, values, 200)
-    assert len(thin) <= 401
-    assert (thin.max(), thin.min()) == (9.0, -9.0)
-    assert thin_us[-1] == 9_999
-    assert np.all(np.diff(thin_us) > 0)
-
-
-def test_thinned_out_gaps_stay() -> None:
-    values = np.full(1000, np.nan)
-    assert np.isnan(thin_out(np.arange(1000), values, 10)[1]).all()
 
 
 def test_seldom_message_takes_no_more_than_its_minutes() -> None:

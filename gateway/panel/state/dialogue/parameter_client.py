@@ -24,8 +24,6 @@ MAX_ATTEMPTS: Final = 5
 MAX_PARAMETERS: Final = 5000
 """Large autopilots have some 1500; more are forged."""
 AUTOPILOT: Final = 1
-NO_INDEX: Final = 65535
-"""Index of a parameter that was not requested."""
 
 ERRORS: Final = {
     mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",

@@ -33,7 +33,6 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
     default: float = NAN
     low: float = NAN
     high: float = NAN
-    decimals: int = 4
     choices: tuple[tuple[float, str], ...] = ()
     """The only values, and what they mean."""
 
@@ -103,7 +102,6 @@ def _meta_of(item: Mapping[str, Any]) -> ParameterMeta | None:
         default=_number(item.get("default")),
         low=_number(item.get("min")),
         high=_number(item.get("max")),
-        decimals=int(_number(item.get("decimalPlaces"), 4)),
         choices=tuple(
             (_number(value.get("value")), _text(value, "description"))
             for value in _items(item, "values")

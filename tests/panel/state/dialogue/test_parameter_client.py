@@ -170,3 +170,10 @@ def test_a_vehicle_without_files_does_not_hold_up() -> None:
 def test_broken_metadata_explains_nothing(content: bytes) -> None:
     assert parse_parameters(content) == {}
     assert parameter_path(content) is None
+
+
+def test_metadata_may_hold_numbers_that_are_none() -> None:
+    content = b'{"parameters": [{"name": "A", "min": NaN, "max": 2, "decimalPlaces": Infinity}]}'
+    meta = parse_parameters(content)["A"]
+    assert math.isnan(meta.low)
+    assert meta.high == 2.0
