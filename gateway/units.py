@@ -1,4 +1,4 @@
-"""Physical constants and the factors between external units and SI."""
+"""Physical constants, the factors between external units and SI, and numbers with their noun."""
 
 from typing import Final
 
@@ -11,3 +11,8 @@ DEG_PER_DEGE7: Final = 1e-7
 M_PER_MM: Final = 1e-3
 M_PER_CM: Final = 1e-2
 PA_PER_HPA: Final = 100.0
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number and what it counts: `1 line`, `2 lines`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -15,7 +15,7 @@ from gateway.flightlog.table.table import TableBlock, TableFault, TableHeader, T
 from gateway.flightlog.tlog.tlog import Batch, TlogIndex
 from gateway.flightlog.tlog.tlog_scan import IntArray
 from gateway.geometry.geodesy import displacement_m
-from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import START_V2
 
@@ -26,7 +26,7 @@ STEP_US: Final = US_PER_S // 2
 """Positions nearer in time than this are not summed: at rest their noise would be a distance."""
 LEAST_STEP_M: Final = 1.0
 
-MENDED: Final = "{} records have a damaged time; they are taken to be as old as the ones before"
+MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
 HEARTBEAT_ID: Final = 0
 GLOBAL_POSITION_INT_ID: Final = 33
 _POSITION: Final = struct.Struct("<Iii")
@@ -209,7 +209,7 @@ class TlogSummary:
             damaged_bytes=index.damaged_bytes,
             damaged_runs=len(index.damage),
             unfinished_bytes=index.unfinished,
-            remarks=(MENDED.format(index.mended),) if index.mended else (),
+            remarks=(MENDED.format(counted(index.mended, "record")),) if index.mended else (),
         )
 
     def _add_position(self, batch: Batch, i: int) -> None:

@@ -20,6 +20,7 @@ from gateway.flightlog.tlog.stamps import JUMP_US
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import RecordedTable
 from gateway.records import FusionState, NodeStatus
+from gateway.units import counted
 
 Limits = tuple[Moment | None, Moment | None]
 
@@ -27,7 +28,7 @@ NOTHING_WITHIN: Final = (
     "there is nothing between that begin and end; `mavgate info` shows the length"
 )
 OLDER: Final = "a recording is older than the first; give the oldest first"
-OVERLAP: Final = "{} rows that overlap with the recording before were left out"
+OVERLAP: Final = "left out {} that overlap with the recording before"
 
 
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
@@ -72,7 +73,7 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
                 yield placed
             remarks.extend(table.remarks)
             if left_out:
-                remarks.append(OVERLAP.format(left_out))
+                remarks.append(OVERLAP.format(counted(left_out, "row")))
 
     return RecordedTable(first, blocks(), remarks)
 

@@ -48,6 +48,7 @@ from gateway.pipeline import PipelineSettings
 from gateway.records import FusionState, NodeStatus
 from gateway.replay import header_for, settings_of
 from gateway.sensing.calibration import NodeCalibration
+from gateway.units import counted
 
 TRACKER_LOG: Final = files("gateway.flights") / "tracker-log.toml"
 """The map for logs whose columns are time_s, ax, gx and so on."""
@@ -267,7 +268,9 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     def told() -> Iterator[TableRow]:
         yield from rows
         if reader.faults:
-            table.remarks.append(f"{path}: {reader.faults} lines cannot be read and were left out")
+            table.remarks.append(
+                f"{path}: left out {counted(reader.faults, 'line')} that cannot be read"
+            )
 
     table = table_of_rows(chain([first], told()), options, options.system_id or 1)
     table.blocks = _going_on(table.blocks, path, table.remarks)
@@ -290,7 +293,8 @@ def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> I
         yield block
     if restarts:
         remarks.append(
-            f"{path}: its clock went back {restarts} times; what follows goes on from there"
+            f"{path}: its clock went back {counted(restarts, 'time')}; "
+            "what follows goes on from there"
         )
 
 

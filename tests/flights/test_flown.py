@@ -96,7 +96,7 @@ def test_another_programs_csv(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     np.testing.assert_allclose(flight.baro_alt_m, 100 + flight.accel_b_mps2[:, 0])
     np.testing.assert_allclose(flight.gps_vel_n_mps, [[0.0, 7.0, 0.0]], atol=1e-9)
     assert (flight.gps_latency_s, flight.gps_time_s.tolist()) == (0.17, [0.1])
-    assert "1 lines cannot be read" in caplog.text
+    assert "left out 1 line that cannot be read" in caplog.text
 
 
 def test_what_holds_no_flight_is_refused(tmp_path: Path) -> None:

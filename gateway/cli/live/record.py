@@ -24,7 +24,7 @@ from gateway.edges.disk.recordings import (
     rename_recording,
 )
 from gateway.flightlog.moment import civil_time
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
     from gateway.flights.glance import Glance
@@ -101,7 +101,7 @@ def delete(
         # `last` may have become another one while the user was asked.
         found = find_recording(folder, name)
         if not yes:
-            what = f"{found.name!r}: {len(found.files)} files, {found.size / 1e6:.2f} MB"
+            what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
             typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
         if running:
             deleted = _recording(ask("record.delete", {"name": found.name}))

@@ -25,6 +25,7 @@ from gateway.cli.support.recording_options import (
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import console_of, table_of
 from gateway.output import write_new
+from gateway.units import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -220,7 +221,7 @@ def _show_versus(compared: "Versus") -> None:
 
 def _end(results: "Sequence[FlightResult]") -> None:
     if count := failures(results):
-        console_of(stderr=True).print(f"{count} of {len(results)} recordings failed")
+        console_of(stderr=True).print(f"{count} of {counted(len(results), 'recording')} failed")
         raise typer.Exit(FAILED)
 
 

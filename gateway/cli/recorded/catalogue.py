@@ -19,6 +19,7 @@ from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_fl
 from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import LocalProcesses
 from gateway.season.statistics.flight_facts import UNITS
+from gateway.units import counted
 
 INDEX: Final = "index"
 UNKNOWN: Final = "—"
@@ -91,7 +92,7 @@ def index(
 
         report = index_folder(place, options, LocalProcesses(jobs), show)
     console_of().print(
-        f"{place}: {report.read} files read ({report.broken} of them broken), "
+        f"{place}: {counted(report.read, 'file')} read ({report.broken} of them broken), "
         f"{report.unchanged} unchanged, {report.gone} gone"
     )
 
@@ -188,7 +189,7 @@ def _show_table(rows: list[Row]) -> None:
     files = len({row["path"] for row in rows})
     broken = sum(row["error"] is not None for row in rows)
     console.print(
-        f"{len(lasted_s)} flight{'s' * (len(lasted_s) != 1)}, {hours:.2f} h, in {files} files; "
+        f"{counted(len(lasted_s), 'flight')}, {hours:.2f} h, in {counted(files, 'file')}; "
         f"{broken} broken"
     )
 

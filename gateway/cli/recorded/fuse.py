@@ -42,6 +42,7 @@ from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new
 from gateway.records import FusionState
 from gateway.replay import header_for
+from gateway.units import counted
 
 
 def register(app: typer.Typer) -> None:
@@ -119,7 +120,7 @@ def fuse_log(
         write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
     print_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-    console_of(stderr=True).print(f"{out}: {len(time_us)} samples fused by {name}")
+    console_of(stderr=True).print(f"{out}: {counted(len(time_us), 'sample')} fused by {name}")
 
 
 def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:

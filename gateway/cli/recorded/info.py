@@ -42,7 +42,7 @@ from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flights.describing import describe
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.output import write_new
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
     from gateway.flights.reading import ReadOptions
@@ -117,8 +117,10 @@ def recover(
     for line in left_out[:SHOWN]:
         console.print(line)
     if len(left_out) > SHOWN:
-        console.print(f"and {len(left_out) - SHOWN} more places")
-    verdict = "nothing was damaged" if not left_out else f"{before - size} bytes left out"
+        console.print(f"and {counted(len(left_out) - SHOWN, 'more place')}")
+    verdict = (
+        "nothing was damaged" if not left_out else f"{counted(before - size, 'byte')} left out"
+    )
     console.print(f"{target}: {size} of {before} bytes; {verdict}")
 
 
@@ -126,11 +128,11 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
     found = False
     for batch in read_batches(file, advance, strict=True):
         for run in batch.damage:
-            report(f"at byte {run.offset}: {run.size} bytes that are no record")
+            report(f"at byte {run.offset}: {counted(run.size, 'byte')} without a record")
         if batch.unfinished:
-            report(f"at the end: {batch.unfinished} bytes of an incomplete record")
+            report(f"at the end: {counted(batch.unfinished, 'byte')} of an incomplete record")
         if batch.mended:
-            console_of().print(MENDED.format(batch.mended))
+            console_of().print(MENDED.format(counted(batch.mended, "record")))
         yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
         found = found or len(batch.starts) > 0
     if not found:
@@ -148,7 +150,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
                 report("the head is lost: the current settings and calibration will be used")
             yield encode_head(reader.header or TableHeader()).encode()
         for fault in faults:
-            report(f"line {fault.line}: {fault.size} bytes: {fault.reason}")
+            report(f"line {fault.line}: {counted(fault.size, 'byte')}: {fault.reason}")
         yield encode_block(block)
     if not begun:
         raise FlightError(f"{file}: holds no row that can be read")
@@ -158,7 +160,7 @@ def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
     kind = "another program's CSV" if found.kind == FileKind.CSV else found.kind
     console.print(f"{file}: {kind}, {found.size / 1e6:.3f} MB")
-    console.print(f"{found.records} records in {_clock(found.duration_s)}{_when(found)}")
+    console.print(f"{counted(found.records, 'record')} in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:
         head = found.header
         console.print(
@@ -170,20 +172,22 @@ def _show(file: Path, found: FileInfo) -> None:
         at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
         console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
     if len(found.gaps) > SHOWN:
-        console.print(f"and {len(found.gaps) - SHOWN} more gaps")
+        console.print(f"and {counted(len(found.gaps) - SHOWN, 'more gap')}")
     for mark in found.marks:
         at_s = (mark.time_us - (found.first_us or 0)) / US_PER_S
         console.print(f"mark at {_clock(at_s)}: {mark.text}")
     if found.damaged_bytes:
         console.print(
-            f"damaged: {found.damaged_bytes} bytes in {found.damaged_runs} places; "
+            f"damaged: {counted(found.damaged_bytes, 'byte')} in "
+            f"{counted(found.damaged_runs, 'place')}; "
             "`mavgate recover` leaves them out",
             style="red",
         )
     if found.unfinished_bytes:
         console.print(
             f"the last {'record' if found.kind == 'tlog' else 'line'} is incomplete "
-            f"({found.unfinished_bytes} bytes): it is still being written, or was cut off"
+            f"({counted(found.unfinished_bytes, 'byte')}): "
+            "it is still being written, or was cut off"
         )
     for remark in found.remarks:
         console.print(remark)

@@ -28,6 +28,7 @@ from gateway.output import check_output, write_new
 from gateway.season.batch.flight_tasks import FlightResult, SweepTask
 from gateway.season.statistics.cross_validation import Choice, FloatArray, choose
 from gateway.season.statistics.season_errors import group_of
+from gateway.units import counted
 
 
 def run_season_sweep(
@@ -119,7 +120,8 @@ def _show(
         grid_.add_row(*cells, f"{choice.means[number]:.4g}")
     console.print(grid_)
     console.print(
-        f"{len(points)} points on {flights} flights, in {choice.folds} folds by aircraft and day; "
+        f"{counted(len(points), 'point')} on {counted(flights, 'flight')}, "
+        f"in {choice.folds} folds by aircraft and day; "
         f"the same point wins without {choice.stable} of the {choice.folds}"
     )
     if choice.over_base is not None:

@@ -5,6 +5,7 @@ from typing import Final
 
 from gateway.geometry.quaternion import to_euler
 from gateway.status import Snapshot
+from gateway.units import counted
 
 UNKNOWN: Final = "—"
 
@@ -25,7 +26,7 @@ def summary_line(snapshot: Snapshot) -> str:
             f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
         )
     count = len(snapshot.clients)
-    parts.append(f"{count} client{'' if count == 1 else 's'}")
+    parts.append(counted(count, "client"))
     return "; ".join(parts)
 
 

@@ -15,7 +15,7 @@ from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 MAGIC: Final = b"\xa3\x95"
 SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
@@ -136,10 +136,10 @@ def _lines_of(log: Any, names: set[str]) -> int:
 
 def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:
     if heard.bytes:
-        yield f"is damaged: {heard.bytes} bytes are no messages and were left out"
+        yield f"is damaged: left out {counted(heard.bytes, 'byte')} without a message"
     if log.offset < log.data_len:
-        yield f"ends within a message: {log.data_len - log.offset} bytes were left out"
+        yield f"ends within a message: left out {counted(log.data_len - log.offset, 'byte')}"
     if broken := reader.dropped + heard.messages:
-        yield f"is damaged: {broken} messages cannot be understood and were left out"
+        yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
     if reader.leaps:
-        yield f"its clock leaped {reader.leaps} times"
+        yield f"its clock leaped {counted(reader.leaps, 'time')}"

@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.writing import FlightToWrite
+from gateway.units import counted
 
 
 def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
@@ -18,4 +19,4 @@ def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
         except mavlink.MAVError:
             unknown += 1
     if unknown:
-        flight.remark(f"{unknown} messages that no MAVLink dialect here knows were left out")
+        flight.remark(f"left out {counted(unknown, 'message')} that no MAVLink dialect here knows")

@@ -16,6 +16,7 @@ from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
 from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
+from gateway.units import counted
 
 MS_PER_S: Final = 1000.0
 SYSTEM_ID: Final = "MAV_SYS_ID"
@@ -112,14 +113,15 @@ def _damage(log: Any, unread: int) -> Iterator[str]:
     if log.file_corruption:
         yield "is damaged; what is sound of it was read"
     if unread:
-        yield f"its last {unread} bytes cannot be read"
+        yield f"left out {counted(unread, 'byte')} at its end that cannot be read"
 
 
 def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
     if log.dropouts:
         lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
-        yield f"its logger was too slow {len(log.dropouts)} times, {lost_s:.1f} s are not in it"
+        slow = counted(len(log.dropouts), "time")
+        yield f"its logger was too slow {slow}, {lost_s:.1f} s are not in it"
     if flight.left_out:
         yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
     if flight.dropped:
-        yield f"{flight.dropped} samples without a time that can be were left out"
+        yield f"left out {counted(flight.dropped, 'sample')} without a time that can be"

@@ -13,6 +13,7 @@ from gateway.panel.state.dialogue.parameter_client import ListState
 from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import ViewContext
+from gateway.units import counted
 
 REFRESH_S: Final = 0.25
 MAX_ROWS: Final = 120
@@ -186,8 +187,8 @@ def _state_of(dialogue: Dialogue) -> str:
         case ListState.LOADING:
             return f"reading {len(parameters.entries)} of {parameters.count or '…'}"
         case ListState.FAILED:
-            return f"{len(parameters.entries)} parameters; the aircraft sends no more"
+            return f"{counted(len(parameters.entries), 'parameter')}; the aircraft sends no more"
         case ListState.COMPLETE:
-            return f"{len(parameters.entries)} parameters"
+            return counted(len(parameters.entries), "parameter")
         case _:
             return ""

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, permutation_test
 
+from gateway.units import counted
+
 RESAMPLES: Final = 9_999
 SEED: Final = 1
 CONFIDENCE: Final = 0.95
@@ -33,7 +35,7 @@ class Lead:
     @property
     def text(self) -> str:
         """Say it in one sentence."""
-        change = f"{_percent(self.ratio)} error over {self.flights} flights"
+        change = f"{_percent(self.ratio)} error over {counted(self.flights, 'flight')}"
         if self.p is None or self.low is None or self.high is None:
             return f"{change}, all of one aircraft and day: nothing tells it from chance"
         if self.low == self.high == self.ratio == 1.0:

@@ -74,7 +74,7 @@ def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) 
     out = tmp_path / "out.csv"
     printed = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
     assert "samples fused" in printed
-    assert "10 lines cannot be read and were left out" in printed
+    assert "left out 10 lines that cannot be read" in printed
     assert "out.csv: 90 samples" in printed
 
 
@@ -253,7 +253,7 @@ def test_a_log_whose_clock_begins_anew_goes_on(tmp_path: Path) -> None:
     path.write_text("\n".join([head, *late, *rows, *late, ""]))
     printed = run("info", path)
     assert "300 records in 1:01.980" in printed
-    assert "its clock went back 1 times" in printed
+    assert "its clock went back 1 time;" in printed
     run("convert", path, "-o", once)
     times_us = [
         int(line.partition(",")[0])
