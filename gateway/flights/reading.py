@@ -3,7 +3,6 @@
 import codecs
 import heapq
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -136,8 +135,7 @@ def import_format(module: str, name: str) -> Any:
         if (error.name or "").startswith("gateway"):
             raise
         raise FlightError(
-            f"{name} needs {error.name}, the extra mavgate[formats]:\n"
-            f"{sys.executable} -m pip install 'mavgate[formats]'"
+            f"{name} needs {error.name}, the extra mavgate[formats]: see mavgate doctor"
         ) from error
 
 

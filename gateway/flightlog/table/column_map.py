@@ -24,7 +24,12 @@ from gateway.units import US_PER_S
 EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
 """May be mapped though the table has no such columns: heights become pressures, speed and course
 the velocity where it is not given."""
-NEEDED: Final = ("time_us", "accel_x_b_mps2", "gyro_x_b_radps")
+VECTORS: Final = tuple(
+    frozenset(f"{quantity}_{axis}_b_{unit}" for axis in "xyz")
+    for quantity, unit in (("accel", "mps2"), ("gyro", "radps"), ("mag", "ut"))
+)
+"""Of each all axes are needed, or none."""
+NEEDED: Final = frozenset({"time_us"}).union(*VECTORS[:2])
 """Without these there is nothing to fuse."""
 LATE_US: Final = 60 * US_PER_S
 """What was measured so long before or after its line has a damaged time, or another clock's."""
@@ -53,6 +58,8 @@ class ColumnMap(Settings, frozen=True):
             raise ValueError(f"no such column here: {', '.join(unknown)}")
         if "time_us" not in self.columns:
             raise ValueError("time_us must be mapped")
+        if absent := _begun(self.columns) - self.columns.keys():
+            raise ValueError(f"of the same vector must be mapped too: {', '.join(sorted(absent))}")
 
 
 class CsvReader:
@@ -131,7 +138,9 @@ class CsvReader:
         """Compare the map with the file's columns; raises ValueError if one is missing."""
         found = {ours: theirs for ours, theirs in self._columns.items() if theirs.column in names}
         absent = self._columns.keys() - found.keys()
-        if absent & set(NEEDED) or (absent and not self._lenient):
+        if self._lenient:
+            absent &= NEEDED | _begun(found)
+        if absent:
             missing = sorted(self._columns[ours].column for ours in absent)
             raise ValueError(f"the file has no column {', '.join(missing)}")
         self._columns = found
@@ -207,6 +216,11 @@ class CsvReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
+
+
+def _begun(names: Iterable[str]) -> frozenset[str]:
+    """Return all axes of the vectors of which at least one is among the names."""
+    return frozenset[str]().union(*(axes for axes in VECTORS if not axes.isdisjoint(names)))
 
 
 def _measured_us(own_us: float, row_us: int) -> int:

@@ -76,7 +76,25 @@ def test_a_file_without_the_columns_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "text"), [({"wings": "w", "time_us": "t"}, "wings"), ({}, "time_us")]
+    ("names", "missing"),
+    [
+        ("time_s,az", "ax, ay, gx, gy, gz"),
+        ("time_s,ax,ay,az,gx,gz", "gy"),
+        ("time_s,ax,ay,az,gx,gy,gz,mx,my", "mz"),
+    ],
+)
+def test_a_file_without_a_map_lacks_only_what_is_needed(names: str, missing: str) -> None:
+    with pytest.raises(ValueError, match=f"no column {missing}$"):
+        list(CsvReader(TRACKER, lenient=True).rows([names, "1,2"]))
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"wings": "w", "time_us": "t"}, "wings"),
+        ({}, "time_us"),
+        ({"time_us": "t", "mag_y_b_ut": "m"}, "mapped too: mag_x_b_ut, mag_z_b_ut"),
+    ],
 )
 def test_a_wrong_map_is_refused(columns: dict[str, str], text: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=text):

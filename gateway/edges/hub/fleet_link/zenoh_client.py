@@ -21,7 +21,7 @@ from gateway.edges.hub.fleet_link.site_keys import (
     recordings_key,
 )
 from gateway.edges.hub.fleet_link.zenoh_session import (
-    HOW_TO_ADD,
+    NOT_INSTALLED,
     PATIENT_IDS,
     Inlet,
     Outlets,
@@ -139,7 +139,7 @@ class ZenohClient(Client):
             session = await off_loop(open_session, config)
         except ModuleNotFoundError:
             self.become("unreachable")
-            self.reason = HOW_TO_ADD
+            self.reason = NOT_INSTALLED
         except (OSError, ValueError) as error:
             self.become("unreachable", error)
         else:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HOW_TO_ADD: Final = "the fleet is an extra: pip install 'mavgate[fleet]'"
+NOT_INSTALLED: Final = "the extra mavgate[fleet] is not installed: see mavgate doctor"
 MAX_WAITING: Final = 4096
 """What has come and was not taken yet: a third of a second of two hundred aircraft."""
 AT_ONCE: Final = 64
