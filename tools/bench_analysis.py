@@ -14,7 +14,8 @@ from gateway.analysis.processes import cores
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.reporting.page import write_report
 from gateway.analysis.sources import simulated_flight
-from gateway.analysis.tuning.contest import grid, make_contest, parse_axis
+from gateway.analysis.tuning.axis import grid, parse_axis
+from gateway.analysis.tuning.contest import make_contest
 from gateway.analysis.tuning.workers import pool
 from gateway.estimation.select import make_estimator
 from gateway.records import GpsFix

@@ -35,7 +35,7 @@ import msgspec
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
 from gateway.analysis.sources import ideal_calibration
-from gateway.analysis.tuning.contest import parse_axis
+from gateway.analysis.tuning.axis import parse_axis
 from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import TableHeader, encode_head
 from gateway.flights.reading import ReadOptions

@@ -10,7 +10,7 @@ from gateway.analysis.blending import blend_table, grows
 from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_blocks
-from gateway.analysis.tuning.contest import with_value
+from gateway.analysis.tuning.axis import with_value
 from gateway.edges.disk.recording_streams import read_chunks
 from gateway.flightlog.table.column_map import ColumnMap, CsvReader
 from gateway.flightlog.table.table import block_of

@@ -4,25 +4,30 @@ Each trial fuses the flight causally, from the samples only. Some GPS fixes are 
 fusion to score it: a filter that only copies its GPS, noise included, gains nothing.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-import msgspec
 import numpy as np
 import pandas as pd
 from scipy.optimize import OptimizeResult, differential_evolution
 
 from gateway.analysis.blending import Judge, judge_of, make_judge, score
-from gateway.analysis.case import ESTIMATORS
 from gateway.analysis.flight_arrays import Flight, FlightTrack, FusionSettings
 from gateway.analysis.fusion import Sensed, fuse, sense
 from gateway.analysis.interpolation import thin, withhold
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
+from gateway.analysis.tuning.axis import (
+    ESTIMATOR_KEY,
+    Axis,
+    SweepError,
+    Value,
+    Values,
+    with_estimator_of,
+    with_values,
+)
 from gateway.sensing.chain import SensingSettings
-from gateway.settings import Settings, fields_of
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 COLUMN_OF: Final[dict[Metric, str]] = {
@@ -31,32 +36,10 @@ COLUMN_OF: Final[dict[Metric, str]] = {
     "reference": "reference_m",
     "attitude": "attitude_deg",
 }
-SHORT: Final = {
-    "alpha": "estimation.paper.alpha_accel",
-    "beta": "estimation.paper.beta_velocity",
-}
-"""The paper's own names."""
-ESTIMATOR_KEY: Final = "estimation.estimator"
-LARGEST_GRID: Final = 100_000
 SEED: Final = 1
 
-Value = float | int | str | bool
-Values = tuple[Value, ...]
 Trial = tuple[Values, Mapping[str, float]]
 """What was tried, and its scores."""
-
-
-class SweepError(ValueError):
-    """A sweep that cannot be done; the text says why."""
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """One setting that is varied."""
-
-    key: str
-    """Path from the root of the settings, such as `estimation.paper.alpha_accel`."""
-    values: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,92 +52,9 @@ class Contest:
     judge: Judge
 
 
-def known_keys() -> list[str]:
-    """List every setting that can be varied."""
-    return list(_leaves(FusionSettings, ""))
-
-
-def full_key(name: str) -> str:
-    """Find a setting by its path, the end of its path, or the paper's name.
-
-    Raises
-    ------
-    SweepError
-        If there is none, or more than one.
-    """
-    name = SHORT.get(name, name)
-    found = [key for key in known_keys() if key == name or key.endswith(f".{name}")]
-    if not found:
-        raise SweepError(f"no setting ends in {name!r}")
-    if len(found) > 1 and name not in found:
-        raise SweepError(f"{name!r} may be {' or '.join(found)}")
-    return name if name in found else found[0]
-
-
-def parse_axis(name: str, text: str) -> Axis:
-    """Read an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
-
-    Raises
-    ------
-    SweepError
-        If the text is neither, or a value is not allowed.
-    """
-    key = full_key(name)
-    parts = text.split(":")
-    try:
-        values: Values
-        if len(parts) == 3:
-            steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
-            # Rounded to the digits that a person would write.
-            values = tuple(float(f"{step:.12g}") for step in steps)
-        elif len(parts) == 2:
-            values = (float(parts[0]), float(parts[1]))
-        else:
-            values = tuple(_value(part.strip()) for part in text.split(","))
-    except ValueError as error:
-        raise SweepError(f"{name}: {text!r} is no low:high:count and no list: {error}") from error
-    if not values:
-        raise SweepError(f"{name}: {text!r} holds no value")
-    for value in values:
-        with_value(FusionSettings(), key, value)
-    return Axis(key, values)
-
-
-def with_value(settings: Any, key: str, value: Value) -> Any:
-    """Return settings with one value changed.
-
-    Raises
-    ------
-    SweepError
-        If the value is not allowed there; the text names the key.
-    """
-    name, _, rest = key.partition(".")
-    if rest:
-        return msgspec.structs.replace(
-            settings, **{name: with_value(getattr(settings, name), rest, value)}
-        )
-    field = next(f for f in fields_of(type(settings)) if f.name == name)
-    if isinstance(value, float) and value.is_integer() and isinstance(field.default, int):
-        value = int(value)
-    try:
-        checked = msgspec.convert(value, field.type)
-    except msgspec.ValidationError as error:
-        raise SweepError(f"{name} = {value}: {error}") from error
-    return msgspec.structs.replace(settings, **{name: checked})
-
-
 def settings_at(contest: Contest, values: Sequence[Value]) -> FusionSettings:
     """Return the settings with the values of one trial."""
     return with_values(contest.fusion, contest.keys, values)
-
-
-def with_values(
-    fusion: FusionSettings, keys: Sequence[str], values: Sequence[Value]
-) -> FusionSettings:
-    """Return settings with values changed by key; raises SweepError as `with_value`."""
-    for key, value in zip(keys, values, strict=True):
-        fusion = with_value(fusion, key, value)
-    return fusion
 
 
 def make_contest(
@@ -198,14 +98,6 @@ def make_contest(
     return Contest(flight, fusion, tuple(keys), make_judge(flight, keep))
 
 
-def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSettings:
-    """Choose the estimator that the keys belong to, if to one; raises SweepError if to several."""
-    named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
-    if len(named) > 1:
-        raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
-    return with_value(fusion, ESTIMATOR_KEY, named.pop()) if named else fusion
-
-
 def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
     """Score a flight with unchanged settings, by the same fixes."""
     judge = rejudged(contest.judge, fusion)
@@ -240,20 +132,6 @@ def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
         return judge
     fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))
     return judge_of(fused, held)
-
-
-def grid(axes: Sequence[Axis]) -> list[Values]:
-    """List every point of a grid; the first axis varies slowest.
-
-    Raises
-    ------
-    SweepError
-        If there are too many.
-    """
-    size = math.prod(len(axis.values) for axis in axes)
-    if size > LARGEST_GRID:
-        raise SweepError(f"the grid has {size} points; at most {LARGEST_GRID} are tried")
-    return list(itertools.product(*(axis.values for axis in axes)))
 
 
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
@@ -382,18 +260,3 @@ def _attitude_deg(track: FlightTrack, judge: Judge) -> float:
         return math.nan
     error = total_error_rad(rotation_error(track.q_nb, reference.track.q_nb))
     return rms(np.degrees(error[judge.fused.scored]))
-
-
-def _leaves(kind: type[Settings], prefix: str) -> Iterator[str]:
-    for field in fields_of(kind):
-        if field.section:
-            yield from _leaves(field.section, f"{prefix}{field.name}.")
-        else:
-            yield f"{prefix}{field.name}"
-
-
-def _value(text: str) -> Value:
-    try:
-        return float(text)
-    except ValueError:
-        return {"true": True, "false": False}.get(text, text)

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from gateway.analysis.processes import copies, cores
-from gateway.analysis.tuning.contest import Contest, Trials, Values
+from gateway.analysis.tuning.axis import Values
+from gateway.analysis.tuning.contest import Contest, Trials
 
 Scores = dict[str, float]
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]

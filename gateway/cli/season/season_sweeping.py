@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 
 from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.tuning.contest import (
-    COLUMN_OF,
+from gateway.analysis.tuning.axis import (
     Axis,
     SweepError,
     Values,
@@ -17,6 +16,7 @@ from gateway.analysis.tuning.contest import (
     with_estimator_of,
     with_values,
 )
+from gateway.analysis.tuning.contest import COLUMN_OF
 from gateway.cli.season.season_work import SeasonWork
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.recording_options import refusing

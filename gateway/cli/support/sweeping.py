@@ -19,15 +19,8 @@ from rich.table import Table
 
 from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.tuning import contest as sweeping
-from gateway.analysis.tuning.contest import (
-    COLUMN_OF,
-    Axis,
-    Contest,
-    Metric,
-    SweepError,
-    Trial,
-    Values,
-)
+from gateway.analysis.tuning.axis import ESTIMATOR_KEY, Axis, SweepError, Values, grid, parse_axis
+from gateway.analysis.tuning.contest import COLUMN_OF, Contest, Metric, Trial
 from gateway.analysis.tuning.workers import Run, pool
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import Loading, load_flight
@@ -88,7 +81,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             if options.generations:
                 trials = _search(axes, run, options.generations, options.metric)
             else:
-                trials = _try_all(sweeping.grid(axes), run)
+                trials = _try_all(grid(axes), run)
         results = sweeping.tabulate(contest.keys, trials, options.metric)
     except SweepError as error:
         refuse(str(error))
@@ -113,7 +106,7 @@ def parse_axes(options: SweepOptions) -> list[Axis]:
         wanted.append((name, text))
     if not wanted:
         raise SweepError("nothing to vary: give --alpha, --beta or --vary NAME=VALUES")
-    return [sweeping.parse_axis(name, text) for name, text in wanted]
+    return [parse_axis(name, text) for name, text in wanted]
 
 
 def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
@@ -123,7 +116,7 @@ def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
         return
     estimator = contest.fusion.estimation.estimator
     text = f"{', '.join(idle)}: changes nothing on this flight"
-    if not any(axis.key == sweeping.ESTIMATOR_KEY for axis in axes):
+    if not any(axis.key == ESTIMATOR_KEY for axis in axes):
         text += f" with the estimator {estimator}"
     if len(idle) == len(axes):
         raise SweepError(f"{text}; vary another setting, or choose the estimator that uses it")

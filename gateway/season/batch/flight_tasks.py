@@ -15,7 +15,8 @@ from gateway.analysis.flight_arrays import Flight, FusionSettings, flight_of_rec
 from gateway.analysis.fusion import fuse_states
 from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
-from gateway.analysis.tuning.contest import Axis, SweepError, Trials, base_score, grid, make_contest
+from gateway.analysis.tuning.axis import Axis, SweepError, grid
+from gateway.analysis.tuning.contest import Trials, base_score, make_contest
 from gateway.edges.disk.recordings import as_text, recording_name
 from gateway.flights.describing import describe
 from gateway.flights.flight_terms import FlightError

@@ -3,76 +3,19 @@ import math
 import numpy as np
 import pytest
 
-from gateway.analysis.flight_arrays import FusionSettings, fixes_of
-from gateway.analysis.tuning.contest import (
+from gateway.analysis.flight_arrays import fixes_of
+from gateway.analysis.tuning.axis import (
     Axis,
     SweepError,
-    Trials,
     Values,
-    full_key,
     grid,
-    make_contest,
-    optimise,
-    parse_axis,
-    settings_at,
-    tabulate,
-    with_value,
 )
+from gateway.analysis.tuning.contest import Trials, make_contest, optimise, settings_at, tabulate
 from gateway.analysis.tuning.workers import pool
 from tests.analysis.flights import short_case, short_flight
 
 ALPHA, BETA = "estimation.paper.alpha_accel", "estimation.paper.beta_velocity"
 LATENCY = "estimation.reference.gps_latency_s"
-
-
-@pytest.mark.parametrize(
-    ("name", "key"),
-    [
-        ("alpha", ALPHA),
-        ("beta", BETA),
-        ("gps_latency_s", LATENCY),
-        ("sensing.accel_cutoff_hz", "sensing.accel_cutoff_hz"),
-        ("reference.declination_deg", "estimation.reference.declination_deg"),
-    ],
-)
-def test_a_setting_is_found_by_its_name(name: str, key: str) -> None:
-    assert full_key(name) == key
-
-
-def test_an_unknown_setting_is_reported() -> None:
-    with pytest.raises(SweepError, match="no setting ends in 'gama'"):
-        full_key("gama")
-
-
-@pytest.mark.parametrize(
-    ("text", "values"),
-    [
-        ("0.1:0.9:9", (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)),
-        ("0.5,0.1", (0.5, 0.1)),
-        ("0:1", (0.0, 1.0)),
-        ("0.25", (0.25,)),
-    ],
-)
-def test_values_are_read(text: str, values: tuple[float, ...]) -> None:
-    assert parse_axis("alpha", text).values == values
-
-
-def test_names_are_values_too() -> None:
-    axis = parse_axis("accel_filter", "butterworth, chebyshev")
-    assert axis == Axis("sensing.accel_filter", ("butterworth", "chebyshev"))
-
-
-@pytest.mark.parametrize("text", ["0:2:3", "a:b:c", "-0.1", "chebyshev"])
-def test_values_that_are_not_allowed_are_reported(text: str) -> None:
-    with pytest.raises(SweepError, match="alpha"):
-        parse_axis("alpha", text)
-
-
-def test_a_value_lands_where_it_belongs() -> None:
-    changed = with_value(FusionSettings(), ALPHA, 0.7)
-    assert changed.estimation.paper.alpha_accel == 0.7
-    assert changed.estimation.paper.beta_velocity == 0.1
-    assert changed.sensing == FusionSettings().sensing
 
 
 def test_varying_an_estimators_setting_chooses_it() -> None:
@@ -97,16 +40,6 @@ def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
     assert len(fused) + len(held) == len(fixes_of(flight))
     assert not set(fused.arrival_us.tolist()) & set(held.arrival_us.tolist())
     assert len(fused) / len(fixes_of(flight)) == pytest.approx(share, abs=0.03)
-
-
-def test_a_grid_is_every_point() -> None:
-    axes = [Axis("a", (1, 2)), Axis("b", (3, 4, 5))]
-    assert grid(axes) == [(1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5)]
-
-
-def test_a_grid_too_large_is_refused() -> None:
-    with pytest.raises(SweepError, match="1000000 points"):
-        grid([Axis("a", tuple(range(1000))), Axis("b", tuple(range(1000)))])
 
 
 def test_several_processes_give_the_same_as_one() -> None:
