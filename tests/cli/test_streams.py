@@ -1,11 +1,15 @@
 """Standard streams that are closed, full or know few signs: clear errors, and no traceback."""
 
+import io
+import logging
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from gateway.cli import app
 
 pytestmark = pytest.mark.io
 
@@ -50,3 +54,21 @@ def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
     done = run("recover", name, "-o", str(tmp_path / "out.tlog"))
     assert done.returncode == 1
     assert done.stderr == f"{name}: File name too long\n"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes the place of `sys.stderr` while it is shown."""
+    before, above_the_bar = Terminal(), Terminal()
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    monkeypatch.setattr(sys, "stderr", before)
+    app._options()
+    monkeypatch.setattr(sys, "stderr", above_the_bar)
+    logging.getLogger("gateway").warning("the port has gone")
+    assert "the port has gone" in above_the_bar.getvalue()
+    assert before.getvalue() == ""
