@@ -161,13 +161,14 @@ def test_aircraft_files_lie_over_the_common_settings(settings: GatewaySettings) 
     folder.mkdir()
     (folder / "3.toml").write_text(
         '[vehicle]\ntype = "quadrotor"\n[calibration]\ngyro_bias_radps = [0.1, 0.0, -0.1]\n'
+        '[sensing]\naccel_filter = "chebyshev"\n'
     )
     (folder / "99.toml").write_text("nonsense")
     found = load_aircraft(settings)
     assert list(found) == [3]
     assert found[3].calibration.gyro_bias_radps == (0.1, 0.0, -0.1)
     assert found[3].vehicle.type == "quadrotor"
-    assert found[3].sensing.accel_cutoff_hz == 7.0
+    assert (found[3].sensing.accel_cutoff_hz, found[3].sensing.accel_filter) == (7.0, "chebyshev")
 
 
 def test_no_folder_is_no_aircraft(settings: GatewaySettings) -> None:

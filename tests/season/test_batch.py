@@ -153,6 +153,7 @@ def test_a_file_that_has_gone_is_said_in_plain_words(season: Path, tmp_path: Pat
     items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((StoredFile(str(gone)),))]
     results = run_season(InfoTask(OPTIONS), items, LocalProcesses(1), None, silent)
     assert [result.error for result in results] == [None, f"{gone}: No such file or directory"]
+    assert results[0].began == "2026-05-28 20:26:40"
 
 
 def test_two_batches_do_not_write_into_one_folder(season: Path, tmp_path: Path) -> None:

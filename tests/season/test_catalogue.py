@@ -27,8 +27,9 @@ from gateway.season.catalogue.catalogue_file import (
 )
 from gateway.season.catalogue.indexing import index_folder, read_file, recordings_below
 from gateway.season.executors import LocalProcesses
-from gateway.season.statistics.flight_facts import FlightFacts, lost_share
+from gateway.season.statistics.flight_facts import FlightFacts, FlightTally, lost_share
 from gateway.season.statistics.track_shape import feature, simplified
+from gateway.units import US_PER_S
 from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 
 pytestmark = pytest.mark.io
@@ -350,6 +351,14 @@ def test_a_track_is_shown_within_the_tolerance(rng: np.random.Generator) -> None
     assert 20 < len(kept) < 400
     lost = np.interp(turn, [turn[places.index(place)] for place in kept], [p[0] for p in kept])
     assert np.abs(lost - np.array(places)[:, 0]).max() * 111_000.0 < 15.0
+
+
+def test_a_slow_receiver_is_no_outage() -> None:
+    tally = FlightTally()
+    for second in (0, 5, 10, 15, 30, 35):
+        tally.add_gps(second * US_PER_S, fixed=True)
+    facts = tally.facts(35 * US_PER_S)
+    assert (facts.gps_outages, facts.gps_lost) == (1, 15.0)
 
 
 def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:

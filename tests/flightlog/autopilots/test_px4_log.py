@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.flightlog.autopilots.px4_log import Px4Log, Topic
+from gateway.records import GpsFix
 
 ROWS = 60
 STEP_US = 20_000
@@ -51,3 +52,20 @@ def test_a_damaged_stamp_is_no_gap(off_us: int) -> None:
     assert times == sorted(times)
     assert times[-1] - times[0] <= ROWS * STEP_US + 4_000_000
     assert flight.dropped == (2 if abs(off_us) > 60_000_000 else 0)
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "valid", "known"), [(3, 1, True), (3, 0, False), (1, 1, False)]
+)
+def test_a_velocity_counts_with_a_fix_and_where_it_is_valid(
+    fix_type: int, valid: int, known: bool
+) -> None:
+    found = topics()
+    times = {"timestamp": found["sensor_combined"]["timestamp"][:1]}
+    numbers = {"fix_type": fix_type, "vel_ned_valid": valid, "lat": 470000000, "lon": 80000000}
+    speeds = dict.fromkeys(("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"), np.full(1, 1.5))
+    found["vehicle_gps_position"] = (
+        times | {name: np.array([number]) for name, number in numbers.items()} | speeds
+    )
+    (fix,) = (record for record in Px4Log(found, 1).records() if isinstance(record, GpsFix))
+    assert (fix.vel_n_mps == (1.5, 1.5, 1.5)) is known

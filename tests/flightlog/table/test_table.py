@@ -94,6 +94,17 @@ def test_a_damaged_line_costs_itself_alone() -> None:
     assert repr([e for e in events if isinstance(e, TableRow)]) == repr([rows[0], *rows[3:]])
 
 
+def test_a_damaged_line_is_counted_from_the_files_first() -> None:
+    reader = TableReader()
+    whole = make_table(make_rows(4, 6))
+    reader.feed(whole)
+    rows = "".join(map(row_to_line, make_rows(4, 6))).encode()
+    reader.feed(rows)
+    (fault,) = reader.feed(b"1,2,3\n")
+    assert isinstance(fault, TableFault)
+    assert fault.line == (whole + rows).count(b"\n") + 1
+
+
 @pytest.mark.parametrize("chunk", [None, 4096])
 def test_zeros_without_an_end_do_not_fill_the_memory(chunk: int | None) -> None:
     rows = make_rows(5, 4)
