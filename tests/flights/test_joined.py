@@ -67,7 +67,7 @@ def test_what_two_recordings_hold_is_taken_once(
     assert times == sorted(times)
     assert sorted(set(marks)) == [*kept[::10]]
     (remark,) = joined.remarks
-    assert remark.startswith(f"{left_out} rows that overlap")
+    assert remark.startswith(f"left out {left_out} rows")
 
 
 def test_an_older_recording_behind_a_newer_one_is_refused() -> None:

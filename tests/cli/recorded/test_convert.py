@@ -233,7 +233,8 @@ def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
     assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
     assert math.isfinite(states[-1].alt_amsl_m)
     own = tmp_path / "map.toml"
-    own.write_text('[columns]\ntime_us = "t"\naccel_x_b_mps2 = "ax"\ngyro_x_b_radps = "gx"\n')
+    axes = [f'accel_{axis}_b_mps2 = "a{axis}"\ngyro_{axis}_b_radps = "g{axis}"' for axis in "xyz"]
+    own.write_text("\n".join(["[columns]", 'time_us = "t"', *axes]))
     refused = run("convert", source, "-o", tmp_path / "x.csv", "--columns", own, code=2)
     assert "has no column t" in " ".join(refused.split())
     own.write_text(own.read_text().replace('"t"', '{ column = "time_s", scale = 1e6 }'))
