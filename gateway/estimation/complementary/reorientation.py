@@ -19,6 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.drift import (
     bias_std,
     doubt_sensors,
+    end_level,
     forget_heading,
     heading_variance,
     start_heading,
@@ -38,6 +39,8 @@ LEAST_LEVEL_RAD: Final = 0.02
 def lose_attitude(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Give the attitude up; the place follows the fixes until the alignment has found another."""
     lose(s)
+    if s.level_by_gps == 1:
+        end_level(s, p)
     begin_level(s)
     forget_heading(s, p)
 
