@@ -15,17 +15,20 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+from gateway.analysis.reporting.sections.estimators import COLOURS
+from gateway.analysis.reporting.style import GREEN, MUTED
+
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "accuracy.png"
 MARKS = {
-    "smoothed": ("#009e73", "o"),
-    "eskf": ("#0072b2", "o"),
-    "complementary": ("#d55e00", "o"),
-    "paper": ("#cc79a7", "s"),
-    "vqf": ("#888888", "D"),
-    "imufusion": ("#888888", "^"),
-    "ahrs Madgwick": ("#888888", "x"),
+    "smoothed": (GREEN, "o"),
+    "eskf": (COLOURS["eskf"], "o"),
+    "complementary": (COLOURS["complementary"], "o"),
+    "paper": (COLOURS["paper"], "s"),
+    "vqf": (MUTED, "D"),
+    "imufusion": (MUTED, "^"),
+    "ahrs Madgwick": (MUTED, "x"),
 }
-"""Okabe and Ito's colours for our own, grey for other people's."""
+"""The colours that reports give to our own, grey for other people's."""
 PANELS = {
     "total": "attitude, degrees",
     "out10": "position in 10 s without GPS, m",

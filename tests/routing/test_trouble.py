@@ -4,32 +4,13 @@ import dataclasses
 
 from gateway.routing.client_table import ClientStats, ListenerStats
 from gateway.routing.trouble import PATIENCE_US, QUIET_US, TroubleWatch
+from tests.client_stats import TABLET
 
 S = 1_000_000
 
-CLIENT = ClientStats(
-    client_id=1,
-    name="tablet",
-    endpoint="udp:10.0.0.7:14550",
-    remote="10.0.0.7:14550",
-    state="open",
-    trusted=True,
-    systems=(),
-    sent=0,
-    dropped=0,
-    bytes_sent=0,
-    received=0,
-    bytes_received=0,
-    bytes_garbage=0,
-    queued=0,
-    since_us=0,
-    heard_us=None,
-    round_trip_us=None,
-)
-
 
 def client(**changes: object) -> tuple[ClientStats, ...]:
-    return (dataclasses.replace(CLIENT, **changes),)
+    return (dataclasses.replace(TABLET, **changes),)
 
 
 def look(watch: TroubleWatch, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
@@ -116,7 +97,7 @@ def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
     for n in range(100):
         strangers = tuple(
             dataclasses.replace(
-                CLIENT, client_id=100 + number, name=f"stranger {number}", endpoint=port, dropped=n
+                TABLET, client_id=100 + number, name=f"stranger {number}", endpoint=port, dropped=n
             )
             for number in range(n * 10, n * 10 + 20)
         )

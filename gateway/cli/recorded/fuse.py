@@ -80,8 +80,9 @@ def fuse_log(
     """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
 
     The columns are those of a recording's table, so every command accepts the file as one.
-    Reads mavgate's own recordings, autopilots' tlogs, and CSV files with the columns time_s, ax,
-    ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or others by a column map.
+    Reads mavgate's own recordings, autopilots' logs (tlog, ULog, DataFlash), and CSV files with
+    the columns time_s, ax, ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or
+    others by a column map.
     Where the settings leave them at their defaults, gps_latency_s and declination_deg of such a
     file's # lines are used; a latency that is not given there either is estimated from its
     manoeuvres, or the default is assumed, with a message.

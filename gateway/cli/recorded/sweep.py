@@ -27,7 +27,7 @@ def sweep(
     flights: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Recordings by name, CSV files or tlogs, or a folder; by default the built-in "
+            help="Recordings by name, flight logs, or a folder; by default the built-in "
             "simulated flight.",
             show_default=False,
         ),

@@ -29,7 +29,7 @@ from gateway.flights.reading import ReadOptions, is_table, open_rows
 FlightArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="A recording by its name, our CSV, another program's with --columns, or a tlog; "
+        help="A recording by its name, or any flight log; "
         "by default the built-in simulated flight.",
         show_default=False,
     ),

@@ -19,28 +19,23 @@ from gateway.cli.live import clients
 from gateway.config import load
 from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams, socket_path
 from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.routing.client_table import HubCounters, ListenerStats
 from gateway.status import AircraftStatus, Snapshot, Way
+from tests.client_stats import TABLET
 
 pytestmark = pytest.mark.io
 
 NAN = float("nan")
-CLIENT = ClientStats(
-    client_id=1,
-    name="tablet",
+CLIENT = dataclasses.replace(
+    TABLET,
     endpoint="udp:10.0.0.7:14550?name=tablet",
-    remote="10.0.0.7:14550",
-    state="open",
-    trusted=True,
     systems=((255, 190),),
     sent=5000,
     dropped=2,
     bytes_sent=200_000,
     received=10,
     bytes_received=200,
-    bytes_garbage=0,
     queued=3,
-    since_us=0,
     heard_us=1_000_000,
     round_trip_us=1500,
 )

@@ -23,8 +23,9 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.routing.client_table import HubCounters, ListenerStats
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from tests.client_stats import TABLET
 from tests.vehicle.samples import FIX
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
@@ -48,24 +49,18 @@ FLYING = NavState(
 LOST = msgspec.structs.replace(
     FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3
 )
-CLIENT = ClientStats(
-    client_id=1,
+CLIENT = replace(
+    TABLET,
     name="",
     endpoint="udp:127.0.0.1:14550",
     remote="127.0.0.1:14550",
-    state="open",
-    trusted=True,
     systems=((255, 190),),
     sent=1200,
     dropped=3,
     bytes_sent=50_000,
     received=9,
     bytes_received=200,
-    bytes_garbage=0,
-    queued=0,
-    since_us=0,
     heard_us=9_500_000,
-    round_trip_us=None,
 )
 SNAPSHOT = Snapshot(
     10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)), HubCounters()

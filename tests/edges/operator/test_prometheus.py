@@ -12,8 +12,9 @@ from gateway.edges.operator import prometheus
 from gateway.edges.operator.metric_families import prometheus_text
 from gateway.edges.operator.prometheus import MetricsServer
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus
-from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.routing.client_table import HubCounters, ListenerStats
 from gateway.status import AircraftStatus, Snapshot, Way
+from tests.client_stats import TABLET
 from tests.ports import free_port
 from tests.vehicle.samples import FIX, NOTHING, STATE
 
@@ -40,22 +41,16 @@ REPORT = LinkReport(
     nodes=(NODE,),
     receiver=None,
 )
-CLIENT = ClientStats(
+CLIENT = dataclasses.replace(
+    TABLET,
     client_id=7,
     name='the "tablet"',
-    endpoint="udp:10.0.0.7:14550",
-    remote="10.0.0.7:14550",
-    state="open",
-    trusted=True,
-    systems=(),
     sent=5000,
     dropped=2,
     bytes_sent=200_000,
     received=10,
     bytes_received=200,
-    bytes_garbage=0,
     queued=1,
-    since_us=0,
     heard_us=1_000_000,
     round_trip_us=1500,
 )
