@@ -74,9 +74,12 @@ def main() -> None:
         seen["place"][:, 0], seen["place"][:, 3], color=BLUE, lw=1, label="GLOBAL_POSITION_INT"
     )
     panels["height"].set(xlabel="time, s", ylabel="height AMSL, m")
-    for panel in panels.values():
+    for name, panel in panels.items():
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=8, loc="best")
+        if name != "map":
+            panel.legend(fontsize=8, loc="best")
+    # Above the track, which leaves no room for it.
+    panels["map"].legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     figure.suptitle("218 s of the simulated flight, as a ground station receives it")
     figure.tight_layout()
     figure.savefig(TARGET, dpi=100)
