@@ -27,6 +27,8 @@ SEND_BUFFER_BYTES: Final = 32_768
 """What the peer has not acknowledged, and is underway on a long link."""
 UNSENT_BYTES: Final = 2048
 """What the kernel takes beyond that: frames shall wait in our queue, where the urgent go first."""
+JOINED_BYTES: Final = 1024
+"""The kernel joins what it has not sent, and looks at `UNSENT_BYTES` only when it begins anew."""
 PATIENCE_US: Final = US_PER_S
 """A connection that needs longer for what waits is slow; after a stall one catches up sooner."""
 FRESH_US: Final = US_PER_S // 2
@@ -42,6 +44,8 @@ class StreamClient(QueuedClient):
     _sending_us: int | None = None
     """Since when it has sent what waits without coming to an end."""
     _chunk_bytes = CHUNK_BYTES
+    _joined = 0
+    """Bytes written since the kernel was told to begin anew."""
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Send one frame at once if nothing waits, else queue it."""
@@ -98,8 +102,12 @@ class StreamClient(QueuedClient):
 
     def _write(self, sock: socket.socket, data: bytes) -> bool:
         """Write; keep what the socket does not accept and wait for room."""
+        self._joined += len(data)
+        flags = socket.MSG_EOR if self._joined >= JOINED_BYTES else 0
+        if flags:
+            self._joined = 0
         try:
-            taken = sock.send(data)
+            taken = sock.send(data, flags)
         except BlockingIOError:
             taken = 0
         except OSError:

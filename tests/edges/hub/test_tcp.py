@@ -2,15 +2,18 @@
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import pty
 import socket
+import sys
 import termios
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.edges.hub.tcp import UNSENT_BYTES
 from gateway.routing.client_table import SILENT_AFTER_US
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 from tests.edges.hub.conftest import LIMIT_S
@@ -19,6 +22,8 @@ from tests.ports import free_port
 pytestmark = pytest.mark.io
 
 ATTITUDE, COMMAND_ACK = 30, 77
+SIOCOUTQNSD = 0x894B
+"""Bytes that the kernel has not sent, not even once."""
 
 
 async def connect(rig: Any, port: int) -> socket.socket:
@@ -119,6 +124,17 @@ class TestTcpListen:
             await asyncio.sleep(0)
         assert hub.clients()[0].queued > 1000
         assert hub.clients()[0].bytes_sent < 10_000
+
+    async def test_what_the_kernel_joins_does_not_wait_there_either(self, rig: Any) -> None:
+        """Of a link with a wide window it joined 40 kB, 20 s of a link of 2 kB/s."""
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        (client,) = hub._clients.values()
+        while not client.queued:
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+        unsent = fcntl.ioctl(client._socket, SIOCOUTQNSD, bytes(4))
+        assert int.from_bytes(unsent, sys.byteorder) < 2 * UNSENT_BYTES
 
     async def test_a_slow_client_gets_what_is_fresh_and_answers_first(self, rig: Any) -> None:
         """It takes 2 kB a second of 10."""
