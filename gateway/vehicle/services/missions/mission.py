@@ -12,8 +12,8 @@ An upload, seen from here:
 | upload | the item asked for, bad         | ACK with what is bad              | idle   |
 | upload | one that it had before          |                                   | upload |
 | upload | one further on                  | REQUEST_INT of the one asked for  | upload |
-| upload | MISSION_COUNT once more         |                                   | upload |
-| upload | another MISSION_COUNT           | start again                       | upload |
+| upload | the same count before any item  |                                   | upload |
+| upload | any other count of its own      | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied; after 1.5 s without   | upload |
 |        |                                 | an item it starts its own         |        |
 | upload | MISSION_ACK, not accepted       |                                   | idle   |
@@ -86,7 +86,7 @@ class _Upload:
     progress_us: int = 0
     """When the first that is missing was asked for first."""
     repeats: int = 0
-    """How often that was asked for again: so many copies of it may still come."""
+    """How often a request was repeated since: so many copies of that item may still come."""
     loses: bool = False
     """Whether any request had to be repeated."""
     checks: int = 0
@@ -249,7 +249,8 @@ class MissionService:
             upload.wanted, upload.progress_us, upload.repeats = len(upload.items), now_us, 0
             return self._ask(upload, now_us)
         self._upload, self._finished = None, upload
-        upload.due_us, upload.checks = now_us + REPEAT_US, CHECKS if upload.loses else 0
+        upload.wanted, upload.due_us = message.seq, now_us + REPEAT_US
+        upload.checks = CHECKS if upload.loses else 0
         stored = self._store(upload.kind, tuple(upload.items), now_us)
         return [mission_ack(request, ACCEPTED), *stored]
 

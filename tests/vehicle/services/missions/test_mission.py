@@ -187,6 +187,14 @@ def test_where_a_request_was_lost_the_ack_may_be_too(station: GroundStation) -> 
     assert asked_in(station, 5.0) == [1, 1]
 
 
+def test_the_last_item_is_asked_for_though_an_older_one_came_late(station: GroundStation) -> None:
+    station.send(count(3))
+    assert asked_in(station, 0.5) == [0]
+    for seq in (0, 1, 0, 2):
+        station.send(item(seq))
+    assert asked_in(station, 5.0) == [2, 2, 2]
+
+
 def test_where_nothing_was_lost_an_upload_ends_with_its_ack(station: GroundStation) -> None:
     upload(station, [item(0), item(1)])
     assert asked_in(station, 5.0) == []
