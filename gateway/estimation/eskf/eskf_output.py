@@ -105,6 +105,7 @@ def write_place(s: EskfState, row: FloatArray) -> None:
         write_std(row, NAV_POS_STD, s, POS)
         for k in range(2):
             row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
+            row[NAV_VEL_STD + k] = math.hypot(row[NAV_VEL_STD + k], s.contradiction_mps)
     elif s.time_s - s.fix_s < FRESH_GPS_S:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
 

@@ -119,6 +119,8 @@ class EskfState(FilterState):
     """By how much the last fix contradicted the filter's place, horizontal; 0 if it did not."""
     contradiction_m: float
     """By how much the last two fixes did; the true place may be either."""
+    contradiction_mps: float
+    """By how much the velocities of fixes did of late, along an axis."""
     height_off_s: float
     """For how long the heights of the fixes have contradicted the filter's."""
     weighed_s: float

@@ -18,6 +18,8 @@ GLITCH_S: Final = 10.0
 """What is off beyond the gate is off for about this time."""
 DOUBT_S: Final = 1.0
 """Doubt fades in about this time where fixes agree again."""
+VELOCITY_GATE_SQ: Final = 9.0
+"""A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
 DOUBT_PLACE_SQ: Final = 16.0
 """Beyond four standard deviations, the receiver's usual slow error included, a place is doubted."""
 MOST_MPS: Final = 5.0
@@ -34,6 +36,7 @@ def fade_doubt(s: EskfState, accel_n: Vec3, since_s: float) -> None:
     """Let doubt fade over the time since the last fix, and note what the aircraft flies, m/s2."""
     s.doubt_vel_sq *= math.exp(-since_s / DOUBT_S)
     s.doubt_pos_sq *= math.exp(-since_s / DOUBT_S)
+    s.contradiction_mps *= math.exp(-since_s / DOUBT_S)
     north, east, down = accel_n
     now = math.sqrt(north * north + east * east + down * down)
     s.manoeuvre_mps2 = max(now, s.manoeuvre_mps2 * math.exp(-since_s / MANOEUVRE_S))
@@ -69,3 +72,22 @@ def lasting_excess(
     """
     counts = min(abs(off), most)
     return (counts * counts / gate_sq - explained) * max(1.0, GLITCH_S / since_s)
+
+
+@compiled
+def doubt_velocity(s: EskfState, off_mps: float, explained: float, since_s: float) -> None:
+    """Doubt the velocities of fixes by what one axis is off; see `lasting_excess`.
+
+    The true velocity may be either, so the filter's own is told no surer than that.
+    """
+    excess = lasting_excess(off_mps, MOST_MPS, explained, VELOCITY_GATE_SQ, since_s)
+    if excess > 0.0:
+        s.doubt_vel_sq = max(s.doubt_vel_sq, excess)
+        s.contradiction_mps = max(s.contradiction_mps, min(abs(off_mps), MOST_MPS))
+
+
+@compiled
+def doubt_position(s: EskfState, off_m: float, explained: float, since_s: float) -> None:
+    """Doubt the places of fixes by what one axis is off; see `lasting_excess`."""
+    excess = lasting_excess(off_m, MOST_M, explained, DOUBT_PLACE_SQ, since_s)
+    s.doubt_pos_sq = max(s.doubt_pos_sq, excess)

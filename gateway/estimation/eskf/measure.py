@@ -38,13 +38,13 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.fix_doubt import (
-    DOUBT_PLACE_SQ,
-    MOST_M,
-    MOST_MPS,
+    VELOCITY_GATE_SQ,
+    doubt_position,
+    doubt_velocity,
     fade_doubt,
     lag_variance,
-    lasting_excess,
 )
+from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import STALE_MAG_S
@@ -73,9 +73,9 @@ STRENGTH_NOISE: Final = 0.03
 MISFIT_S: Final = 20.0
 """A strength that has varied for so long beyond its noise is that of unknown iron; the heading's
 error by it lasts as long, for it changes with the attitude alone."""
-VELOCITY_GATE_SQ: Final = 9.0
-"""A receiver's velocity lags in manoeuvres, far beyond its noise, so it counts for less early."""
 FAR_SQ: Final = 1e12
+LEAST_LAG_S: Final = 0.1
+"""Over less, an acceleration is mostly vibration."""
 LEAST_S: Final = 0.05
 """Fixes closer together count as that far apart."""
 
@@ -187,17 +187,19 @@ def place_variance(p: EskfGains, row: FloatArray, k: int) -> float:
 
 
 @compiled
-def mean_acceleration(once: Vec3, lag: float) -> Vec3:
-    """Return the mean acceleration over the lag, m/s2; `once` as of `lag_integrals`."""
-    span = max(lag, 0.02)
-    return (once[0] / span, once[1] / span, once[2] / span + STANDARD_GRAVITY_MPS2)
+def mean_acceleration(s: EskfState, lag: float) -> Vec3:
+    """Return the mean acceleration over the lag, `LEAST_LAG_S` at least, m/s2; uses `then` up."""
+    span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
+    if span <= 0.0:
+        return (0.0, 0.0, 0.0)
+    now, then = s.integrals, s.then
+    return ((now[3] - then[3]) / span, (now[4] - then[4]) / span, (now[5] - then[5]) / span)
 
 
 @compiled
-def delay_variances(s: EskfState, p: EskfGains, once: Vec3, lag: float) -> tuple[Vec3, Vec3]:
-    """Compute the variances that the jitter of the latency adds to position and velocity."""
+def delay_variances(s: EskfState, p: EskfGains, a: Vec3) -> tuple[Vec3, Vec3]:
+    """Compute what the jitter of the latency adds to position and velocity, at `a` m/s2."""
     v, j = s.vel_n, p.gps_jitter_sq
-    a = mean_acceleration(once, lag)
     return (
         (j * v[0] * v[0], j * v[1] * v[1], j * v[2] * v[2]),
         (j * a[0] * a[0], j * a[1] * a[1], j * a[2] * a[2]),
@@ -216,10 +218,10 @@ def place_distance_sq(
         The larger normalised innovation squared of north and east.
     """
     worst = 0.0
-    late, _ = delay_variances(s, p, once, lag)
+    v, j = s.vel_n, p.gps_jitter_sq
     for k in range(2):
         position_row(s, k, once, twice, lag)
-        variance = place_variance(p, row, k) + late[k]
+        variance = place_variance(p, row, k) + j * v[k] * v[k]
         worst = max(worst, normalised_innovation_sq(s, off_pos[k], variance))
     return worst
 
@@ -255,9 +257,9 @@ def update_by_fix(
     before, level = s.P[TILT + 2, TILT + 2], level_variance(s)
     since = max(s.time_s - s.weighed_s, LEAST_S)
     s.weighed_s = s.time_s
-    accel = mean_acceleration(once, lag)
+    accel = mean_acceleration(s, lag)
     fade_doubt(s, accel, since)
-    late_pos, late_vel = delay_variances(s, p, once, lag)
+    late_pos, late_vel = delay_variances(s, p, accel)
     repeated = max(1.0, p.velocity_correlation_s / since)
     unexpected = lasting_noise_sq(s, accel[0] * accel[0] + accel[1] * accel[1], since)
     noise_vel = (
@@ -275,13 +277,11 @@ def update_by_fix(
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             explained = innovation_variance(s, noise_vel[k]) + lag_variance(s)
-            excess = lasting_excess(off_vel[k], MOST_MPS, explained, VELOCITY_GATE_SQ, since)
-            s.doubt_vel_sq = max(s.doubt_vel_sq, excess)
+            doubt_velocity(s, off_vel[k], explained, since)
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
             explained = innovation_variance(s, noise_pos[k])
-            excess = lasting_excess(off_pos[k], MOST_M, explained, DOUBT_PLACE_SQ, since)
-            s.doubt_pos_sq = max(s.doubt_pos_sq, excess)
+            doubt_position(s, off_pos[k], explained, since)
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)

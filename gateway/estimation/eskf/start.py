@@ -168,7 +168,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
             renew(s, GYRO_SCALE + k, p.gyro_scale_var)
         doubt_level(s, p)
         start_iron_search(s)
-    s.off_last_m = s.contradiction_m = 0.0
+    s.off_last_m = s.contradiction_m = s.contradiction_mps = 0.0
     s.doubt_vel_sq = s.doubt_pos_sq = 0.0
 
 
