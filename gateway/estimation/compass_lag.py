@@ -144,10 +144,3 @@ def take_lag_pair(s: LagState, left: Vec3, change: Vec3, norm_sq: float) -> None
     lag_s = (s.late_product_ut2ps + usual * USUAL_LAG_S) / total
     s.compass_lag_s = min(max(lag_s, -LONGEST_LAG_S), LONGEST_LAG_S)
     s.compass_lag_var = noise_sq / total
-
-
-@compiled
-def late_var(s: LagState) -> float:
-    """Return the variance of the field's direction by what is not known of the lag, rad2."""
-    x, y, z = s.late_rate_b[0], s.late_rate_b[1], s.late_rate_b[2]
-    return float(s.compass_lag_var * (x * x + y * y + z * z))

@@ -11,7 +11,6 @@ from gateway.estimation.eskf.covariance import (
     MAX_TILT_VAR,
     clear,
     consider,
-    inject,
     propagate,
     update_scalar,
 )
@@ -222,12 +221,3 @@ def test_the_compass_row_tells_what_iron_does_to_the_heading(rng: np.random.Gene
         bent = field_n + attitude.apply(1e-6 * np.eye(3)[k])
         slope = (heading(bent) - heading(field_n)) / 1e-6
         assert s.h[MAG_BIAS + k] == pytest.approx(slope, rel=1e-4)
-
-
-def test_a_slow_error_of_the_fixes_has_an_end() -> None:
-    s = new_record(EskfState)
-    s.q_nb[:] = [1.0, 0.0, 0.0, 0.0]
-    s.wander_var[:] = [1.0, 4.0, 9.0]
-    s.dx[WANDER : WANDER + 3] = [100.0, -100.0, 1.0]
-    inject(s)
-    np.testing.assert_allclose(s.wander_n, [3.0, -6.0, 1.0])

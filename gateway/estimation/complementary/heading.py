@@ -10,7 +10,6 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.compass_lag import late_var
 from gateway.estimation.complementary.compass_error import note_dip, note_strength
 from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
@@ -82,7 +81,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if s.heading_known == 0:
         s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
     innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
-    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 + late_var(s)
+    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2
     if s.level_by_gps == 0:
         # A level that is off turns the field for as long, the more the steeper it is.
         steep = math.tan(s.mag_dip_ref)

@@ -1,7 +1,6 @@
 """An attitude that is lost, and one that the alignment has found."""
 
 import math
-from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import (
@@ -17,7 +16,6 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import (
-    bias_std,
     doubt_sensors,
     end_level,
     forget_heading,
@@ -30,9 +28,6 @@ from gateway.estimation.complementary.tilt import hold_level, refresh
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.quaternion import multiply, normalise
-
-LEAST_LEVEL_RAD: Final = 0.02
-"""A level that was found is off by the accelerometer's bias at least."""
 
 
 @compiled
@@ -63,13 +58,6 @@ def watch_gravity(s: ComplementaryState, p: ComplementaryGains) -> None:
 
 
 @compiled
-def found_heading_std(s: ComplementaryState) -> float:
-    """Return how uncertain a heading of the alignment is: the bias has turned its pairs, too."""
-    turned = 0.5 * bias_std(s) * s.gathered_s
-    return math.hypot(s.heading_std, turned)
-
-
-@compiled
 def find_by_gravity(s: ComplementaryState) -> None:
     """Believe the level that gravity's low-pass has found meanwhile, as far as the pairs do."""
     s.lost, s.doubt_s = 0, 0.0
@@ -89,10 +77,10 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
             find_by_gravity(s)
         return
     if not taken:
-        if tells_heading(s) and s.at_rest == 0:
+        if tells_heading(s):
             forget_heading(s, p)
             turn_rad = heading_difference(as_quat(s.found_q_nb), q)
-            start_heading(s, p, s.heading_rad + turn_rad, found_heading_std(s) ** 2)
+            start_heading(s, p, s.heading_rad + turn_rad, s.heading_std**2)
             s.heading_known = s.heading_true = 1
             refresh(s)
         return
@@ -100,12 +88,9 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
     if not lost:
         doubt_sensors(s, p)
     forget_heading(s, p)
-    if s.at_rest == 1:
-        # At rest a heading from GPS is only noise.
-        s.heading_known = 0
     if s.heading_known == 1:
         s.heading_true = 1
-        start_heading(s, p, s.heading_rad, found_heading_std(s) ** 2)
+        start_heading(s, p, s.heading_rad, s.heading_std**2)
     begin_level(s)
     # The level frame is NED turned about down by the heading; the gyroscope's frame stays.
     half = -0.5 * s.heading_rad
@@ -115,5 +100,5 @@ def review_attitude(s: ComplementaryState, p: ComplementaryGains, dt: float) -> 
     s.unaided_level_sq = s.level_std * s.level_std
     hold_level(s)
     if s.by_gps == 1 and s.heading_known == 1:
-        start_level(s, p, max(s.level_std, LEAST_LEVEL_RAD))
+        start_level(s, p, s.level_std)
     refresh(s)

@@ -39,8 +39,6 @@ SCALE_S: Final = 1.0
 """An acceleration keeps its axis in the body for about this time, and its error its sign."""
 GYRO_BY_FORCE: Final = 0.1 * RAD_PER_DEG / STANDARD_GRAVITY_MPS2
 """Force beside gravity turns what an MPU6050's gyroscope tells by 0.1 deg/s for each g."""
-MAX_WANDER_SIGMA: Final = 3.0
-"""What the fixes are off beyond this is no slow error of theirs but the filter's."""
 MAX_TILT_VAR: Final = 3.0
 """A heading of which nothing is known; more would only break the linearisation."""
 
@@ -239,8 +237,7 @@ def inject(s: EskfState) -> None:
         s.gyro_bias_b[k] += d[GYRO_BIAS + k]
         s.accel_bias_b[k] += d[ACCEL_BIAS + k]
         s.gyro_scale_b[k] += d[GYRO_SCALE + k]
-        most = MAX_WANDER_SIGMA * math.sqrt(s.wander_var[k])
-        s.wander_n[k] = max(min(s.wander_n[k] + d[WANDER + k], most), -most)
+        s.wander_n[k] += d[WANDER + k]
         s.mag_bias_b[k] += d[MAG_BIAS + k]
     s.baro_bias_m += d[BARO_BIAS]
     fill(d, 0.0)

@@ -13,7 +13,6 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_velocity import TOLD_NOISE_MPS
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
-from gateway.estimation.compass_lag import late_var
 from gateway.estimation.eskf.covariance import (
     clear,
     consider,
@@ -335,7 +334,7 @@ def update_by_compass(
         consider(s, ACCEL_BIAS, 3)
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
-    noise = repeated * (p.mag_var / weight + late_var(s)) + lasting
+    noise = repeated * p.mag_var / weight + lasting
     off = wrap_pi(measured)
     # What is off beyond the gate lasts as long as any error of the compass.
     noise += repeated * max(off * off / p.gate_sq - innovation_variance(s, noise), 0.0)

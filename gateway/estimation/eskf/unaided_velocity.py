@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.wahba import FLOWN_S, TURN_S
+from gateway.estimation.alignment.wahba import FLOWN_S
 from gateway.estimation.eskf.covariance import level_variance
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import VEL, EskfState
@@ -13,8 +13,6 @@ from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.local_position import past_state
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-HAND_MPS2: Final = 0.5
-"""What pulls more for long is flown."""
 WAY_S: Final = 2.0
 HAND_M: Final = 2.0
 """A hand does not go so far in this time; what does is flown."""
@@ -26,8 +24,6 @@ LEG_S: Final = 10.0
 """A flight that hardly turns is on the same leg for about this time."""
 ASSUMED_S: Final = 5.0
 """Corrections that are older are not taken back."""
-UNAIDED_PULL_MPS2: Final = 0.5
-"""A lasting acceleration of this much halves the belief in standing still."""
 PUSHED_SQ: Final = 9.0
 """Beyond three standard deviations nothing is explained by them."""
 
@@ -41,14 +37,12 @@ def unaided_density(s: EskfState, p: EskfGains) -> float:
     float
         The variance of the speed of about zero that stands in for a sensor, times how long the
         true velocity stays the same, m2/s. A hand's is small and short, but not at once known to
-        be. What flies is as fast as it has shown, by turns or by its way, and the harder it
-        turns, the sooner it is another.
+        be. What flies is as fast as its way has shown, and the harder it turns, the sooner it is
+        another.
     """
-    pull = s.pull_mps2 / UNAIDED_PULL_MPS2
-    hand = p.unaided_var * (1.0 + pull * pull) * UNAIDED_CORRELATION_S
-    turned = TURN_S * max(s.turning_mps2 - HAND_MPS2, 0.0)
+    hand = p.unaided_var * UNAIDED_CORRELATION_S
     leg_s = min(0.5 * math.sqrt(s.unaided_sq) / max(s.turning_mps2, 0.1), LEG_S)
-    return max(hand, s.hand_sq * SWING_S, turned * turned * TURN_S, s.unaided_sq * leg_s)
+    return max(hand, s.hand_sq * SWING_S, s.unaided_sq * leg_s)
 
 
 @compiled
