@@ -27,7 +27,8 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.eskf.measure import compass_row, position_row, velocity_row
+from gateway.estimation.eskf.late_fix import position_row, velocity_row
+from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings

@@ -12,7 +12,7 @@ from gateway.estimation.alignment.gps_velocity import (
 from gateway.estimation.eskf.covariance import propagate
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import POS, EskfState
-from gateway.estimation.eskf.measure import (
+from gateway.estimation.eskf.late_fix import (
     lag_integrals,
     place_distance_sq,
     place_variance,

@@ -8,7 +8,8 @@ from gateway.estimation.alignment.wahba import FLOWN_S
 from gateway.estimation.eskf.covariance import level_variance
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import VEL, EskfState
-from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, lag_integrals, take_back
+from gateway.estimation.eskf.late_fix import lag_integrals
+from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, take_back
 from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.local_position import past_state
 from gateway.units import STANDARD_GRAVITY_MPS2
