@@ -1,4 +1,4 @@
-"""What a calibration leaves in a compass: iron that turns along, found beside GPS."""
+"""What a calibration leaves in a compass: iron that turns along, found by turning."""
 
 import math
 from dataclasses import replace
@@ -17,32 +17,47 @@ from tests.estimation.test_without_compass import (
 )
 
 IRON_UT = 4.0
+LEFT_UT = 2.0
 SETTLED_S = 20.0
 
 
-def field_of(seed: int, heading: np.ndarray) -> np.ndarray:
+def field_of(seed: int, heading: np.ndarray, iron_ut: float) -> np.ndarray:
     """Make what a compass beside iron and of skewed axes tells, 25 times a second, in uT."""
     rng = np.random.default_rng(3000 + seed)
     north, _, down = FIELD_N_UT
     field = np.column_stack([north * np.cos(heading), -north * np.sin(heading)])
     field = np.column_stack([field, np.full(len(heading), down)])
-    field = field @ (np.eye(3) + 0.02 * rng.standard_normal((3, 3))) + rng.normal(0.0, IRON_UT, 3)
+    field = field @ (np.eye(3) + 0.02 * rng.standard_normal((3, 3))) + rng.normal(0.0, iron_ut, 3)
     field += rng.normal(0.0, 0.5, field.shape)
     field[np.arange(len(field)) % 4 != 0] = math.nan
     return np.asarray(field)
 
 
-def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure() -> None:
+def errors_beside_iron(iron_ut: float, *, fixes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Tell how far headings are off beside iron, and what they are told to be, rad."""
     off, told = [], []
     settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
     for seed in SEEDS:
         log, heading = flight(seed, "good")
         imu = np.empty((len(log.imu), IMU_COLUMNS))
         imu[:] = log.imu
-        imu[:, MAG : MAG + 3] = field_of(seed, heading)
-        out = estimator_of("eskf").run(replace(log, imu=imu))
+        imu[:, MAG : MAG + 3] = field_of(seed, heading, iron_ut)
+        count = len(log.gps) if fixes else 0
+        log = replace(log, imu=imu, gps_time_us=log.gps_time_us[:count], gps=log.gps[:count])
+        out = estimator_of("eskf").run(log)
         off.append(heading_off(out, heading)[settled:])
         told.append(out[settled:, NAV_ATTITUDE_STD + 2])
-    errors, std = np.concatenate(off), np.concatenate(told)
+    return np.concatenate(off), np.concatenate(told)
+
+
+def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure() -> None:
+    errors, std = errors_beside_iron(IRON_UT, fixes=True)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
     assert np.mean(errors < 2.0 * std) > 0.88
+
+
+def test_iron_is_found_by_turning_without_gps() -> None:
+    errors, std = errors_beside_iron(LEFT_UT, fixes=False)
+    assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
+    assert np.mean(errors < 2.0 * std) > 0.95
+    assert np.degrees(np.sqrt(np.mean(std**2))) < 5.5

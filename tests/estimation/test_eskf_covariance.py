@@ -64,16 +64,20 @@ def transition(
     return F
 
 
-def test_propagation_is_the_matrix_product(state: EskfState, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("aided", [1, 0])
+def test_propagation_is_the_matrix_product(
+    state: EskfState, rng: np.random.Generator, aided: int
+) -> None:
     force, turn, dt = rng.normal(size=3), rng.normal(size=(3, 3)), 0.02
     scaled = rng.normal(size=(3, 3))
     state.P *= 0.01
     before = state.P.copy()
-    state.pending_s = dt
+    state.pending_s, state.aided = dt, aided
     state.pending_force_n[:], state.pending_turn[:] = force, turn
     state.pending_scaled[:] = scaled
     propagate(state, GAINS)
     F = transition(force, turn, dt, scaled)
+    F[VEL : VEL + 3, TILT + 2] *= aided
     kept = [k for k in range(STATES) if not WANDER <= k < WANDER + 3]
     expected = F @ before @ F.T
     added = state.P - expected

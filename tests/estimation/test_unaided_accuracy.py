@@ -111,7 +111,7 @@ def test_what_force_turns_is_told_until_it_is_found_out() -> None:
     seconds, accel_mps2, runs = 5.0, 2.0 * G, []
     for accel in (0.0, accel_mps2):
         s, row = new_record(EskfState), np.zeros(NAV_COLUMNS)
-        s.started, s.iron_search_started, s.q_nb[0] = 1, 1, 1.0
+        s.started, s.aided_before, s.q_nb[0] = 1, 1, 1.0
         s.P[:] = 1e-4 * np.eye(STATES)
         s.pending_s, s.pending_accel_sq = seconds, accel * accel * seconds
         s.pending_force_n[:] = (0.0, 0.0, -G * seconds)
@@ -125,6 +125,22 @@ def test_what_force_turns_is_told_until_it_is_found_out() -> None:
     assert runs[0] == (runs[1][0], pytest.approx(0.0, abs=1e-15), pytest.approx(0.0, abs=1e-15))
     assert runs[1][1] == pytest.approx((GYRO_BY_FORCE * accel_mps2) ** 2 * seconds)
     assert 0.0 < runs[1][2] < 0.7 * runs[1][1]
+
+
+def test_a_speed_of_about_zero_tells_no_heading(rng: np.random.Generator) -> None:
+    """However hard it accelerates: it would be about zero for any heading."""
+    gains = make_gains(EskfSettings(), ReferenceSettings(), RestSettings(), CompassSettings())
+    s, dt, heading_var = new_record(EskfState), 0.1, 0.1**2
+    s.started, s.q_nb[0] = 1, 1.0
+    s.P[TILT + 2, TILT + 2] = heading_var
+    for _ in range(100):
+        accel = rng.normal(0.0, 5.0, 3) * (1.0, 1.0, 0.0)
+        s.vel_n += accel * dt
+        s.pending_s, s.pending_turn[:] = dt, dt * np.eye(3)
+        s.pending_force_n[:] = (accel - (0.0, 0.0, G)) * dt
+        update_by_velocity(s, gains, 0.2)
+    assert abs(2.0 * s.q_nb[3]) < 0.01
+    assert s.P[TILT + 2, TILT + 2] > heading_var
 
 
 def test_a_heading_without_declination_is_as_good_as_told() -> None:

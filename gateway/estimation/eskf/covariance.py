@@ -86,13 +86,20 @@ def propagate(s: EskfState, p: EskfGains) -> None:
 
 @compiled
 def apply_transition(s: EskfState, P: FloatArray, columns: int) -> None:
-    """Multiply the first columns of `P` by the transition matrix from the left."""
+    """Multiply the first columns of `P` by the transition matrix from the left.
+
+    Unaided, the velocity counts in the frame of the heading that is told: it is assumed to be about
+    zero, which is so for any heading. Else the assumption would seem to tell the heading, the more
+    the harder it accelerates.
+    """
     R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        for j in range(columns):
+    for j in range(columns):
+        for k in range(3):
             P[POS + k, j] += dt * P[VEL + k, j]
-            P[VEL + k, j] += P[TILT + a, j] * f[b] - P[TILT + b, j] * f[a]
+        turn = P[TILT + 2, j] if s.aided == 1 else 0.0
+        P[VEL, j] += P[TILT + 1, j] * f[2] - turn * f[1]
+        P[VEL + 1, j] += turn * f[0] - P[TILT, j] * f[2]
+        P[VEL + 2, j] += P[TILT, j] * f[1] - P[TILT + 1, j] * f[0]
     for i in range(3):
         for k in range(3):
             for j in range(columns):

@@ -75,6 +75,8 @@ class EskfState(FilterState):
     the heading, less the more GPS does."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
+    aided_before: int
+    """1 once GPS has told the velocity: it tells the accelerometer's bias from tilt."""
     iron_norm: float
     """Mean strength of the field in flight, its iron in, uT."""
     iron_along: Annotated[FloatArray, (3,)]

@@ -10,17 +10,23 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.covariance import clear, inject, propagate, update_scalar
+from gateway.estimation.eskf.covariance import clear, inject, propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import MAG_BIAS, TILT, EskfState
 from gateway.estimation.eskf.measure import (
-    COMPASS_CORRELATION_S,
     MISFIT_S,
     STRENGTH_NOISE,
+    compass_correlation_s,
     compass_row,
 )
 from gateway.estimation.kernel_record import as_vec
-from gateway.estimation.magfield import FIELD_TAU_S, FIRST_FIELD_S, PLACE_RAD, STALE_MAG_S
+from gateway.estimation.magfield import (
+    FIELD_TAU_S,
+    FIRST_FIELD_S,
+    PLACE_RAD,
+    STALE_MAG_S,
+    bent_share_sq,
+)
 from gateway.records import Vec3
 
 MEAN_S: Final = 60.0
@@ -29,7 +35,10 @@ MEAN_S: Final = 60.0
 
 @compiled
 def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
-    """Compare the strength of a field with its mean, in flight.
+    """Compare the strength of a field with its mean, in motion.
+
+    Without GPS, iron is looked for within what a calibration leaves: a field that varies by more
+    may be that of the place, since aircraft without GPS are often indoors.
 
     Parameters
     ----------
@@ -42,7 +51,9 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
     dt : float
         Time since the field before, s.
     """
-    if s.iron_search_started == 0 or s.at_rest == 1 or s.aided == 0:
+    if s.iron_search_started == 0 or s.at_rest == 1:
+        return
+    if s.aided == 0 and s.mag_disturbed == 1:
         return
     b = s.mag_bias_b
     c0, c1, c2 = raw[0] - b[0], raw[1] - b[1], raw[2] - b[2]
@@ -59,15 +70,16 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
         off -= (along[k] - s.iron_along[k]) * b[k]
     noise = (STRENGTH_NOISE * s.iron_norm) ** 2
     s.iron_misfit += dt / MISFIT_S * (off * off - s.iron_misfit)
-    if s.iron_misfit > noise:
+    if s.aided == 1 and s.iron_misfit > noise:
         s.iron_doubted = 1
         doubt_iron(s, (s.iron_misfit - noise) * dt / MISFIT_S)
-    if s.iron_doubted == 1:
+    if s.aided == 0 or s.iron_doubted == 1:
+        correlated_s = compass_correlation_s(s)
         propagate(s, p)
         clear(s)
         for k in range(3):
             s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
-        update_scalar(s, off, noise * max(1.0, COMPASS_CORRELATION_S / dt), p.gate_sq)
+        update_scalar(s, off, noise * max(1.0, correlated_s / dt), p.gate_sq)
         inject(s)
 
 
@@ -104,19 +116,46 @@ def doubt_iron(s: EskfState, variance: float) -> None:
 
 
 @compiled
+def start_iron_search(s: EskfState, p: EskfGains) -> None:
+    """Look for iron: without GPS for what a calibration leaves, from the first fix on for any.
+
+    A heading that came from the compass has the iron's error, reversed. Turns tell the iron from
+    the heading: it turns along.
+    """
+    if s.iron_search_started == 0:
+        s.iron_search_started = 1
+        for k in range(MAG_BIAS, MAG_BIAS + 3):
+            renew(s, k, 0.0)
+    left = s.left_iron_ut * s.left_iron_ut
+    variance = left if s.aided == 1 else min(left, p.mag_bias_var)
+    s.left_iron_ut = math.sqrt(left - variance)
+    if s.aided == 1 and has_followed_compass(s):
+        north, east, down = as_vec(s.field_n)
+        level_sq = north * north + east * east
+        share_sq = bent_share_sq(math.atan2(down, math.sqrt(level_sq)), s.earth_dip_rad)
+        variance = max(variance, share_sq * (level_sq + down * down) - s.P[MAG_BIAS, MAG_BIAS])
+    doubt_iron(s, variance)
+
+
+@compiled
 def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
     """Doubt a heading that was read where the aircraft stood, where the field in motion is another.
 
     The floor's iron has turned the one, or motors and currents turn the other: which of both is the
     Earth's, nothing tells before a fix. What they differ by in strength and dip, they may differ by
-    sideways. The doubt fades while the compass is believed in motion.
+    sideways. The doubt fades while the compass is believed in motion. Once it has been for some
+    time, the iron that the calibration left is looked for.
     """
     confirmed = s.field_held_s >= FIRST_FIELD_S or s.iron_search_started == 1
     if s.mag_disturbed == 0 and s.at_rest == 0:
         s.field_held_s += dt
         variance = s.left_iron_ut * s.left_iron_ut
-        variance += dt / FIELD_TAU_S * (p.mag_bias_var - variance)
+        least = p.mag_bias_var if s.iron_search_started == 0 else 0.0
+        variance += dt / FIELD_TAU_S * (least - variance)
         s.left_iron_ut = math.sqrt(variance)
+        if s.iron_search_started == 0 and s.heading_known == 1 and s.field_held_s >= FIRST_FIELD_S:
+            propagate(s, p)
+            start_iron_search(s, p)
     elif s.mag_disturbed == 1 and not confirmed:
         s.field_held_s = 0.0
         norm, usual, turned = s.mag_new_norm, s.mag_norm_ref, s.mag_new_dip - s.mag_dip_ref
@@ -134,9 +173,9 @@ def board_var(s: EskfState) -> float:
 def standing_field_var(s: EskfState) -> float:
     """Return the variance of a heading by iron that nothing tells from it yet, rad2.
 
-    It is one error for as long as the flight lasts, until GPS makes the iron a state of its own.
+    It is one error for as long as it lasts, until the iron is a state of its own.
     """
     level_ut = math.hypot(s.field_n[0], s.field_n[1])
-    if s.iron_search_started == 1 or level_ut == 0.0:
+    if level_ut == 0.0:
         return 0.0
     return (s.left_iron_ut / level_ut) ** 2

@@ -23,7 +23,7 @@ LEFT_LEVEL_VAR: Final = (LEFT_BIAS_MPS2 / STANDARD_GRAVITY_MPS2) ** 2
 @compiled
 def standing_level_var(s: EskfState) -> float:
     """Return the variance of the tilt about a level axis by a bias that nothing tells yet, rad2."""
-    return 0.0 if s.iron_search_started == 1 else LEFT_LEVEL_VAR
+    return 0.0 if s.aided_before == 1 else LEFT_LEVEL_VAR
 
 
 @compiled

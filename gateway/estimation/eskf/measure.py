@@ -36,6 +36,8 @@ UNAIDED_CORRELATION_S: Final = 1.0
 COMPASS_CORRELATION_S: Final = 1.0
 """The errors of soft iron and current change with the attitude, so in about this time: recorded
 compasses were 3 to 5 deg off, for half a second to two."""
+UNAIDED_COMPASS_S: Final = 5.0
+"""Without GPS the tilt is off for as long as this, and the field's dip turns the compass by it."""
 STRENGTH_NOISE: Final = 0.03
 """Share by which the field's strength varies with no iron to find: soft iron, scale, currents."""
 MISFIT_S: Final = 20.0
@@ -60,6 +62,13 @@ def compass_row(s: EskfState, field_n: Vec3) -> None:
 
 
 @compiled
+def compass_correlation_s(s: EskfState) -> float:
+    """Return for how long the errors of the compass are alike, s."""
+    unaided = s.aided == 0 and s.iron_search_started == 1
+    return UNAIDED_COMPASS_S if unaided else COMPASS_CORRELATION_S
+
+
+@compiled
 def unexplained_iron_sq(s: EskfState) -> float:
     """Return the variance, per axis, of what bends the field beyond the iron that is known, uT2."""
     return max(s.iron_misfit - (STRENGTH_NOISE * s.iron_norm) ** 2, 0.0)
@@ -76,7 +85,7 @@ def update_by_compass(
     """
     propagate(s, p)
     before = s.P[TILT + 2, TILT + 2]
-    repeated = max(1.0, COMPASS_CORRELATION_S / dt)
+    repeated = max(1.0, compass_correlation_s(s) / dt)
     measured = declination - math.atan2(field_n[1], field_n[0])
     compass_row(s, field_n)
     if s.aided == 0:

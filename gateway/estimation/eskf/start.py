@@ -15,7 +15,6 @@ from gateway.estimation.eskf.eskf_state import (
     BARO_BIAS,
     GYRO_BIAS,
     GYRO_SCALE,
-    MAG_BIAS,
     POS,
     STATES,
     TILT,
@@ -23,7 +22,7 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.eskf.iron import has_followed_compass
+from gateway.estimation.eskf.iron import start_iron_search
 from gateway.estimation.eskf.level_doubt import doubt_level
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
@@ -36,7 +35,6 @@ from gateway.estimation.filtering.sample_clock import (
 )
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
-from gateway.estimation.magfield import bent_share_sq
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
 from gateway.records import NAN, Vec3
@@ -116,29 +114,6 @@ def start_heading_by_compass(
 
 
 @compiled
-def start_iron_search(s: EskfState) -> None:
-    """Look for iron that the calibration left, once the GPS can tell it from the heading.
-
-    A heading that came from the compass has the iron's error, reversed.
-    """
-    s.iron_search_started = 1
-    by_compass = has_followed_compass(s)
-    variance = s.left_iron_ut * s.left_iron_ut
-    if by_compass:
-        north, east, down = as_vec(s.field_n)
-        level_sq = north * north + east * east
-        share_sq = bent_share_sq(math.atan2(down, math.sqrt(level_sq)), s.earth_dip_rad)
-        variance = max(variance, share_sq * (level_sq + down * down))
-        compass_row(s, as_vec(s.field_n))
-    for k in range(3):
-        renew(s, MAG_BIAS + k, variance)
-        if by_compass:
-            share = s.h[MAG_BIAS + k]
-            set_covariance(s, TILT + 2, MAG_BIAS + k, -share * variance)
-            s.P[TILT + 2, TILT + 2] += share * share * variance
-
-
-@compiled
 def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix alone.
 
@@ -163,11 +138,12 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
-    if s.iron_search_started == 0:
+    if s.aided_before == 0:
+        s.aided_before = 1
         for k in range(3):
             renew(s, GYRO_SCALE + k, p.gyro_scale_var)
         doubt_level(s, p)
-        start_iron_search(s)
+        start_iron_search(s, p)
     s.off_last_m = s.contradiction_m = s.contradiction_mps = 0.0
     s.doubt_vel_sq = s.doubt_pos_sq = 0.0
 
