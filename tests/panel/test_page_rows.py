@@ -1,6 +1,7 @@
 """The rows of the window that the panel stands in for, each on a real page."""
 
 import io
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.edges.operator.control_socket import request
+from gateway.geometry.quaternion import to_euler
 from tests.panel.browsing import (
     START_LIMIT_MS,
     WAIT_MS,
@@ -160,9 +162,10 @@ class TestFlightDisplay:
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = -17.5, 8.3, 123.4
         spoken = re.compile(r"^Roll -17.5°, pitch 8.3°, heading 123.4°,")
         expect(display_of(page)).to_have_attribute("aria-label", spoken)
-        state = page.evaluate("mavgate.state")
-        shown = [state[name] * 57.29578 for name in ("roll_rad", "pitch_rad", "yaw_rad")]
-        assert shown == pytest.approx([-17.5, 8.3, 123.4], abs=0.01)
+        drawn = to_euler(tuple(page.evaluate("mavgate.state.q_nb")))
+        assert [math.degrees(angle) for angle in drawn] == pytest.approx(
+            [-17.5, 8.3, 123.4], abs=0.01
+        )
 
     def test_model_in_3d_is_that_of_the_vehicle_type(self, told: tuple[ToldVehicle, Page]) -> None:
         vehicle, page = told
