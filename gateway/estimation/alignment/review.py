@@ -162,7 +162,8 @@ def is_to_be_taken(
 def flown_level_rad(s: ReviewState) -> float:
     """Return how far a flight may pull the mean force of the pairs from gravity, rad.
 
-    Over any time it gains no more than twice its speed: it turns back.
+    However long it pulls, its velocity v changes by 2 v at most, from one way to the opposite one:
+    so over T the mean pull is 2 v / T at most, and gravity g with it leans by asin(2 v / (g T)).
     """
     share = 2.0 * s.flown_mps / (STANDARD_GRAVITY_MPS2 * max(s.gathered_s, GRAVITY_PAIR_S))
     return math.asin(share) if share < 1.0 else math.pi

@@ -114,5 +114,5 @@ def _text(item: Mapping[str, Any], key: str) -> str:
     return value if isinstance(value, str) else ""
 
 
-def _number(value: Any, otherwise: float = NAN) -> float:
-    return float(value) + 0.0 if isinstance(value, int | float) else otherwise
+def _number(value: Any) -> float:
+    return float(value) + 0.0 if isinstance(value, int | float) else NAN
