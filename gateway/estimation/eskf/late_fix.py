@@ -169,7 +169,7 @@ def place_variance(p: EskfGains, row: FloatArray, k: int) -> float:
 
 @compiled
 def mean_acceleration(s: EskfState, lag: float) -> Vec3:
-    """Return the mean acceleration over the lag, `LEAST_LAG_S` at least, m/s2; uses `then` up."""
+    """Return the mean acceleration over the lag or `LEAST_LAG_S`, m/s2; `then` is overwritten."""
     span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
     if span <= 0.0:
         return (0.0, 0.0, 0.0)
