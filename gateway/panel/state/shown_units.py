@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 UnitSystem = Literal["metric", "imperial", "aviation"]
-Quantity = Literal["speed", "altitude", "climb", "distance", "length", "temperature"]
 
 FT: Final = 0.3048
 KT: Final = 1852 / 3600
