@@ -149,6 +149,7 @@ def test_real_car_in_outages(data_dir: Path) -> None:
     """It drives as quietly as it stands: what is taken for rest would stop it."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
     assert outage_score(flight, run_complementary, 10.0) < 2.1
+    assert outage_score(flight, run_complementary, 30.0) < 7.0
     assert outage_score(flight, run_eskf, 10.0) < 2.1
     assert outage_score(flight, run_eskf, 30.0) < 10.0
 

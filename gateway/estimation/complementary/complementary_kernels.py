@@ -70,6 +70,9 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 EPOCH_S: Final = 0.1
 """Without GPS, the bias is updated this often."""
 
+PULL_MPS2: Final = 0.5
+"""An acceleration of this much, by GPS, shows more in the level than the bias does."""
+
 
 @compiled
 def start(s: ComplementaryState, p: ComplementaryGains) -> None:
@@ -197,7 +200,8 @@ def advance(
         take_gravity(s, rotate(as_quat(s.q_ib), accel), s.gravity_tau_s, dt)
         s.epoch_s += dt
         if s.epoch_s >= EPOCH_S:
-            update_bias(s, p, s.gravity_tau_s, s.epoch_s)
+            if s.by_gps == 0 or s.pull_mps2 < PULL_MPS2:
+                update_bias(s, p, s.gravity_tau_s, s.epoch_s)
             s.epoch_s = 0.0
     dead_reckon(s, accel, dt)
     if s.at_rest == 1 and since_fix > FRESH_GPS_S:
