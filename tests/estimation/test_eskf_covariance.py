@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.eskf.covariance import (
-    MAX_TILT_VAR,
+    NO_HEADING_VAR,
     clear,
     consider,
     propagate,
@@ -130,10 +130,10 @@ def test_a_heading_of_which_nothing_is_known_keeps_its_correlations(
     """A smaller variance alone would make them greater than one, and updates run away."""
     state.P[TILT + 2] *= 100.0
     state.P[:, TILT + 2] *= 100.0
-    assert state.P[TILT + 2, TILT + 2] > MAX_TILT_VAR
+    assert state.P[TILT + 2, TILT + 2] > NO_HEADING_VAR
     state.pending_s = 1e-9
     propagate(state, GAINS)
-    assert state.P[TILT + 2, TILT + 2] == pytest.approx(MAX_TILT_VAR)
+    assert state.P[TILT + 2, TILT + 2] == pytest.approx(NO_HEADING_VAR)
     assert np.linalg.eigvalsh(state.P).min() > -1e-9
 
 

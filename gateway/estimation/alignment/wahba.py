@@ -75,7 +75,7 @@ class AlignmentState(PairSums):
     turning_mps2: float
     """Mean of what gives itself away: of a hand little, of a flight in turns much."""
     flown_mps: float
-    """Fastest speed that GPS has shown of late."""
+    """Fastest speed that GPS has shown; it fades while GPS shows less."""
     pull_mps2: float
     """Level acceleration recently: as GPS tells it, or what gives itself away without."""
     square: Annotated[FloatArray, (2, 4, 4)]

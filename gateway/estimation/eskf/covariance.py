@@ -39,7 +39,7 @@ SCALE_S: Final = 1.0
 """An acceleration keeps its axis in the body for about this time, and its error its sign."""
 GYRO_BY_FORCE: Final = 0.1 * RAD_PER_DEG / STANDARD_GRAVITY_MPS2
 """Force beside gravity turns what an MPU6050's gyroscope tells by 0.1 deg/s for each g."""
-MAX_TILT_VAR: Final = 3.0
+NO_HEADING_VAR: Final = 3.0
 """A heading of which nothing is known; more would only break the linearisation."""
 
 
@@ -76,7 +76,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
         decay(s.P, WANDER + k, kept, s.wander_var[k])
         s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
-    limit_variance(s.P, TILT + 2, MAX_TILT_VAR)
+    limit_variance(s.P, TILT + 2, NO_HEADING_VAR)
     s.pending_s = 0.0
     fill(s.pending_force_n, 0.0)
     for k in range(3):

@@ -15,10 +15,10 @@ from gateway.estimation.columns import (
     NAV_VEL,
     NAV_VEL_STD,
 )
+from gateway.estimation.eskf.covariance import NO_HEADING_VAR
 from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
 from gateway.estimation.eskf.iron import board_var, standing_field_var
 from gateway.estimation.eskf.level_doubt import standing_level_var
-from gateway.estimation.eskf.recovery import NO_HEADING_VAR
 from gateway.estimation.filtering.filter_state import sensor_flags
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,

@@ -12,7 +12,7 @@ from gateway.estimation.alignment.review import (
     tells_heading,
 )
 from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, heading_difference
-from gateway.estimation.eskf.covariance import level_variance, propagate, renew
+from gateway.estimation.eskf.covariance import NO_HEADING_VAR, level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
@@ -25,8 +25,6 @@ ENOUGH_HEADING_RAD: Final = 0.3
 LOST_TILT_VAR: Final = 0.5**2
 HAND_VAR: Final = (0.5 * HAND_MPS) ** 2
 """Of each axis of the velocity where an attitude begins in a hand's motion."""
-NO_HEADING_VAR: Final = 3.0
-"""Of a heading that may be any."""
 OWN_FRAME_VAR: Final = 0.0
 """While no heading is known, it is counted from where the filter began: that it knows."""
 

@@ -8,7 +8,7 @@ from gateway.estimation.alignment.gps_latency import begin_latency, forget_veloc
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS, forget_way
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.compass_lag import begin_lag
-from gateway.estimation.eskf.covariance import propagate, renew, update_scalar
+from gateway.estimation.eskf.covariance import NO_HEADING_VAR, propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
@@ -25,7 +25,7 @@ from gateway.estimation.eskf.eskf_state import (
 from gateway.estimation.eskf.iron import start_iron_search
 from gateway.estimation.eskf.level_doubt import doubt_level
 from gateway.estimation.eskf.measure import compass_row
-from gateway.estimation.eskf.recovery import NO_HEADING_VAR, lose_attitude, turn_heading
+from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
     LONGEST_SILENCE_S,
     begin_clock,
