@@ -28,6 +28,7 @@ from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.terminal import console_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
+from gateway.units import counted
 
 SHOWN: Final = 10
 HEADINGS: Final = {
@@ -162,7 +163,9 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
     judged = COLUMN_OF[metric]
     others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
     names = [*contest.keys, judged, *(name for name in others if name != judged)]
-    title = f"Best of {len(results)} trials, by the {HEADINGS[judged].rpartition(',')[0]}"
+    title = (
+        f"Best of {counted(len(results), 'trial')}, by the {HEADINGS[judged].rpartition(',')[0]}"
+    )
     shown = Table(box=box.SIMPLE_HEAD, title=title)
     for name in names:
         shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
