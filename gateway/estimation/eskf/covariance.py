@@ -180,6 +180,27 @@ def innovation_variance(s: EskfState, variance: float) -> float:
 
 
 @compiled
+def lasting_excess(off: float, explained: float, gate_sq: float, shared: float) -> float:
+    """Return the noise that errs as much as an error which lasts.
+
+    Parameters
+    ----------
+    off, explained : float
+        What of the innovation counts, and the variance that it may have.
+    gate_sq : float
+        Beyond so many times that, it is no noise of a single measurement.
+    shared : float
+        How many measurements share the error.
+
+    Returns
+    -------
+    float
+        Variance; not positive within the gate.
+    """
+    return (off * off / gate_sq - explained) * shared
+
+
+@compiled
 def normalised_innovation_sq(s: EskfState, innovation: float, variance: float) -> float:
     """Return the normalised innovation squared of the row in `h`."""
     rest = residual(s, innovation)

@@ -11,6 +11,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.eskf.covariance import lasting_excess
 from gateway.estimation.eskf.eskf_state import EskfState
 from gateway.records import Vec3
 
@@ -49,29 +50,9 @@ def lag_variance(s: EskfState) -> float:
 
 
 @compiled
-def lasting_excess(
-    off: float, most: float, explained: float, gate_sq: float, since_s: float
-) -> float:
-    """Return the noise that errs as much as an error which lasts.
-
-    Parameters
-    ----------
-    off, most : float
-        Innovation, and what of it counts.
-    explained : float
-        Variance that it may have.
-    gate_sq : float
-        Beyond so many times that, it is a glitch.
-    since_s : float
-        Time between fixes.
-
-    Returns
-    -------
-    float
-        Variance; not positive where there is nothing to doubt.
-    """
-    counts = min(abs(off), most)
-    return (counts * counts / gate_sq - explained) * max(1.0, GLITCH_S / since_s)
+def shared_by(since_s: float) -> float:
+    """Return how many fixes, so long apart, share a glitch."""
+    return max(1.0, GLITCH_S / since_s)
 
 
 @compiled
@@ -80,14 +61,16 @@ def doubt_velocity(s: EskfState, off_mps: float, explained: float, since_s: floa
 
     The true velocity may be either, so the filter's own is told no surer than that.
     """
-    excess = lasting_excess(off_mps, MOST_MPS, explained, VELOCITY_GATE_SQ, since_s)
+    counts = min(abs(off_mps), MOST_MPS)
+    excess = lasting_excess(counts, explained, VELOCITY_GATE_SQ, shared_by(since_s))
     if excess > 0.0:
         s.doubt_vel_sq = max(s.doubt_vel_sq, excess)
-        s.contradiction_mps = max(s.contradiction_mps, min(abs(off_mps), MOST_MPS))
+        s.contradiction_mps = max(s.contradiction_mps, counts)
 
 
 @compiled
 def doubt_position(s: EskfState, off_m: float, explained: float, since_s: float) -> None:
     """Doubt the places of fixes by what one axis is off; see `lasting_excess`."""
-    excess = lasting_excess(off_m, MOST_M, explained, DOUBT_PLACE_SQ, since_s)
+    counts = min(abs(off_m), MOST_M)
+    excess = lasting_excess(counts, explained, DOUBT_PLACE_SQ, shared_by(since_s))
     s.doubt_pos_sq = max(s.doubt_pos_sq, excess)

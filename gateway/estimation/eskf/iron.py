@@ -74,12 +74,11 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
         s.iron_doubted = 1
         doubt_iron(s, (s.iron_misfit - noise) * dt / MISFIT_S)
     if s.aided == 0 or s.iron_doubted == 1:
-        correlated_s = compass_correlation_s(s)
         propagate(s, p)
         clear(s)
         for k in range(3):
             s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
-        update_scalar(s, off, noise * max(1.0, correlated_s / dt), p.gate_sq)
+        update_scalar(s, off, noise * max(1.0, compass_correlation_s(s) / dt), p.gate_sq)
         inject(s)
 
 

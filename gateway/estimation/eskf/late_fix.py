@@ -40,7 +40,7 @@ from gateway.estimation.eskf.fix_doubt import (
 )
 from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
-from gateway.estimation.kernel_record import FloatArray, as_quat
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import STALE_MAG_S
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
@@ -178,13 +178,10 @@ def mean_acceleration(s: EskfState, lag: float) -> Vec3:
 
 
 @compiled
-def delay_variances(s: EskfState, p: EskfGains, a: Vec3) -> tuple[Vec3, Vec3]:
-    """Compute what the jitter of the latency adds to position and velocity, at `a` m/s2."""
-    v, j = s.vel_n, p.gps_jitter_sq
-    return (
-        (j * v[0] * v[0], j * v[1] * v[1], j * v[2] * v[2]),
-        (j * a[0] * a[0], j * a[1] * a[1], j * a[2] * a[2]),
-    )
+def jitter_variances(p: EskfGains, rate: Vec3) -> Vec3:
+    """Compute what the jitter of the latency adds to what changes at this rate, per second."""
+    j = p.gps_jitter_sq
+    return (j * rate[0] * rate[0], j * rate[1] * rate[1], j * rate[2] * rate[2])
 
 
 @compiled
@@ -199,10 +196,10 @@ def place_distance_sq(
         The larger normalised innovation squared of north and east.
     """
     worst = 0.0
-    v, j = s.vel_n, p.gps_jitter_sq
+    late_pos = jitter_variances(p, as_vec(s.vel_n))
     for k in range(2):
         position_row(s, k, once, twice, lag)
-        variance = place_variance(p, row, k) + j * v[k] * v[k]
+        variance = place_variance(p, row, k) + late_pos[k]
         worst = max(worst, normalised_innovation_sq(s, off_pos[k], variance))
     return worst
 
@@ -240,7 +237,7 @@ def update_by_fix(
     s.weighed_s = s.time_s
     accel = mean_acceleration(s, lag)
     fade_doubt(s, accel, since)
-    late_pos, late_vel = delay_variances(s, p, accel)
+    late_pos, late_vel = jitter_variances(p, as_vec(s.vel_n)), jitter_variances(p, accel)
     repeated = max(1.0, p.velocity_correlation_s / since)
     unexpected = lasting_noise_sq(s, accel[0] * accel[0] + accel[1] * accel[1], since)
     noise_vel = (

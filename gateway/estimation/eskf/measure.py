@@ -10,6 +10,7 @@ from gateway.estimation.eskf.covariance import (
     fade_force_turn,
     inject,
     innovation_variance,
+    lasting_excess,
     level_variance,
     propagate,
     update_scalar,
@@ -97,7 +98,8 @@ def update_by_compass(
     noise = repeated * p.mag_var / weight + lasting
     off = wrap_pi(measured)
     # What is off beyond the gate lasts as long as any error of the compass.
-    noise += repeated * max(off * off / p.gate_sq - innovation_variance(s, noise), 0.0)
+    explained = innovation_variance(s, noise)
+    noise += max(lasting_excess(off, explained, p.gate_sq, repeated), 0.0)
     update_scalar(s, off, noise, p.gate_sq)
     s.compass_share = 1.0 - (1.0 - s.compass_share) * s.P[TILT + 2, TILT + 2] / before
     inject(s)
