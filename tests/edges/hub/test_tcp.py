@@ -126,7 +126,7 @@ class TestTcpListen:
         assert hub.clients()[0].bytes_sent < 10_000
 
     async def test_what_the_kernel_joins_does_not_wait_there_either(self, rig: Any) -> None:
-        """Of a link with a wide window it joined 40 kB, 20 s of a link of 2 kB/s."""
+        """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
         hub = rig.hub("tcp-listen:127.0.0.1:0")
         await connect(rig, hub.listening_ports()[0])
         await rig.until(lambda: len(hub.clients()) == 1)

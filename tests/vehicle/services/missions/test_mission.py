@@ -157,7 +157,7 @@ def test_a_client_that_went_back_for_a_late_request_is_taken_from_there(
 
 
 def test_a_begin_that_comes_twice_asks_once(station: GroundStation) -> None:
-    """Each repeated begin led to requests that made MAVSDK go back to the first item for good."""
+    """A request for each makes MAVSDK go back to the first item for good."""
     station.send(count(2))
     assert station.send(count(2)) == []
     assert [m.seq for m in station.send(count(3))] == [0], "another upload"
