@@ -12,7 +12,7 @@ from gateway.units import RAD_PER_DEG
 BIAS_CHANGE_RADPS: Final = 0.15 * RAD_PER_DEG
 """What a gyroscope's bias may change by between rest and flight, by heat and vibration."""
 LEAST_CHANGE_RADPS: Final = 0.05 * RAD_PER_DEG
-FLOWN_S: Final = 20.0
+LEAST_MOTION_S: Final = 20.0
 """A bias is that of a motion which lasted so long."""
 REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
@@ -167,7 +167,7 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
     """
     if s.at_rest == 1:
         change = 0.0
-        if not rested and s.flown_s > FLOWN_S:
+        if not rested and s.flown_s > LEAST_MOTION_S:
             s.flown_known = 1
             write_vec(s.flown_bias_b, bias_b)
             change = largest_difference(bias_b, as_vec(s.gyro_rest))

@@ -17,7 +17,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.wahba import DRIFT_RADPS, UNKNOWN_RAD, AlignmentState
+from gateway.estimation.alignment.wahba import UNKNOWN_RAD, AlignmentState, drift_variance
 from gateway.estimation.kernel_record import FloatArray
 from gateway.geometry.quaternion import rotate_inverse
 from gateway.records import Quat, Vec3
@@ -57,8 +57,7 @@ def heading_evidence(s: AlignmentState, q_ni: Quat, bias_radps: float) -> tuple[
     size = math.hypot(along, across)
     # Two numbers a pair; the fewer there are, the wider is the distribution of what they estimate.
     s.noise_excess = max(1.0, (squares - 2.0 * size) / (2.0 * (s.pairs - FITTED_PAIRS)))
-    drift = (DRIFT_RADPS * 0.5 * s.gathered_s) ** 2
-    variance = s.noise_excess / max(size, 1e-9) + drift
+    variance = s.noise_excess / max(size, 1e-9) + drift_variance(s)
     return (math.atan2(across, along), math.sqrt(min(variance, UNKNOWN_RAD * UNKNOWN_RAD)))
 
 

@@ -40,7 +40,7 @@ PULL_TAU_S: Final = 3.0
 SWING_TAU_S: Final = 1.8
 """Of either of two low-passes, where a hand's swings are to average out."""
 TURNING_TAU_S: Final = 20.0
-FLOWN_S: Final = 30.0
+SPEED_MEMORY_S: Final = 30.0
 """The speed that a flight has shown is to be expected for about this time."""
 TURN_S: Final = 4.0
 """What flies pulls one way for about this time."""
@@ -150,7 +150,7 @@ def align_by_velocity(
     weight = dt * PAIR_WINDOW_S / (2.0 * (noise_mps * noise_mps + late_sq))
     s.pull_mps2 = max(math.hypot(reference[0], reference[1]), PULL_KEPT * s.pull_mps2)
     speed = math.hypot(vel[2], math.hypot(vel[0], vel[1]))
-    s.flown_mps = max(speed, math.exp(-dt / FLOWN_S) * s.flown_mps)
+    s.flown_mps = max(speed, math.exp(-dt / SPEED_MEMORY_S) * s.flown_mps)
     take_pair(s, mean_force(s, force_i, dt), reference, weight, dt)
     begin_pair(s, valid_s, vel, force_i)
     return dt
@@ -284,8 +284,13 @@ def alignment_level_std(s: AlignmentState, excess: float) -> float:
     if s.by_gps == 0:
         # However it is shaken: over the time, the mean force is gravity but for the speed gained.
         variance = min(variance, (HAND_MPS / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
-    drift = (DRIFT_RADPS * 0.5 * s.gathered_s) ** 2
-    return math.sqrt(min(variance + drift, UNKNOWN_RAD * UNKNOWN_RAD))
+    return math.sqrt(min(variance + drift_variance(s), UNKNOWN_RAD * UNKNOWN_RAD))
+
+
+@compiled
+def drift_variance(s: AlignmentState) -> float:
+    """Return the variance by which the gyroscope's frame turns between the pairs and now, rad2."""
+    return (DRIFT_RADPS * 0.5 * s.gathered_s) ** 2
 
 
 @compiled

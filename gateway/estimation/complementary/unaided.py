@@ -26,7 +26,7 @@ from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.geometry.quaternion import rotate
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-FLOWN_S: Final = 20.0
+PULL_MEMORY_S: Final = 20.0
 """What has pulled in this time is to be expected."""
 PULL_TAU_S: Final = 1.5
 """What a hand does averages out in this time."""
@@ -45,7 +45,7 @@ def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None
     dt : float
         Time since the last call, s.
     """
-    share, tau, g = dt / FLOWN_S, s.gravity_tau_s, STANDARD_GRAVITY_MPS2
+    share, tau, g = dt / PULL_MEMORY_S, s.gravity_tau_s, STANDARD_GRAVITY_MPS2
     x, y, z = as_vec(s.rate_b)
     s.unaided_radps += share * (math.sqrt(x * x + y * y + z * z) - s.unaided_radps)
     drift_sq = level_drift_sq(s)

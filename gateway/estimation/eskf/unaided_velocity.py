@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.wahba import FLOWN_S
+from gateway.estimation.alignment.wahba import SPEED_MEMORY_S
 from gateway.estimation.eskf.covariance import level_variance
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import VEL, EskfState
@@ -63,7 +63,7 @@ def watch_way(s: EskfState, dt: float) -> None:
     drift = unsure + PUSHED_SQ * (2.0 * s.hand_sq + pulled_sq)
     flew = s.flies
     s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * drift else 0
-    s.unaided_sq *= math.exp(-dt / FLOWN_S)
+    s.unaided_sq *= math.exp(-dt / SPEED_MEMORY_S)
     s.hand_sq *= math.exp(-dt / SETTLE_S)
     for k in range(6):
         s.assumed[k] *= math.exp(-dt / ASSUMED_S)

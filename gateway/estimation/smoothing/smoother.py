@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.estimation.alignment.latency_of_log import latency_of_flight
-from gateway.estimation.alignment.wahba import FLOWN_S
+from gateway.estimation.alignment.wahba import SPEED_MEMORY_S
 from gateway.estimation.columns import (
     NAV_ALT,
     NAV_ATTITUDE_STD,
@@ -147,7 +147,7 @@ def _hindsight(shown: FloatArray) -> FloatArray:
         For a second pass.
     """
     known = shown.copy()
-    kept = math.exp(-NODE_S / FLOWN_S)
+    kept = math.exp(-NODE_S / SPEED_MEMORY_S)
     for k in range(len(known) - 2, -1, -1):
         known[k, 0] = max(known[k, 0], kept * known[k + 1, 0])
     # What shows a flight is the way of the last seconds.
