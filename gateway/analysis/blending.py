@@ -6,7 +6,6 @@ the reference if there is one.
 """
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -119,7 +118,6 @@ def blend_table(
     fusion: FusionSettings,
     sensed: Sensed,
     interval_s: float,
-    weights: Sequence[float] = WEIGHTS,
 ) -> pd.DataFrame:
     """Fuse a flight with every pair of weights, as in Table I.
 
@@ -132,8 +130,6 @@ def blend_table(
         The flight's filtered samples.
     interval_s : float
         GPS is thinned to one fix in this many seconds; 0 for all.
-    weights : sequence of float
-        Values of alpha and of beta.
 
     Returns
     -------
@@ -142,7 +138,7 @@ def blend_table(
     """
     judge = make_judge(flight, thin(flight, interval_s))
     rows = []
-    for alpha, beta in itertools.product(weights, weights):
+    for alpha, beta in itertools.product(WEIGHTS, repeat=2):
         track = fuse(judge.fused, with_weights(fusion, alpha, beta), sensed)
         rows.append({"alpha": alpha, "beta": beta, **score(track, judge)})
     return pd.DataFrame(rows)

@@ -25,7 +25,6 @@ TIMED_RUNS: Final = 5
 class Response:
     """Frequency response of one filter."""
 
-    kind: Kind
     frequency_hz: FloatArray
     gain_db: FloatArray
     phase_deg: FloatArray
@@ -46,7 +45,6 @@ def response(kind: Kind, settings: SensingSettings, rate_hz: float) -> Response:
     _, h = signal.freqz(b, a, frequency, fs=rate_hz)
     _, delay = signal.group_delay((b, a), frequency, fs=rate_hz)
     return Response(
-        kind=kind,
         frequency_hz=frequency,
         gain_db=20.0 * np.log10(np.maximum(np.abs(h), 1e-12)),
         phase_deg=np.degrees(np.unwrap(np.angle(h))),

@@ -21,7 +21,7 @@ MAX_GAP_S: Final = 2.0
 """Across a longer gap a straight line is no reference for a curved flight."""
 
 
-def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -> FlightTrack:
+def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
     """Interpolate linearly between the fixes, at the times at which they were valid.
 
     Parameters
@@ -30,8 +30,6 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
         In the order of time.
     time_us : ndarray, shape (N,)
         Gateway times to interpolate at.
-    max_gap_s : float
-        Longest time between two fixes that is bridged.
 
     Returns
     -------
@@ -54,7 +52,7 @@ def interpolate(fixes: Fixes, time_us: IntArray, max_gap_s: float = MAX_GAP_S) -
     columns = [fixes.lat_deg, lon_deg, fixes.alt_amsl_m, *fixes.vel_n_mps.T]
     after = np.searchsorted(fixes.valid_us, time_us, side="right").clip(1, len(fixes) - 1)
     gap_s = (fixes.valid_us[after] - fixes.valid_us[after - 1]) / US_PER_S
-    known = (time_us >= fixes.valid_us[0]) & (time_us <= fixes.valid_us[-1]) & (gap_s <= max_gap_s)
+    known = (time_us >= fixes.valid_us[0]) & (time_us <= fixes.valid_us[-1]) & (gap_s <= MAX_GAP_S)
     lat, lon, alt, *vel = (
         np.where(known, np.interp(time_us, fixes.valid_us, column), np.nan) for column in columns
     )

@@ -64,26 +64,17 @@ def determinant(matrix: Matrix3) -> float:
     return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 
 
-def is_rotation(matrix: Matrix3, tolerance: float = 1e-3) -> bool:
+def is_rotation(matrix: Matrix3) -> bool:
     """Return whether the rows are of length one, at right angles and right-handed.
 
-    Parameters
-    ----------
-    matrix : tuple of 3 tuples of 3 floats
-        Rows.
-    tolerance : float
-        Of every product of two rows; a thousandth allows for rows that a person rounded.
-
-    Returns
-    -------
-    bool
+    To a thousandth in every product of two: a person may have rounded them.
     """
     products = (
         (sum(a * b for a, b in zip(matrix[m], matrix[n], strict=True)), float(m == n))
         for m in range(3)
         for n in range(m, 3)
     )
-    return determinant(matrix) > 0.0 and all(abs(p - wanted) <= tolerance for p, wanted in products)
+    return determinant(matrix) > 0.0 and all(abs(p - wanted) <= 1e-3 for p, wanted in products)
 
 
 def _cos_sin(angle_deg: float) -> tuple[float, float]:

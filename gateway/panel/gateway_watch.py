@@ -1,7 +1,6 @@
 """The gateway's status over its control socket, polled once a second for all pages."""
 
 import asyncio
-import logging
 from contextlib import suppress
 from typing import Any, Final
 
@@ -10,8 +9,6 @@ from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.instant import Spot
 from gateway.records import NAN
-
-log = logging.getLogger(__name__)
 
 INTERVAL_S: Final = 1.0
 

@@ -66,7 +66,7 @@ def run_panel(
     control_socket: Path | None,
     on_link: Callable[[str], None],
     *,
-    attached: bool = False,
+    attached: bool,
 ) -> None:
     """Serve the page until interrupted.
 

@@ -33,7 +33,6 @@ TYPING: Final[list[Literal["input", "select", "button", "textarea"]]] = [
 ]
 """Elements in which a key is typed, and is no order."""
 SILENT_S: Final = 3.0
-UNITS: Final = {"metric": "m", "imperial": "mi", "aviation": "kt"}
 THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 
 

@@ -55,11 +55,11 @@ class LocalProcesses:
 
     Parameters
     ----------
-    jobs : int, optional
-        How many; one a core by default.
+    jobs : int or None
+        How many; None for one a core.
     """
 
-    def __init__(self, jobs: int | None = None) -> None:
+    def __init__(self, jobs: int | None) -> None:
         self._jobs = jobs or cores()
 
     def run(

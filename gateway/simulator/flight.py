@@ -89,9 +89,6 @@ class SimulatedFlight:
     """`trajectory.truth_at(times)` is exact anywhere; `imu.truth` and `baro.truth` are it."""
     errors: SensorErrors
     """Its fields are those of a node's calibration."""
-    field_n_ut: FloatArray
-    """Shape (3,), the Earth's magnetic field."""
-    sea_level_pa: float
     imu: ImuSamples
     baro: BaroSamples
     gps: GpsSamples
@@ -186,8 +183,6 @@ def fly(
         vehicle_id=aircraft.vehicle_id,
         trajectory=aircraft.trajectory,
         errors=aircraft.errors,
-        field_n_ut=aircraft.imu.magnetometer.field_n_ut,
-        sea_level_pa=aircraft.baro.barometer.sea_level_pa,
         imu=aircraft.imu.take(duration_s),
         baro=aircraft.baro.take(duration_s),
         gps=aircraft.gps.take(duration_s),

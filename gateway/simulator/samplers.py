@@ -35,8 +35,7 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
 IMU_BOOT_US: Final = 2_718_281
-GPS_BOOT_US: Final = 3_141_592
-"""The nodes' clocks at the start of the simulation."""
+"""The node's clock at the start of the simulation."""
 BARO_PHASE_US: Final = 3_300
 
 

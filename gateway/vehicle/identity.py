@@ -30,7 +30,7 @@ def software_version(version: str) -> int:
     return major << 24 | minor << 16 | patch << 8 | kind
 
 
-def autopilot_version(system_id: int, firmware: int = 0) -> Any:
+def autopilot_version(system_id: int, firmware: int) -> Any:
     """Encode AUTOPILOT_VERSION; the uid tells the vehicles of one gateway apart.
 
     The nodes' firmware stands where an operating system's version does.

@@ -85,7 +85,6 @@ class Vehicle:
         self,
         settings: VehicleSettings,
         system_id: int,
-        vehicle_id: int | None = None,
         *,
         sections: Mapping[str, Settings] | None = None,
         clock: SigningClock | None = None,
@@ -99,9 +98,7 @@ class Vehicle:
         settings : VehicleSettings
             The `[vehicle]` section.
         system_id : int
-            MAVLink system id, 1 to 250.
-        vehicle_id : int, optional
-            The id in the radio payloads, if it is not the system id.
+            MAVLink system id, 1 to 250, which is also the id in the radio payloads.
         sections : mapping of str to Settings, optional
             Other settings of this aircraft that ground stations may change as parameters, by the
             key under which the change comes back.
@@ -113,10 +110,9 @@ class Vehicle:
             What was kept from an earlier run.
         """
         self.system_id = system_id
-        self.vehicle_id = system_id if vehicle_id is None else vehicle_id
         self.refusals = 0
         """Requests to change something that were refused."""
-        self.health = Health(self.vehicle_id, settings.node_silent_s, settings.supply_low_v)
+        self.health = Health(system_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = clock or SigningClock(0)
         self._stamps = stamps or StampBook()
@@ -129,7 +125,7 @@ class Vehicle:
         # Separate, so that strangers cannot use up the quota of other events.
         self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
         self.places = PlaceService(
-            self.vehicle_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
+            system_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
         )
         self._told_home = self.telemetry.home
         home = self.places.home.parameters()
@@ -138,13 +134,13 @@ class Vehicle:
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
         self._intervals = IntervalService(self.system_id, self.telemetry)
         self._parameters = ParameterService(
-            self.vehicle_id, ParameterTable(sections), {HOME_SECTION: self.places}
+            self.system_id, ParameterTable(sections), {HOME_SECTION: self.places}
         )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService(
             {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
         )
-        self._calibrator = Calibrator(self.vehicle_id, lambda: self.in_flight)
+        self._calibrator = Calibrator(self.system_id, lambda: self.in_flight)
         self._recording = RecordingService(self._explain)
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(

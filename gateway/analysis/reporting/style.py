@@ -170,10 +170,10 @@ def legend_outside(figure: Figure, axes: Axes, columns: int) -> None:
     )  # fmt: skip
 
 
-def fit_square(axes: Axes, x: FloatArray, y: FloatArray, margin: float = 0.06) -> None:
+def fit_square(axes: Axes, x: FloatArray, y: FloatArray) -> None:
     """Show all points at one scale in both directions."""
     spread = max(float(np.ptp(x)), float(np.ptp(y)), 1e-9)
-    half = (0.5 + margin) * spread
+    half = 0.56 * spread
     middle_x, middle_y = 0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.min(y) + np.max(y))
     axes.set_xlim(middle_x - half, middle_x + half)
     axes.set_ylim(middle_y - half, middle_y + half)
@@ -189,11 +189,11 @@ def to_svg(figure: Figure) -> str:
     return _tidy(buffer.getvalue())
 
 
-def to_png(figure: Figure, dpi: int = 130) -> bytes:
+def to_png(figure: Figure) -> bytes:
     """Write a figure as a PNG on white."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    figure.savefig(buffer, format="png", dpi=130, facecolor="white")
     return buffer.getvalue()
 
 

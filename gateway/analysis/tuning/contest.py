@@ -46,7 +46,6 @@ Trial = tuple[Values, Mapping[str, float]]
 class Contest:
     """The data shared by all trials; each process gets a copy."""
 
-    flight: Flight
     fusion: FusionSettings
     keys: tuple[str, ...]
     judge: Judge
@@ -95,7 +94,7 @@ def make_contest(
         keep = thin(flight, interval_s)
     elif hold_out:
         keep = withhold(flight, hold_out)
-    return Contest(flight, fusion, tuple(keys), make_judge(flight, keep))
+    return Contest(fusion, tuple(keys), make_judge(flight, keep))
 
 
 def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:

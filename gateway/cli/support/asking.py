@@ -47,7 +47,7 @@ def ask(
         Longest wait, where it is not that of `request`.
     """
     try:
-        return request(_named.get() or find_socket(of), verb, params, timeout_s=wait_s)
+        return request(socket_of(of), verb, params, timeout_s=wait_s)
     except ControlError as error:
         refuse(str(error))
 

@@ -227,9 +227,7 @@ def read_batches(
     yield scanner.feed(b"", final=True)
 
 
-def read_blocks(
-    path: Path, reader: TableReader, progress: Progress | None = None
-) -> Iterator[TableBlock]:
+def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> Iterator[TableBlock]:
     """Read a table block by block; the reader then knows its head."""
     for data in read_chunks(path, progress):
         yield reader.feed_block(data)

@@ -19,7 +19,7 @@ class LiveChart:
         Message and field of each; see `FieldHistory.series`.
     """
 
-    def __init__(self, context: ViewContext, fields: Sequence[str] = ()) -> None:
+    def __init__(self, context: ViewContext, fields: Sequence[str]) -> None:
         self._context = context
         self.fields = list(fields)
         self._sent_us: dict[str, int] = {}

@@ -51,7 +51,6 @@ class LinkView:
                     ("Aircraft", "Heartbeat", "Attitude", "Position", "Messages"),
                     "No aircraft was heard.",
                 )
-        self._counts: dict[int, int] = {}
         context.every(REFRESH_S, self.refresh)
         self.refresh()
 

@@ -85,7 +85,7 @@ class _TuningView:
                 choice.props('dense borderless options-dense aria-label="What is plotted"')
             self._chart = LiveChart(self._context, EFFECTS["attitude"])
             choice.on_value_change(lambda event: self._chart.choose(EFFECTS[event.value]))
-        self._comparison = ComparisonCard(self._context)
+        ComparisonCard(self._context)
 
     def _on_select(self) -> None:
         self._grouped = None

@@ -53,7 +53,7 @@ def group_table(groups: Sequence[GroupErrors]) -> pd.DataFrame:
 
 
 def write_season_page(
-    results: Sequence[FlightResult], folder: Path, compared: Versus | None = None
+    results: Sequence[FlightResult], folder: Path, compared: Versus | None
 ) -> Path:
     """Write the season's page, its figure and its tables into a folder.
 
@@ -62,7 +62,7 @@ def write_season_page(
     results : sequence of FlightResult
         Of `fuse` or `report`.
     folder : Path
-    compared : Versus, optional
+    compared : Versus or None
         The same flights by another version.
 
     Returns

@@ -86,7 +86,7 @@ def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choic
     )
 
 
-def folds_of(groups: Sequence[str], count: int = FOLDS) -> NDArray[np.int64]:
+def folds_of(groups: Sequence[str]) -> NDArray[np.int64]:
     """Deal groups out to folds of about equal numbers of flights; with one group, flights.
 
     Returns
@@ -96,7 +96,7 @@ def folds_of(groups: Sequence[str], count: int = FOLDS) -> NDArray[np.int64]:
     """
     labels = list(groups) if len(set(groups)) > 1 else [str(k) for k in range(len(groups))]
     sizes = Counter(labels)
-    load = [0] * min(count, len(sizes))
+    load = [0] * min(FOLDS, len(sizes))
     fold: dict[str, int] = {}
     for label in sorted(sizes, key=lambda name: (-sizes[name], name)):
         fold[label] = load.index(min(load))

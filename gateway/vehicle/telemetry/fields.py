@@ -51,19 +51,19 @@ def uint16(value: float, unknown: int = UINT16_MAX) -> int:
     return whole(value, 0, UINT16_MAX - (unknown == UINT16_MAX), unknown)
 
 
-def int16(value: float, unknown: int = 0) -> int:
-    """Fit a signed 16-bit field; most of them have no value for unknown."""
-    return whole(value, -INT16_MAX - 1, INT16_MAX - (unknown == INT16_MAX), unknown)
+def int16(value: float) -> int:
+    """Fit a signed 16-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT16_MAX - 1, INT16_MAX, 0)
 
 
-def int32(value: float, unknown: int = 0) -> int:
-    """Fit a signed 32-bit field; most of them have no value for unknown."""
-    return whole(value, -INT32_MAX - 1, INT32_MAX - (unknown == INT32_MAX), unknown)
+def int32(value: float) -> int:
+    """Fit a signed 32-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT32_MAX - 1, INT32_MAX, 0)
 
 
-def uint32(value: float, unknown: int = 0) -> int:
+def uint32(value: float) -> int:
     """Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
-    return whole(value, 0, UINT32_MAX, unknown)
+    return whole(value, 0, UINT32_MAX, 0)
 
 
 def compass_cdeg(angle_rad: float) -> int:

@@ -27,9 +27,9 @@ def off_loop(work: Callable[..., Result], *args: object) -> "asyncio.Future[Resu
     return asyncio.get_running_loop().run_in_executor(_calls, work, *args)
 
 
-def end_calls(within_s: float = GOOD_BYE_S) -> bool:
+def end_calls() -> bool:
     """Let what runs end, take nothing more, and return whether nothing waits any longer."""
     ending = threading.Thread(target=_calls.shutdown, daemon=True)
     ending.start()
-    ending.join(within_s)
+    ending.join(GOOD_BYE_S)
     return not ending.is_alive()

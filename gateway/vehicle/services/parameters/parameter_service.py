@@ -62,17 +62,17 @@ class ParameterService:
         Id in the radio payloads.
     table : ParameterTable
         All of them.
-    own : mapping of str to OwnSection, optional
+    own : mapping of str to OwnSection
         Sections of the table that are not settings. They have no defaults.
     """
 
     types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
 
     def __init__(
-        self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection] | None = None
+        self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection]
     ) -> None:
         self.table = table
-        self._own = own or {}
+        self._own = own
         self._vehicle_id = vehicle_id
         self._lists: dict[int, int] = {}
         """The next parameter of each list that is under way; whose turn it is comes first."""
