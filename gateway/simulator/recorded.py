@@ -48,7 +48,7 @@ from gateway.simulator.sensors import (
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import STANDARD_GRAVITY_MPS2, counted
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
 ROWS: Final = 2048
@@ -136,7 +136,8 @@ class RecordedFlight:
         usable = np.isfinite(columns["time_s"]) & _complete(inertial)
         time_s = columns["time_s"][usable]
         if len(time_s) < 2:
-            raise ValueError(f"{len(time_s)} rows with acceleration and rate; a flight has more")
+            rows = counted(len(time_s), "row")
+            raise ValueError(f"{rows} with acceleration and rate; a flight has more")
         if (np.diff(time_s) <= 0.0).any():
             at_s = time_s[int(np.argmax(np.diff(time_s) <= 0.0)) + 1]
             raise ValueError(f"time_s goes back at {at_s} s")

@@ -19,7 +19,7 @@ from gateway.cli.support.terminal import (
     print_json,
     table_of,
 )
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 PANEL: Final = "A running gateway"
 UNKNOWN: Final = "—"
@@ -133,7 +133,7 @@ def _summary(snapshot: Record) -> str:
     up_s = snapshot["time_us"] // US_PER_S
     receiver = f"{report['port']} {'connected' if report['connected'] else 'not connected'}"
     up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
-    frames = f"{report['frames']} frames, {report['frames_lost']} lost"
+    frames = f"{counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     lines = [f"up {up}, receiver {receiver}, {frames}"]
     lines += [
         f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "

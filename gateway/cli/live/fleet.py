@@ -22,7 +22,7 @@ from gateway.edges.operator.detached_output import detached_output
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.session import NEWEST
 from gateway.routing.endpoint import SITE_NAME
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def status(*, json: JsonOption = False) -> None:
     if found["left_out"]:
         console.print(f"left out by hand: {', '.join(found['left_out'])}")
     if found["overflowed"]:
-        console.print(f"{found['overflowed']} messages came too fast to be taken")
+        console.print(f"{counted(found['overflowed'], 'message')} came too fast to be taken")
     loops = [
         f"{site['looped']} through {site['name']}" for site in found["sites"] if site["looped"]
     ]

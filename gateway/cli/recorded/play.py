@@ -60,6 +60,7 @@ from gateway.player import (
     endpoints_beyond,
     prepare,
 )
+from gateway.units import counted
 
 VIEW_INTERVAL_S: Final = 0.25
 FASTEST: Final = "max"
@@ -293,7 +294,8 @@ def _speed(text: str) -> float:
 
 def _place(status: PlayerStatus) -> str:
     speed = FASTEST if status.speed is None else f"{status.speed:g}x"
-    return f"{status.position_s:.1f} of {status.duration_s:.1f} s, {speed}, {status.sent} frames"
+    sent = counted(status.sent, "frame")
+    return f"{status.position_s:.1f} of {status.duration_s:.1f} s, {speed}, {sent}"
 
 
 def _show(status: dict[str, Any]) -> None:

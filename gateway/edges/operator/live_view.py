@@ -25,7 +25,7 @@ from gateway.geometry.quaternion import to_euler
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.routing.client_table import ClientStats, ListenerStats
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 SILENT_US: Final = 2 * US_PER_S
 LOG_LINES: Final = 5
@@ -176,9 +176,9 @@ def _link_line(snapshot: Snapshot) -> Text:
     line = Text(f"mavgate  up {up}  receiver ")
     state = ("connected", "green") if report.connected else ("not connected", "red")
     line.append(f"{report.port} {state[0]}", style=state[1])
-    line.append(f"  {report.frames} frames, {report.frames_lost} lost on the line")
+    line.append(f"  {counted(report.frames, 'frame')}, {report.frames_lost} lost on the line")
     for kind, count in report.faults:
-        line.append(f", {count} {kind} faults", style="yellow")
+        line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     if report.receiver is not None:
         line.append(f"  channel {report.receiver.channel}")
         line.append(f", noise {report.receiver.noise_percent} %")

@@ -25,6 +25,7 @@ from gateway.flightlog.table.row import (
     WHOLE_COLUMNS,
 )
 from gateway.records import GpsFixType
+from gateway.units import counted
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -119,7 +120,7 @@ def read_cells(line: bytes, width: int, places: Sequence[int] | None) -> list[fl
     """
     texts = line.decode().split(",")
     if len(texts) != width:
-        raise ValueError(f"{len(texts)} cells where there should be {width}")
+        raise ValueError(f"{counted(len(texts), 'cell')} where there should be {width}")
     if places is not None:
         texts = [texts[place] if place >= 0 else "" for place in places]
     return [float(text) if text else np.nan for text in texts]

@@ -24,6 +24,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.units import counted
+
 CLASSES: Final = {kind.msgname: kind for kind in mavlink.mavlink_map.values()}
 NUL: Final = "\0"
 BITMASK: Final = "bitmask"
@@ -157,7 +159,7 @@ def _in(kind: Any, name: str, value: Any) -> Any:
             raise BadMessageError("is a text or an array of characters")
         data = text.rstrip(NUL).encode()
         if len(data) > max(length, 1):
-            raise BadMessageError(f"has more than {max(length, 1)} bytes")
+            raise BadMessageError(f"has more than {counted(max(length, 1), 'byte')}")
         return data if length else data.ljust(1, b"\0")
     if length:
         if not isinstance(value, list) or len(value) != length:

@@ -8,7 +8,7 @@ from nicegui import ui
 from gateway.panel.live_table import Cells, LiveTable, RowButton
 from gateway.panel.page_prompts import confirm, heading, notify_failure
 from gateway.panel.view_context import ViewContext
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
 SILENT_US: Final = 2 * US_PER_S
@@ -151,11 +151,11 @@ def _receiver_line(status: Record) -> str:
     report = status["report"]
     parts = [
         f"{report['port']} {'connected' if report['connected'] else 'NOT CONNECTED'}",
-        f"{report['frames']} frames, {report['frames_lost']} lost on the line",
+        f"{counted(report['frames'], 'frame')}, {report['frames_lost']} lost on the line",
     ]
     if (receiver := report["receiver"]) is not None:
         parts.append(f"channel {receiver['channel']}, noise {receiver['noise_percent']} %")
-    parts += [f"{count} {kind} faults" for kind, count in report["faults"]]
+    parts += [counted(count, f"{kind} fault") for kind, count in report["faults"]]
     return " · ".join(parts)
 
 

@@ -14,6 +14,7 @@ from gateway.season.statistics.season_errors import (
     Versus,
     errors_by_group,
 )
+from gateway.units import counted
 
 ALL: Final = "all"
 
@@ -141,7 +142,7 @@ def _versus_section(compared: Versus) -> Any:
         columns=["recording", "estimator", "then, m", "now, m"],
     )
     lead = (
-        f"{compared.compared} flights were fused by both. A flight is listed as worse where its "
+        f"Both fused {counted(compared.compared, 'flight')}. A flight is listed as worse where its "
         "error grew by more than 5 % and 5 cm."
     )
     tables = [ReportTable("versus", leads, "Errors of now over those of then.")]
