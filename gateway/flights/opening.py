@@ -106,7 +106,7 @@ def open_flights(
 
 
 def lay_out(
-    flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool = False
+    flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool
 ) -> list[PlayedFlight]:
     """Give each vehicle its own system id, and recordings of different days the same start.
 

@@ -35,7 +35,7 @@ def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
 
 def laid_out(files: list[Path], *wished: int) -> list[PlayedFlight]:
     with ExitStack() as opened:
-        return lay_out(open_flights(files, OPTIONS, opened), wished)
+        return lay_out(open_flights(files, OPTIONS, opened), wished, with_commands=False)
 
 
 def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
     lines = [*map(row_to_line, rows[:half]), encode_header(changed), *map(row_to_line, rows[half:])]
     path.write_text(encode_head(header) + "".join(lines))
     with ExitStack() as opened:
-        (flight,) = lay_out(open_flights([path], OPTIONS, opened))
+        (flight,) = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)
         (track,) = flight.tracks
         while not track.prepare(rows[-1].time_us):
             pass

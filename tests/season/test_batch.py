@@ -151,7 +151,11 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_file_that_has_gone_is_said_in_plain_words(season: Path, tmp_path: Path) -> None:
     gone = tmp_path / "gone.csv"
     items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((StoredFile(str(gone)),))]
-    results = run_season(InfoTask(OPTIONS), items, LocalProcesses(1), None, silent)
+    told: list[tuple[str, int, int]] = []
+    results = run_season(
+        InfoTask(OPTIONS), items, LocalProcesses(1), None, lambda *now: told.append(now)
+    )
+    assert [done for _, done, total in told if total == 2] == [1, 2, 2]
     assert [result.error for result in results] == [None, f"{gone}: No such file or directory"]
     assert results[0].began == "2026-05-28 20:26:40"
 
