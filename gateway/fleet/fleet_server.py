@@ -97,6 +97,11 @@ class FleetServer:
         RemoteRecordings(self._session).register(self._control)
 
     @property
+    def control_socket(self) -> Path:
+        """Where it can be asked."""
+        return self._control.path
+
+    @property
     def place(self) -> str:
         """Where the router is, or where this one listens as the router."""
         return self._session.place
