@@ -14,8 +14,7 @@ An upload, seen from here:
 | upload | one further on                  | REQUEST_INT of the one asked for  | upload |
 | upload | the same count before any item  |                                   | upload |
 | upload | any other count of its own      | start again                       | upload |
-| upload | MISSION_COUNT, another client   | ACK denied; after 1.5 s without   | upload |
-|        |                                 | an item it starts its own         |        |
+| upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK, not accepted       |                                   | idle   |
 | upload | 400 ms without the item         | REQUEST_INT again                 | upload |
 | upload | 5 s without one that is missing | ACK cancelled                     | idle   |
@@ -55,9 +54,8 @@ from gateway.vehicle.services.missions.mission_items import (
 )
 
 REPEAT_US: Final = 400_000
-SILENT_US: Final = 1_500_000
-"""An upload that stands still for so long gives way to another client's."""
 GIVE_UP_US: Final = 5 * US_PER_S
+"""Of an upload that stands still; longer than the way there and back on a slow link."""
 CHECKS: Final = 3
 """The last item is asked for so many times more where the ACK may have been lost."""
 KINDS: Final = (MISSION, FENCE, RALLY)
@@ -206,14 +204,14 @@ class MissionService:
         kind, count = request.message.mission_type, request.message.count
         begun = self._upload
         is_own = begun is None or begun.request.client_id == request.client_id
-        if begun is not None and not is_own and now_us - begun.progress_us < SILENT_US:
+        if not is_own:
             return [mission_ack(request, mavlink.MAV_MISSION_DENIED)]
         if kind not in KINDS:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if count > MAX_ITEMS[kind]:
             return [mission_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
         is_same = begun is not None and (begun.kind, begun.count) == (kind, count)
-        if begun is not None and is_own and is_same and not begun.items:
+        if begun is not None and is_same and not begun.items:
             return []
         self._upload = self._finished = None
         if count == 0:

@@ -318,12 +318,23 @@ def test_two_uploads_do_not_mix(station: GroundStation) -> None:
     assert upload(other, [item(0)]) == ACCEPTED
 
 
+def test_an_upload_on_a_slow_link_is_not_taken_over(station: GroundStation) -> None:
+    other = GroundStation(station.vehicle, station.clock, client_id=8, system_id=254)
+    station.send(count(2))
+    for seq in range(2):
+        station.wait(3.0)
+        [denied] = other.send(count(1))
+        assert denied.type == mavlink.MAV_MISSION_DENIED
+        answers = station.send(item(seq))
+    assert answers[0].type == ACCEPTED
+
+
 def test_an_upload_that_stands_still_gives_way(station: GroundStation) -> None:
     """A ground station that was started anew is another client, and its old upload never ends."""
     other = GroundStation(station.vehicle, station.clock, client_id=8, system_id=254)
     station.send(count(2))
     station.send(item(0))
-    station.wait(1.6)
+    station.wait(5.5)
     assert upload(other, [item(0)]) == ACCEPTED
 
 
