@@ -5,9 +5,12 @@ import os
 import pwd
 import shutil
 import socket
+import ssl
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +20,7 @@ from gateway.cli.support.errors import how_to_add
 from gateway.cli.support.warm_up import ENTRY_POINTS, is_kept
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
 from gateway.edges.disk.part_files import free_bytes_near
+from gateway.edges.hub.web.tls_layer import valid_until_s
 from gateway.edges.operator.control_finder import live_sockets
 from gateway.edges.reasons import reason_of
 from gateway.edges.receiver.serial_port import PortNotFoundError, find_port, list_serial_ports
@@ -34,6 +38,8 @@ EXTRAS: Final = {
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0
 """Of one aircraft, tlog and table together."""
+SOON_S: Final = 14 * 86_400
+"""A certificate that ends within this time should have been renewed."""
 
 
 class Grade(StrEnum):
@@ -212,6 +218,28 @@ def _trouble_of(endpoint: Endpoint) -> str:
     return ""
 
 
+def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether the certificates of hub and panel can be used, and for how long."""
+    hub, panel = settings.hub, settings.panel
+    for what, certificate, key in (
+        ("hub.tls_certificate", hub.tls_certificate, hub.tls_key),
+        ("panel.certificate", panel.certificate, panel.certificate_key),
+    ):
+        if not certificate:
+            continue
+        file = Path(certificate).expanduser()
+        try:
+            end_s = valid_until_s(file, Path(key).expanduser() if key else file)
+        except ssl.SSLCertVerificationError as error:
+            yield Diagnosis(Grade.WRONG, what, f"{file}: {error.verify_message}")
+        except OSError as error:
+            yield Diagnosis(Grade.WRONG, what, f"{file}: {reason_of(error)}")
+        else:
+            grade = Grade.GOOD if end_s - time.time() > SOON_S else Grade.NOTE
+            until = datetime.fromtimestamp(end_s, UTC)
+            yield Diagnosis(grade, what, f"{file}, valid until {until:%Y-%m-%d}")
+
+
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check which optional parts are installed."""
     for extra, modules in EXTRAS.items():
@@ -227,5 +255,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     check_disk,
     check_cache,
     check_clock,
+    check_certificates,
     check_extras,
 )

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -157,3 +158,35 @@ def test_the_exit_code_tells_programs(monkeypatch: pytest.MonkeyPatch, grade: Gr
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == (1 if grade is Grade.WRONG else 0)
     assert result.output == f"{grade:5} thing: is so\n"
+
+
+@pytest.mark.parametrize(
+    ("days", "grade", "word"),
+    [
+        (0, Grade.WRONG, "certificate has expired"),
+        (3, Grade.NOTE, "valid until"),
+        (300, Grade.GOOD, "valid until"),
+    ],
+)
+def test_a_certificate_that_ends(
+    settings: GatewaySettings, tmp_path: Path, days: int, grade: Grade, word: str
+) -> None:
+    key, wish, file = (tmp_path / name for name in ("key.pem", "wish.pem", "panel.pem"))
+    curve = ("ec", "-pkeyopt", "ec_paramgen_curve:P-256")
+    made = ("openssl", "req", "-new", "-newkey", *curve, "-nodes", "-subj", "/CN=mavgate")
+    subprocess.run([*made, "-keyout", key, "-out", wish], check=True, capture_output=True)
+    signed = ("openssl", "x509", "-req", "-in", wish, "-signkey", key, "-days", str(days))
+    subprocess.run([*signed, "-out", file], check=True, capture_output=True)
+    panel = replace(settings.panel, certificate=str(file), certificate_key=str(key))
+    found = one(checkup.check_certificates, replace(settings, panel=panel))
+    assert (found.grade, word in found.text) == (grade, True)
+
+
+def test_a_certificate_that_is_none(settings: GatewaySettings, tmp_path: Path) -> None:
+    assert list(checkup.check_certificates(settings)) == []
+    file = tmp_path / "hub.pem"
+    hub = replace(settings.hub, tls_certificate=str(file))
+    missing = one(checkup.check_certificates, replace(settings, hub=hub))
+    file.write_text("no certificate")
+    broken = one(checkup.check_certificates, replace(settings, hub=hub))
+    assert (missing.grade, broken.grade) == (Grade.WRONG, Grade.WRONG)

@@ -96,6 +96,11 @@ def test_link_node_aircraft_and_client_are_shown() -> None:
         assert part in text
 
 
+def test_a_single_frame_is_one_frame() -> None:
+    once = msgspec.structs.replace(REPORT, frames=1)
+    assert " 1 frame, " in text_of(replace(SNAPSHOT, report=once))
+
+
 def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
     far = msgspec.structs.replace(
         FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6

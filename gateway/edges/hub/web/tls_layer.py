@@ -73,6 +73,11 @@ class TlsLayer:
         """Return the bytes to send at once."""
         return self._outward.read()
 
+    def peer_valid_until_s(self) -> float:
+        """Return when the verified certificate of the peer ends, in s since 1970."""
+        found = self._stream.getpeercert() or {}
+        return ssl.cert_time_to_seconds(str(found["notAfter"]))
+
 
 def server_context(settings: HubSettings) -> ssl.SSLContext:
     """Return the context of a listening port; a replaced certificate is read again.
@@ -102,6 +107,34 @@ def caller_context(settings: HubSettings) -> ssl.SSLContext:
     return ssl.create_default_context(cafile=Path(settings.tls_authority).expanduser())
 
 
+def valid_until_s(certificate: Path, key: Path) -> float:
+    """Return when a certificate ends, in s since 1970.
+
+    It is shown to a client that trusts it, whoever signed it: Python reads no other.
+
+    Parameters
+    ----------
+    certificate, key : Path
+        PEM files; both may be the same.
+
+    Raises
+    ------
+    OSError
+        If the files cannot be read or are invalid; ssl.SSLCertVerificationError if the certificate
+        is not valid now.
+    """
+    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    trusting.check_hostname = False
+    trusting.verify_flags = ssl.VERIFY_X509_PARTIAL_CHAIN
+    trusting.load_verify_locations(certificate)
+    server, client = TlsLayer(_presenting(certificate, key)), TlsLayer(trusting, "localhost")
+    sent = b""
+    while not client.is_open:
+        _, asked = client.feed(sent)
+        _, sent = server.feed(asked)
+    return client.peer_valid_until_s()
+
+
 @functools.lru_cache(maxsize=4)
 def _server_context(
     certificate: Path,
@@ -109,6 +142,10 @@ def _server_context(
     key: Path,
     key_ns: int,  # noqa: ARG001
 ) -> ssl.SSLContext:
+    return _presenting(certificate, key)
+
+
+def _presenting(certificate: Path, key: Path) -> ssl.SSLContext:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     # Never ask for a password: a daemon has no terminal.
     context.load_cert_chain(certificate, key, password="")
