@@ -1,5 +1,6 @@
 """Who may reach the page: tested on the guard alone, before an application that grants all."""
 
+import contextlib
 import http
 import logging
 import subprocess
@@ -8,9 +9,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse
-from starlette.types import Receive, Scope, Send
+from starlette.responses import PlainTextResponse, Response
+from starlette.types import Message, Receive, Scope, Send
 
 from gateway.panel.panel_server import PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
@@ -85,6 +87,28 @@ async def test_head_is_answered_as_get_is() -> None:
     async with client_of(guard) as client:
         answer = await client.head("/")
     assert answer.headers["content-length"] == str(len("GET"))
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+async def test_a_browser_that_leaves_unanswered_is_no_error(leaves: bool) -> None:
+    async def says_nothing(scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect" if leaves else "http.request"}
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    async def pass_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        return await call_next(request)
+
+    guard = guarded()
+    guard.app = BaseHTTPMiddleware(says_nothing, pass_on)
+    head = [(b"host", b"127.0.0.1:14590")]
+    scope = {"type": "http", "method": "GET", "path": "/favicon.ico", "headers": head}
+    with contextlib.nullcontext() if leaves else pytest.raises(RuntimeError):
+        await guard(scope, receive, send)
 
 
 @pytest.mark.parametrize(

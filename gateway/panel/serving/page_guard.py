@@ -145,7 +145,7 @@ class PageGuard:
             await send(message)
 
         try:
-            await self.app(scope, counted, dressed)
+            await _answer(self.app, scope, counted, dressed)
         except _TooLargeError:
             if not begun:
                 await answer(scope, receive, send)
@@ -187,6 +187,24 @@ class PageGuard:
             secure=self._secure,
         )
         return response
+
+
+async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Let a request be answered, unless the browser leaves meanwhile."""
+    left = False
+
+    async def heard() -> Message:
+        nonlocal left
+        message = await receive()
+        left = message["type"] == "http.disconnect"
+        return message
+
+    try:
+        await app(scope, heard, send)
+    except RuntimeError:
+        # Starlette's middleware misses an answer that nobody waits for any more.
+        if not left:
+            raise
 
 
 async def _refuse(

@@ -189,4 +189,7 @@ def test_a_certificate_that_is_none(settings: GatewaySettings, tmp_path: Path) -
     missing = one(checkup.check_certificates, replace(settings, hub=hub))
     file.write_text("no certificate")
     broken = one(checkup.check_certificates, replace(settings, hub=hub))
-    assert (missing.grade, broken.grade) == (Grade.WRONG, Grade.WRONG)
+    assert missing == Diagnosis(
+        Grade.WRONG, "hub.tls_certificate", f"{file}: No such file or directory"
+    )
+    assert "no certificate" in broken.text.replace(str(file), "").lower()
