@@ -189,8 +189,7 @@ class Uplink:
                 except TimeoutError:
                     continue
                 if result != mavlink.MAV_RESULT_ACCEPTED:
-                    word = mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")
-                    raise CommandFailedError(f"{name or number}: {word.lower().replace('_', ' ')}")
+                    raise CommandFailedError(f"{name or number}: {_word_of(result)}")
                 return
         finally:
             self._acks.pop((system_id, number), None)
@@ -295,6 +294,13 @@ async def _outcome(results: asyncio.Queue[int]) -> int:
         async with asyncio.timeout(PROGRESS_TIMEOUT_S):
             result = await results.get()
     return result
+
+
+def _word_of(result: int) -> str:
+    known = mavlink.enums["MAV_RESULT"].get(result)
+    if known is None:
+        return f"result {result}"
+    return str(known.name).removeprefix("MAV_RESULT_").lower().replace("_", " ")
 
 
 def _trusting(url: str) -> str:

@@ -12,7 +12,14 @@ from gateway.edges.clock import GatewayClock
 from gateway.panel import uplink as panel_uplink
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture, Origin
-from gateway.panel.uplink import ACK_TIMEOUT_S, PROGRESS_TIMEOUT_S, SYSTEM_ID, Uplink
+from gateway.panel.uplink import (
+    ACK_TIMEOUT_S,
+    PROGRESS_TIMEOUT_S,
+    SYSTEM_ID,
+    CommandFailedError,
+    Uplink,
+)
+from tests.panel.messages import decoded
 
 pytestmark = pytest.mark.io
 LIMIT_S = 60.0
@@ -117,3 +124,19 @@ async def test_command_that_is_being_carried_out_is_waited_for_longer(
     monkeypatch.setattr(asyncio, "timeout", timeout)
     assert await panel_uplink._outcome(results) == result
     assert limits_s == [ACK_TIMEOUT_S, PROGRESS_TIMEOUT_S, PROGRESS_TIMEOUT_S]
+
+
+@pytest.mark.parametrize(
+    ("result", "word"), [(mavlink.MAV_RESULT_TEMPORARILY_REJECTED, "temporarily"), (200, "200")]
+)
+async def test_any_result_that_is_not_accepted_is_a_failure(
+    tmp_path: Path, result: int, word: str
+) -> None:
+    uplink = Uplink(None, FleetPicture(), ControlClient(tmp_path / "none.sock"), GatewayClock())
+    waits = asyncio.ensure_future(uplink.command(1, mavlink.MAV_CMD_LOGGING_START))
+    await asyncio.sleep(0)
+    uplink._note_ack(
+        decoded(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_LOGGING_START, result))
+    )
+    with pytest.raises(CommandFailedError, match=word):
+        await waits

@@ -73,6 +73,16 @@ def test_mark_is_found_from_distance_and_bearing(vehicle: VehiclePicture) -> Non
     assert vehicle.instant(0).mark == Spot(1.0, 2.0, 3.0)
 
 
+def test_what_cannot_be_is_not_known(vehicle: VehiclePicture) -> None:
+    vehicle.take(decoded(mavlink.MAVLink_attitude_message(0, math.inf, 0, 0, 1, 0, 0)), 0)
+    vehicle.take(position(214.0, 8.0), 0)
+    way = mavlink.MAVLink_nav_controller_output_message(0, 0, 90, 90, 1113, 0, 0, 0)
+    vehicle.take(decoded(way), 0)
+    now = vehicle.instant(0)
+    assert all(math.isnan(value) for value in now.q_nb)
+    assert (now.rate_b_radps, now.mark, now.mark_distance_m) == ((1, 0, 0), None, 1113.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "model"),
     [(1, "plane"), (2, "copter"), (13, "copter"), (4, "heli"), (19, "plane"), (26, "none")],

@@ -14,6 +14,7 @@ from gateway.panel.state.instant import Instant, Spot
 from gateway.panel.state.status_texts import StatusTexts
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
+from gateway.vehicle.client_place import is_on_earth
 
 DEGE7: Final = 1e7
 MM: Final = 1e3
@@ -176,7 +177,9 @@ class VehiclePicture:
             return q_nb, _rates(quaternion)
         if angles is None:
             return UNKNOWN_QUAT, UNKNOWN_VEC3
-        return from_euler(angles.roll, angles.pitch, angles.yaw), _rates(angles)
+        turned = (angles.roll, angles.pitch, angles.yaw)
+        q_nb = from_euler(*turned) if all(map(math.isfinite, turned)) else UNKNOWN_QUAT
+        return q_nb, _rates(angles)
 
     def _pos_std_m(self) -> float:
         """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
@@ -196,6 +199,8 @@ class VehiclePicture:
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
         if self.exact_mark is not None:
             return self.exact_mark, distance_m, bearing_deg
+        if not is_on_earth(place.lat / DEGE7, place.lon / DEGE7):
+            return None, distance_m, bearing_deg
         lat_deg, lon_deg = vincenty.vreckon(
             place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
         )

@@ -108,19 +108,20 @@ class ParameterClient:
         Raises
         ------
         ValueError
-            If there is no such parameter, or the value is not a number.
+            If there is no such parameter, or the value is no number that it can hold.
         """
         entry = self.entries.get(name)
         if entry is None:
             raise ValueError(f"aircraft {self.system_id} has no parameter {name}")
         if not math.isfinite(value):
             raise ValueError(f"{name}: {value} is not a number")
+        message = self._set_message(entry, value)
         self.refused.pop(name, None)
         if (unanswered := self._changes.get(name)) is not None:
             unanswered.newer = value
             return []
         self._changes[name] = _Change(value, now_us + QUIET_US)
-        return [self._set_message(entry, value)]
+        return [message]
 
     def take(self, message: Any, now_us: int) -> None:
         """Process one message of the vehicle; only those about parameters matter."""
@@ -201,7 +202,12 @@ class ParameterClient:
                 change.value, change.newer = change.newer, None
             change.attempts += 1
             change.due_us = now_us + QUIET_US
-            found.append(self._set_message(self.entries[name], change.value))
+            try:
+                found.append(self._set_message(self.entries[name], change.value))
+            except ValueError as error:
+                # The vehicle tells another type than it did.
+                del self._changes[name]
+                self.refused[name] = str(error)
         return found
 
     def _decoded(self, value: float, kind: int) -> float:
@@ -212,8 +218,11 @@ class ParameterClient:
 
     def _set_message(self, entry: ParameterEntry, value: float) -> Any:
         code = INTEGER_CODES.get(entry.kind) if self.bytewise else None
-        if code is not None:
-            value = struct.unpack("<f", struct.pack(code, round(value)))[0]
+        try:
+            packed = struct.pack(code, round(value)) if code else struct.pack("<f", value)
+        except (struct.error, OverflowError):
+            raise ValueError(f"{entry.name} cannot hold {value:g}") from None
+        value = struct.unpack("<f", packed)[0]
         return mavlink.MAVLink_param_set_message(
             self.system_id, AUTOPILOT, entry.name.encode(), value, entry.kind
         )

@@ -117,6 +117,23 @@ def test_nonsense_is_not_sent() -> None:
     client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
     with pytest.raises(ValueError, match="not a number"):
         client.change("P", math.nan, 0)
+    with pytest.raises(ValueError, match="P cannot hold"):
+        client.change("P", 1e39, 0)
+    assert not client.pending
+
+
+def test_a_value_must_fit_the_type() -> None:
+    client = ParameterClient(1)
+    client.take(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3), 0)
+    client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 6, 1, 0), 0)
+    with pytest.raises(ValueError, match="N cannot hold"):
+        client.change("N", 1e10, 0)
+    assert client.change("N", 300.0, 0)
+    # Changed again, and then the vehicle tells of another type.
+    client.change("N", 301.0, 0)
+    client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 1, 1, 0), 0)
+    assert client.poll(2 * US_PER_S) == []
+    assert client.refused == {"N": "N cannot hold 301"}
 
 
 def test_integers_travel_as_the_vehicle_has_them() -> None:
