@@ -286,7 +286,10 @@ def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
 def test_a_catalogue_that_cannot_be_written_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, message: str
 ) -> None:
-    def fail(*_: object) -> None:
+    opened = []
+
+    def fail(catalogue: Catalogue) -> None:
+        opened.append(catalogue._db)
         (tmp_path / CATALOGUE_NAME).touch()
         error = sqlite3.OperationalError("no luck")
         error.sqlite_errorcode = code
@@ -295,6 +298,8 @@ def test_a_catalogue_that_cannot_be_written_says_what_to_do(
     monkeypatch.setattr(Catalogue, "_make", fail)
     with pytest.raises(CatalogueError, match=f"no luck; .*{message}"):
         Catalogue(tmp_path)
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        opened[0].execute("SELECT 1")
     with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)
 

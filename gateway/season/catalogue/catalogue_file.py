@@ -3,7 +3,7 @@
 import sqlite3
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, get_type_hints
@@ -87,16 +87,16 @@ class Catalogue:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CATALOGUE_NAME
-        with _told(self.path):
-            self._db = sqlite3.connect(self.path, timeout=BUSY_S)
+        with _told(self.path), ExitStack() as opened:
+            self._db = opened.enter_context(closing(sqlite3.connect(self.path, timeout=BUSY_S)))
             if not self._is_made():
                 self._make()
+            opened.pop_all()
 
     def close(self) -> None:
         """Keep what was added."""
-        with _told(self.path):
+        with _told(self.path), closing(self._db):
             self._db.commit()
-        self._db.close()
 
     def known(self) -> dict[str, tuple[int, int, str]]:
         """Return size, time of modification and digest of every file."""
