@@ -4,6 +4,7 @@ import asyncio
 import errno
 import logging
 import math
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -74,6 +75,8 @@ def test_the_first_start_runs_as_python_until_the_machine_code_comes(
     machine = []
     while compiling.take_one():
         machine.append([name for name, p in points.items() if quotient(p, 1.0, 0.0) == math.inf])
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, signal.SIGINT)  # The terminal's: it is for the parent to end.
     assert [len(names) for names in machine] == [1, 2, 3, 4]
     assert machine[0] == [SCANNER]
     assert set(machine[1]) == {SCANNER, "eskf"}

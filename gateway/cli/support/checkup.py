@@ -132,7 +132,7 @@ def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
     if all(map(is_kept, ENTRY_POINTS)):
         yield Diagnosis(Grade.GOOD, "estimators", "compiled")
         return
-    text = "the next start compiles the estimators: telemetry waits for the chosen one alone"
+    text = "the next start compiles them, and they cost more computing for a minute"
     yield Diagnosis(Grade.NOTE, "estimators", text)
 
 

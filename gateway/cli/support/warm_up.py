@@ -141,8 +141,8 @@ class Compilation:
 
 
 def _compile(names: Sequence[str], sender: Connection) -> None:
-    # The parent reports an interrupt.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # The parent ends it. A dead one it would report as a compiler that has failed.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(BEHIND)
     # The collector would take a fifth of the time.
     gc.disable()
