@@ -41,7 +41,12 @@ from gateway.estimation.complementary.reorientation import (
 )
 from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown, take_gravity
 from gateway.estimation.filtering.roughness import collect_roughness
-from gateway.estimation.filtering.sample_clock import begin_clock, is_silent, step_clock
+from gateway.estimation.filtering.sample_clock import (
+    begin_clock,
+    is_silent,
+    mean_over_step,
+    step_clock,
+)
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
@@ -150,6 +155,7 @@ def take_imu(
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
+        gyro, accel = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
     if row[CLIPPED] != 0.0:
         doubt_clipped(s, dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)

@@ -38,7 +38,7 @@ from gateway.estimation.eskf.start import (
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
 from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.filtering.roughness import collect_roughness
-from gateway.estimation.filtering.sample_clock import is_silent, step_clock
+from gateway.estimation.filtering.sample_clock import is_silent, mean_over_step, step_clock
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
@@ -141,6 +141,7 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
+        gyro, accel = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
     if not sound_gyro:
         gyro = rate_instead(s, as_vec(s.gyro_bias_b))
     if not sound_accel:

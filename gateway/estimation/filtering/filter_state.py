@@ -71,6 +71,8 @@ class FilterState(
     base_us: int
     time_us: int
     """Time of the newest sample, and of the one that `time_s` counts from."""
+    usual_step_s: float
+    """Time from sample to sample, on average; 0 before the second."""
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
     silent_s: float

@@ -12,6 +12,10 @@ from gateway.records import Vec3
 
 LONGEST_SILENCE_S: Final = 60.0
 """What moved and turned for longer may be anywhere: more tells no more, but breaks a covariance."""
+USUAL_STEP_SHARE: Final = 0.01
+"""Of the newest step in the usual one: it is an average over a hundred samples."""
+LOST_STEPS: Final = 1.5
+"""Samples further apart than so many usual steps had others between them."""
 
 
 @compiled
@@ -54,6 +58,49 @@ def step_clock(s: FilterState, time_us: int) -> float:
         return dt
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
     return dt
+
+
+@compiled
+def mean_over_step(
+    s: FilterState, gyro_before: Vec3, accel_before: Vec3, gyro: Vec3, accel: Vec3, dt: float
+) -> tuple[Vec3, Vec3]:
+    """Return the mean rate and force since the sample before, where samples between were lost.
+
+    A sample tells the usual step before it; over what is missing they changed evenly.
+
+    Parameters
+    ----------
+    s : FilterState
+        Follows the usual step.
+    gyro_before, accel_before, gyro, accel : tuple of 3 floats
+        The sample before and the newest one, in body FRD.
+    dt : float
+        Time between them, s.
+
+    Returns
+    -------
+    tuple of 2 vectors
+        In rad/s and m/s2.
+    """
+    if s.usual_step_s == 0.0:
+        s.usual_step_s = dt
+    s.usual_step_s += USUAL_STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
+    # After a silence, the sample before is not of the begin of this step.
+    if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
+        return (gyro, accel)
+    share = 0.5 * (1.0 - s.usual_step_s / dt)
+    return (
+        (
+            gyro[0] + share * (gyro_before[0] - gyro[0]),
+            gyro[1] + share * (gyro_before[1] - gyro[1]),
+            gyro[2] + share * (gyro_before[2] - gyro[2]),
+        ),
+        (
+            accel[0] + share * (accel_before[0] - accel[0]),
+            accel[1] + share * (accel_before[1] - accel[1]),
+            accel[2] + share * (accel_before[2] - accel[2]),
+        ),
+    )
 
 
 @compiled
