@@ -43,6 +43,10 @@ in the place of another leaves most, or more than there are, one with strong iro
 LIKE_NORM_SHARE: Final = 0.04
 LIKE_DIP_RAD: Final = 0.035
 """A field this much stronger or steeper than usual counts half."""
+USUAL_DIP_RAD: Final = 74.0 * RAD_PER_DEG
+"""Up to this dip of either sign a compass tells the heading as well as usual."""
+LEAST_LEVEL: Final = 1e-3
+"""Least share of a field's strength that counts as level."""
 
 
 class CompassSettings(Settings, frozen=True):
@@ -251,6 +255,17 @@ def compare_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: flo
         s.mag_reject_s += dt
         return 0.0
     return REJECT_SHARE
+
+
+@compiled
+def steepness(dip_rad: float) -> float:
+    """Return by what the dip of the field multiplies the variance of a heading by compass.
+
+    Iron, scale and currents bend a field by a share of its strength; the less of it lies level, the
+    more that turns the heading. 1 up to `USUAL_DIP_RAD`, of either sign.
+    """
+    share = math.cos(USUAL_DIP_RAD) / max(math.cos(dip_rad), LEAST_LEVEL)
+    return max(1.0, share * share)
 
 
 @compiled

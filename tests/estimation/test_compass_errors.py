@@ -4,8 +4,16 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import IMU_COLUMNS, MAG, NAV_ATTITUDE_STD
+from gateway.estimation.columns import (
+    GPS_DECLINATION,
+    GPS_DIP,
+    IMU_COLUMNS,
+    MAG,
+    NAV_ATTITUDE_STD,
+)
 from tests.estimation.test_receiver_noise import FIELD_N_UT
 from tests.estimation.test_without_compass import (
     RATE_HZ,
@@ -15,10 +23,15 @@ from tests.estimation.test_without_compass import (
     flight,
     heading_off,
 )
+from tools.flights import simulated_flight
+from tools.score_estimators import OWN, attitude_scores
+from tools.score_honesty import share, two_sigma
 
 IRON_UT = 4.0
 LEFT_UT = 2.0
 SETTLED_S = 20.0
+ARCTIC_UT, ARCTIC_DIP_RAD = 58.0, math.radians(88.0)
+ARCTIC_IRON_UT = np.array([0.3, -0.25, 0.31])
 
 
 def field_of(seed: int, heading: np.ndarray, iron_ut: float) -> np.ndarray:
@@ -61,3 +74,26 @@ def test_iron_is_found_by_turning_without_gps() -> None:
     assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
     assert np.mean(errors < 2.0 * std) > 0.95
     assert np.degrees(np.sqrt(np.mean(std**2))) < 5.5
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_steep_field_tells_little_of_the_heading_and_nothing_of_the_level(name: str) -> None:
+    """What bends the field a little turns its level part far."""
+    flight = simulated_flight(603, calibrated=True)
+    imu, gps = flight.log.imu.copy(), flight.log.gps.copy()
+    dip_rad, declination_rad = np.nanmedian(gps[:, [GPS_DIP, GPS_DECLINATION]], axis=0)
+    q = Rotation.from_quat(flight.q_nb, scalar_first=True)
+    north = np.array([math.cos(declination_rad), math.sin(declination_rad), 0.0])
+    usual_ut = np.nanmedian(np.linalg.norm(imu[:, MAG : MAG + 3], axis=1))
+    usual, steep = (
+        ut * (math.cos(dip) * north + (0.0, 0.0, math.sin(dip)))
+        for ut, dip in ((usual_ut, dip_rad), (ARCTIC_UT, ARCTIC_DIP_RAD))
+    )
+    imu[:, MAG : MAG + 3] += q.inv().apply(steep - usual) + ARCTIC_IRON_UT
+    gps[:, GPS_DIP] = ARCTIC_DIP_RAD
+    flight = replace(flight, log=replace(flight.log, imu=imu, gps=gps))
+    out = OWN[name](flight)
+    found, within = attitude_scores(flight, out[:, :4]), two_sigma(flight, out)
+    assert found["heading"] < 1.0
+    assert found["inclination"] < 1.0
+    assert min(share(within["tilt"]), share(within["heading"])) > 0.95

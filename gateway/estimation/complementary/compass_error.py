@@ -13,7 +13,13 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.magfield import MIN_FIELD_UT, PLACE_RAD, SETTLE_S, bent_share_sq
+from gateway.estimation.magfield import (
+    MIN_FIELD_UT,
+    PLACE_RAD,
+    SETTLE_S,
+    bent_share_sq,
+    steepness,
+)
 from gateway.records import Vec3
 
 IRON_TAU_S: Final = 60.0
@@ -49,6 +55,8 @@ def compass_variance(s: ComplementaryState, p: ComplementaryGains) -> tuple[floa
     averages out over the turns.
     """
     variance, iron = p.heading_noise_rad**2, steady_iron_variance(s)
+    if s.level_dip_s > 0.0:
+        variance *= steepness(s.level_dip_rad)
     level_ut = s.strength_ut * math.cos(s.level_dip_rad)
     if level_ut > MIN_FIELD_UT and s.level_by_gps == 1:
         iron += s.strength_var_ut2 / (level_ut * level_ut)

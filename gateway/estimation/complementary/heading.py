@@ -26,7 +26,7 @@ from gateway.estimation.complementary.drift import (
     heading_variance,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, take_field
+from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, steepness, take_field
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -81,7 +81,8 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if s.heading_known == 0:
         s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
     innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
-    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2
+    dip = s.mag_dip_ref if s.mag_norm_ref > 0.0 else math.asin(down / norm)
+    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 * steepness(dip)
     if s.level_by_gps == 0:
         # A level that is off turns the field for as long, the more the steeper it is.
         steep = math.tan(s.mag_dip_ref)

@@ -56,6 +56,7 @@ from gateway.estimation.magfield import (
     STALE_MAG_S,
     field_unlikeness,
     is_field_told,
+    steepness,
     take_field,
 )
 from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, outruns, watch_rest
@@ -308,7 +309,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
         return
     if s.heading_known == 0:
         turn_rad = declination - math.atan2(field[1], field[0])
-        start_heading_by_compass(s, p, field, turn_rad, p.mag_var / weight)
+        start_heading_by_compass(s, p, field, turn_rad, p.mag_var * steepness(dip) / weight)
         s.heading_true = 1 if known else 0
     elif s.time_s - s.mag_used_s >= COMPASS_S:
         since = min(s.time_s - s.mag_used_s, STALE_MAG_S)

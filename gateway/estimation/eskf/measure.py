@@ -27,6 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.kernel_record import as_quat, as_vec
+from gateway.estimation.magfield import steepness
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
 
@@ -95,7 +96,8 @@ def update_by_compass(
         consider(s, ACCEL_BIAS, 3)
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
-    noise = repeated * p.mag_var / weight + lasting
+    steep = steepness(math.atan2(field_n[2], math.sqrt(level_sq)))
+    noise = repeated * steep * p.mag_var / weight + lasting
     off = wrap_pi(measured)
     # What is off beyond the gate lasts as long as any error of the compass.
     explained = innovation_variance(s, noise)
