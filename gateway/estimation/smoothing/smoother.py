@@ -261,7 +261,8 @@ def _correct(
         lat_deg = float(out[np.argmax(aided), NAV_LAT])
         meridian_m, parallel_m = radii_m(lat_deg, 0.0)
         out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
-        out[aided, NAV_LON] += np.degrees(off[aided, POS + 1] / parallel_m)
+        lon_deg = out[aided, NAV_LON] + np.degrees(off[aided, POS + 1] / parallel_m)
+        out[aided, NAV_LON] = (lon_deg + 180.0) % 360.0 - 180.0
         out[aided, NAV_ALT] -= off[aided, POS + 2]
     variance = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
     # The axes are off for a whole flight; averages do not lessen that.
