@@ -95,6 +95,8 @@ class EskfState(FilterState):
     """Mean square of the speed that has shown itself where no GPS tells it, per axis, m2/s2."""
     assumed: Annotated[FloatArray, (6,)]
     """What the speed of about zero has lately corrected: attitude in rad, velocity in m/s."""
+    assumed_bias: Annotated[FloatArray, (3,)]
+    """The same of the gyroscope's bias, rad/s."""
     pushed_mps: float
     """Speed to which a steady force would have pushed by now, were it no tilt."""
     flies: int

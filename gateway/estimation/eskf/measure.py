@@ -131,6 +131,8 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
     for k in range(6):
         s.assumed[k] += s.dx[TILT + k]
+    for k in range(3):
+        s.assumed_bias[k] += s.dx[GYRO_BIAS + k]
     fade_force_turn(s, level)
     inject(s)
 
@@ -142,6 +144,12 @@ def take_back(s: EskfState) -> None:
         s.dx[TILT + k] = -s.assumed[k]
         s.P[TILT + k, TILT + k] += s.assumed[k] * s.assumed[k]
         s.assumed[k] = 0.0
+    for k in range(3):
+        more = s.assumed_bias[k] * s.assumed_bias[k]
+        s.dx[GYRO_BIAS + k] = -s.assumed_bias[k]
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += more
+        s.bias_raised[k] += more
+        s.assumed_bias[k] = 0.0
     inject(s)
 
 

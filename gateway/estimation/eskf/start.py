@@ -33,7 +33,7 @@ from gateway.estimation.filtering.sample_clock import (
     silent_rate,
     silent_variance,
 )
-from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
+from gateway.estimation.kernel_record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
@@ -138,6 +138,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
+    fill(s.assumed_bias, 0.0)
     if s.aided_before == 0:
         s.aided_before = 1
         for k in range(3):
