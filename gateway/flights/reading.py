@@ -313,7 +313,7 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
 def table_of_rows(
     rows: Iterator[TableRow],
     options: ReadOptions,
-    vehicle_id: int,
+    vehicle_id: int = 1,
     unix_us_at_zero: int | None = None,
 ) -> RecordedTable:
     """Give rows of another program the head of a table, with the current settings.
