@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import ACCEL, CLIPPED, GPS_COLUMNS, GYRO, IMU_COLUMNS, MAG
+from gateway.estimation.columns import (
+    ACCEL,
+    CLIPPED,
+    GPS_COLUMNS,
+    GYRO,
+    IMU_COLUMNS,
+    MAG,
+    NAV_FLAGS,
+)
 from gateway.estimation.kernel import SampleLog
+from gateway.records import NavFlags
 from tests.estimation.samples import G
 from tests.estimation.test_without_compass import estimator_of
 
@@ -15,18 +24,20 @@ RATE_HZ = 100
 SECONDS, STANDS_S = 60.0, 5.0
 SWING_HZ, SWING_RAD = 0.4, 1.2
 LOST_S, EVERY_S = 0.1, 0.7
+LONG_S, LONG_EVERY_S = 0.6, 6.7
+SLOW_HZ = 0.2
 
 
-def swinging() -> tuple[SampleLog, Rotation]:
+def swinging(swing_hz: float = SWING_HZ) -> tuple[SampleLog, Rotation]:
     """Swing about the forward axis to and fro, after a rest; each sample tells its own instant."""
     t = np.arange(0.0, SECONDS, 1.0 / RATE_HZ)
-    phase = 2.0 * math.pi * SWING_HZ * np.clip(t - STANDS_S, 0.0, None)
+    phase = 2.0 * math.pi * swing_hz * np.clip(t - STANDS_S, 0.0, None)
     roll = SWING_RAD * (1.0 - np.cos(phase)) / 2.0
     truth = Rotation.from_rotvec(np.outer(roll, [1.0, 0.0, 0.0]))
     imu = np.full((len(t), IMU_COLUMNS), math.nan)
     imu[:, ACCEL : ACCEL + 3] = truth.inv().apply([0.0, 0.0, -G])
     imu[:, GYRO : GYRO + 3] = 0.0
-    imu[:, GYRO] = math.pi * SWING_HZ * SWING_RAD * np.sin(phase)
+    imu[:, GYRO] = math.pi * swing_hz * SWING_RAD * np.sin(phase)
     imu[:, : GYRO + 3] += np.random.default_rng(3).normal(0.0, 1e-3, (len(t), 6))
     imu[:, MAG : MAG + 3] = truth.inv().apply([21.0, 0.0, 43.0])
     imu[:, CLIPPED] = 0.0
@@ -38,16 +49,38 @@ def swinging() -> tuple[SampleLog, Rotation]:
     return log, truth
 
 
+def tilt_errors_deg(name: str, log: SampleLog, truth: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Run an estimator; tell how far its tilt is off, and whether it says that it knows it."""
+    out = estimator_of(name).run(log)
+    off = Rotation.from_quat(out[:, :4], scalar_first=True) * truth.inv()
+    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
+    valid = (out[:, NAV_FLAGS].astype(int) & NavFlags.ATTITUDE_VALID) != 0
+    return np.degrees(2.0 * np.arccos(np.hypot(w, z).clip(max=1.0))), valid
+
+
+def without(log: SampleLog, keep: np.ndarray) -> SampleLog:
+    return SampleLog(
+        log.imu_time_us[keep], log.imu[keep], log.baro_time_us, log.baro_alt_m, log.gps_time_us,
+        log.gps,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", ["complementary", "eskf"])
 def test_what_turned_while_samples_were_lost_is_told_by_both_ends(name: str) -> None:
     log, truth = swinging()
     keep = (log.imu_time_us * 1e-6) % EVERY_S >= LOST_S
-    log = SampleLog(
-        log.imu_time_us[keep], log.imu[keep], log.baro_time_us, log.baro_alt_m, log.gps_time_us,
-        log.gps,
-    )  # fmt: skip
-    out = estimator_of(name).run(log)
-    off = Rotation.from_quat(out[:, :4], scalar_first=True) * truth[keep].inv()
-    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
-    tilt = np.degrees(2.0 * np.arccos(np.hypot(w, z).clip(max=1.0)))
-    assert np.sqrt(np.mean(tilt[log.imu_time_us > 2e6 * STANDS_S] ** 2)) < 0.5
+    log = without(log, keep)
+    tilt_deg, _ = tilt_errors_deg(name, log, truth[keep])
+    assert np.sqrt(np.mean(tilt_deg[log.imu_time_us > 2e6 * STANDS_S] ** 2)) < 0.5
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_silence_beyond_half_a_second_is_bridged_by_both_ends_too(name: str) -> None:
+    """Nor is a tilt told as known that is not."""
+    log, truth = swinging(SLOW_HZ)
+    keep = ((log.imu_time_us * 1e-6) % LONG_EVERY_S >= LONG_S) | (log.imu_time_us < 2e6 * STANDS_S)
+    log = without(log, keep)
+    tilt_deg, valid = tilt_errors_deg(name, log, truth[keep])
+    after = log.imu_time_us > 2e6 * STANDS_S
+    assert np.sqrt(np.mean(tilt_deg[after] ** 2)) < 3.0
+    assert tilt_deg[after & valid].max() < 10.0

@@ -29,7 +29,7 @@ from gateway.estimation.complementary.drift import (
     raise_bias_variance,
 )
 from gateway.estimation.complementary.heading import is_heading_good, take_mag
-from gateway.estimation.complementary.intake import bridge_gap, take_gps
+from gateway.estimation.complementary.intake import bridge_silence, take_gps
 from gateway.estimation.complementary.navigation import (
     dead_reckon,
     stand_still,
@@ -148,7 +148,7 @@ def take_imu(
             forget_times(s)
         return
     if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
-        bridge_gap(s, p, dt)
+        bridge_silence(s, p, gyro, accel, dt)
         write_attitude_std(s)
         return
     gyro_before, accel_before = as_vec(s.gyro_held), as_vec(s.accel_held)

@@ -23,7 +23,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import doubt_sensors, raise_attitude_variance
-from gateway.estimation.complementary.manoeuvre import take_fix_velocity
+from gateway.estimation.complementary.manoeuvre import LEVEL_STD_RAD, take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
     doubt_height,
@@ -35,7 +35,7 @@ from gateway.estimation.complementary.reorientation import (
     lose_attitude,
     review_attitude,
 )
-from gateway.estimation.complementary.tilt import refresh
+from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown
 from gateway.estimation.filtering.fix_intake import (
     accept_fix,
     is_fix_told,
@@ -48,7 +48,10 @@ from gateway.estimation.filtering.fix_intake import (
 )
 from gateway.estimation.filtering.sample_clock import (
     LONGEST_SILENCE_S,
+    end_silence,
+    is_end_told,
     is_rest_silent,
+    is_turn_lost,
     silence_before,
     silent_rate,
     silent_variance,
@@ -72,24 +75,61 @@ SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)
 def bridge_gap(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, level anew from here; lost where it turned."""
     dt = min(dt, LONGEST_SILENCE_S)
-    s.sound_s = 0.0
     still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-    for k in range(3):
-        s.pos_n[k] += s.vel_n[k] * dt
-    begin_level(s)
-    s.pair_s = NEVER_S
-    if not still:
-        turn_rad = rotate(as_quat(s.q_nb), rate)[2] * dt
-        s.heading_rad = wrap_pi(s.heading_rad + turn_rad)
-        half = 0.5 * turn_rad
-        turn = (math.cos(half), 0.0, 0.0, math.sin(half))
-        write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
+    turn_rad = rotate(as_quat(s.q_nb), rate)[2] * dt
+    go_straight_on(s, turn_rad, dt)
+    s.silent_turn_rad += turn_rad
+    s.heading_rad = wrap_pi(s.heading_rad + turn_rad)
     raise_attitude_variance(s, math.sqrt(silent_variance(s, GAP_TILT_RATE + turning, dt)))
-    if s.silent_rad > GAP_LOST_RAD and not still:
+    if is_turn_lost(s, still):
         lose_attitude(s, p)
     refresh(s)
+
+
+@compiled
+def bridge_silence(
+    s: ComplementaryState, p: ComplementaryGains, gyro: Vec3, accel: Vec3, dt: float
+) -> None:
+    """Go on at the sample that ends a silence, `dt` after the last sample or fix."""
+    if not is_end_told(s, gyro, accel):
+        bridge_gap(s, p, dt)
+        return
+    q_nb, bias_b = as_quat(s.q_nb), as_vec(s.bias_b)
+    mean, std = end_silence(s, q_nb, bias_b, gyro, GAP_TILT_RATE)
+    if std > GAP_LOST_RAD:
+        bridge_gap(s, p, dt)
+        if s.silent_rad <= GAP_LOST_RAD:
+            lose_attitude(s, p)
+        return
+    go_straight_on(s, rotate(q_nb, silent_rate(s, bias_b))[2] * dt, dt)
+    s.heading_rad = wrap_pi(s.heading_rad - s.silent_turn_rad)
+    strapdown(s, mean, s.gap_s)
+    refresh(s)
+    more_sq = max(std * std - s.silent_rad * s.silent_rad, 0.0)
+    raise_attitude_variance(s, math.sqrt(more_sq))
+    s.silent_rad = s.silent_turn_rad = 0.0
+    write_vec(s.gyro_held, gyro)
+    write_vec(s.accel_held, accel)
+    if s.lost == 0:
+        hold_level(s)
+        # As sure of the level as a mean over so long.
+        s.force_lp_s = s.gravity_tau_s / (1.0 + (std / LEVEL_STD_RAD) ** 2)
+        if s.level_by_gps == 0:
+            s.unaided_level_sq += more_sq
+
+
+@compiled
+def go_straight_on(s: ComplementaryState, turn_rad: float, dt: float) -> None:
+    """Let place and velocity go on in a silence; level, pairs and history begin anew."""
+    s.sound_s = 0.0
+    s.pair_s = NEVER_S
+    half = 0.5 * turn_rad
+    for k in range(3):
+        s.pos_n[k] += s.vel_n[k] * dt
+    write_vec(s.vel_n, rotate((math.cos(half), 0.0, 0.0, math.sin(half)), as_vec(s.vel_n)))
+    begin_level(s)
 
 
 @compiled

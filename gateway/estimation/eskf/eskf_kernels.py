@@ -29,6 +29,7 @@ from gateway.estimation.eskf.recovery import (
 from gateway.estimation.eskf.start import (
     begin,
     bridge_gap,
+    bridge_silence,
     end_dead_reckoning,
     forget_times,
     restart_baro,
@@ -111,7 +112,7 @@ def take_imu(
             forget_times(s)
         return
     if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
-        bridge_gap(s, p, dt)
+        bridge_silence(s, p, gyro, accel, dt)
         return
     sound = move(s, gyro, accel, row[CLIPPED], dt)
     if row[CLIPPED] != 0.0:

@@ -7,6 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS, forget_way
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -29,14 +30,23 @@ from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
     LONGEST_SILENCE_S,
     begin_clock,
+    end_silence,
+    is_end_told,
     is_rest_silent,
+    is_turn_lost,
     silent_rate,
     silent_variance,
 )
 from gateway.estimation.kernel_record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.sensor_faults import is_sound, is_start
-from gateway.geometry.quaternion import from_euler, multiply, normalise, rotate
+from gateway.geometry.quaternion import (
+    from_euler,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+)
 from gateway.records import NAN, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -203,14 +213,62 @@ def end_dead_reckoning(s: EskfState, p: EskfGains) -> None:
 def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     """Go on after a silence: on in the same turn, and less sure; lost where it turned."""
     dt = min(dt, LONGEST_SILENCE_S)
-    propagate(s, p)
-    s.sound_s = 0.0
     still = is_rest_silent(s)
     rate = silent_rate(s, as_vec(s.gyro_bias_b))
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-    flown = GAP_TILT_RATE if s.aided == 1 else GAP_HAND_RATE
-    turned_var = silent_variance(s, GAP_REST_RATE if still else flown + turning, dt)
-    turn_on(s, rotate(as_quat(s.q_nb), rate)[2] * dt)
+    turned_rad = GAP_REST_RATE if still else wander_rate(s) + turning
+    turn_rad = rotate(as_quat(s.q_nb), rate)[2] * dt
+    turn_on(s, turn_rad)
+    s.silent_turn_rad += turn_rad
+    go_straight_on(s, p, silent_variance(s, turned_rad, dt), dt)
+    s.rest_unsure = 1 if still else 0
+    if is_turn_lost(s, still):
+        lose_attitude(s, p)
+
+
+@compiled
+def bridge_silence(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Go on at the sample that ends a silence, `dt` after the last sample or fix."""
+    if not is_end_told(s, gyro, accel):
+        bridge_gap(s, p, dt)
+        return
+    q_nb, b, e = as_quat(s.q_nb), as_vec(s.gyro_bias_b), as_vec(s.gyro_scale_b)
+    mean, std = end_silence(s, q_nb, b, gyro, wander_rate(s))
+    if std > GAP_LOST_RAD:
+        bridge_gap(s, p, dt)
+        if s.silent_rad <= GAP_LOST_RAD:
+            lose_attitude(s, p)
+        return
+    dt = min(dt, LONGEST_SILENCE_S)
+    turn_rad = rotate(q_nb, silent_rate(s, b))[2] * dt
+    turn_on(s, turn_rad)
+    turn_heading(s, -turn_rad - s.silent_turn_rad)
+    rate = (
+        mean[0] - b[0] - e[0] * mean[0],
+        mean[1] - b[1] - e[1] * mean[1],
+        mean[2] - b[2] - e[2] * mean[2],
+    )
+    carry_frame(s, rate, s.gap_s)
+    turn = from_rotation_vector((rate[0] * s.gap_s, rate[1] * s.gap_s, rate[2] * s.gap_s))
+    write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
+    go_straight_on(s, p, max(std * std - s.silent_rad * s.silent_rad, 0.0), dt)
+    s.rest_unsure = 0
+    s.silent_s = s.silent_rad = s.silent_turn_rad = 0.0
+    write_vec(s.gyro_held, gyro)
+    write_vec(s.accel_held, accel)
+
+
+@compiled
+def wander_rate(s: EskfState) -> float:
+    """Return by how much it may turn in a silence beside the turn that it was in, rad/s."""
+    return GAP_TILT_RATE if s.aided == 1 else GAP_HAND_RATE
+
+
+@compiled
+def go_straight_on(s: EskfState, p: EskfGains, turned_var: float, dt: float) -> None:
+    """Let place and velocity go on in a silence, and be less sure of all."""
+    propagate(s, p)
+    s.sound_s = 0.0
     before_sq = s.silent_s * s.silent_s
     s.silent_s += dt
     silent_sq = s.silent_s * s.silent_s
@@ -226,9 +284,6 @@ def bridge_gap(s: EskfState, p: EskfGains, dt: float) -> None:
     s.pair_s = NEVER_S
     s.rest_s = 0.0
     s.at_rest = 0
-    s.rest_unsure = 1 if still else 0
-    if s.silent_rad > GAP_LOST_RAD and not still:
-        lose_attitude(s, p)
 
 
 @compiled

@@ -73,12 +73,20 @@ class FilterState(
     """Time of the newest sample, and of the one that `time_s` counts from."""
     usual_step_s: float
     """Time from sample to sample, on average; 0 before the second."""
+    turning_sq: float
+    """Mean square of the angular rate of late, of one axis, (rad/s)2."""
+    imu_s: float
+    """Time of the newest sample."""
+    gap_s: float
+    """Time from the sample before to the newest one."""
     heading_true: int
     """1 if the declination was known or the GPS gave the heading."""
     silent_s: float
     """How long a silence of the IMU has lasted since it began, or since the last fix in it."""
     silent_rad: float
     """How far the attitude may have turned in a silence of the IMU that has not ended, else 0."""
+    silent_turn_rad: float
+    """How far the heading has been turned on in such a silence, rad."""
     silent_rest: int
     """1 while such a silence goes on that began at rest."""
     declination_rad: float

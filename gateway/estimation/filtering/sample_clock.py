@@ -1,14 +1,23 @@
 """The clock of a filter: its begin, its step from sample to sample, and silences."""
 
+import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.review import GAP_S
+from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState
-from gateway.estimation.kernel_record import write_vec
+from gateway.estimation.kernel_record import as_vec, write_vec
 from gateway.estimation.magfield import begin_turn
-from gateway.estimation.sensor_faults import UNKNOWN_HOLD_S, is_hanging, is_sound
-from gateway.records import Vec3
+from gateway.estimation.sensor_faults import (
+    ACCEL_LIMIT_MPS2,
+    GYRO_LIMIT_RADPS,
+    UNKNOWN_HOLD_S,
+    is_blank,
+    is_hanging,
+    is_sound,
+)
+from gateway.geometry.quaternion import rotate_inverse
+from gateway.records import Quat, Vec3
 
 LONGEST_SILENCE_S: Final = 60.0
 """What moved and turned for longer may be anywhere: more tells no more, but breaks a covariance."""
@@ -16,6 +25,13 @@ USUAL_STEP_SHARE: Final = 0.01
 """Of the newest step in the usual one: it is an average over a hundred samples."""
 LOST_STEPS: Final = 1.5
 """Samples further apart than so many usual steps had others between them."""
+RATE_TAU_S: Final = 0.3
+"""An angular rate is another one after this time: between that of a hand, or of a multirotor in the
+wind, and that of what flies on wings."""
+TURNING_S: Final = 5.0
+"""How much turns is averaged over this time."""
+STEADY_S: Final = 1.0
+"""What turned in a longer silence, both ends of it do not tell."""
 
 
 @compiled
@@ -54,9 +70,10 @@ def step_clock(s: FilterState, time_us: int) -> float:
     if dt <= 0.0:
         s.fault = 1
         if dt < -GAP_S:
-            s.base_us, s.time_us, s.time_s = time_us, time_us, 0.0
+            s.base_us, s.time_us, s.time_s, s.imu_s = time_us, time_us, 0.0, 0.0
         return dt
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    s.gap_s, s.imu_s = min(s.time_s - s.imu_s, LONGEST_SILENCE_S), s.time_s
     return dt
 
 
@@ -71,7 +88,7 @@ def mean_over_step(
     Parameters
     ----------
     s : FilterState
-        Follows the usual step.
+        Follows the usual step, and how much turns.
     gyro_before, accel_before, gyro, accel : tuple of 3 floats
         The sample before and the newest one, in body FRD.
     dt : float
@@ -85,6 +102,8 @@ def mean_over_step(
     if s.usual_step_s == 0.0:
         s.usual_step_s = dt
     s.usual_step_s += USUAL_STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
+    newest_sq = (gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]) / 3.0
+    s.turning_sq += min(dt / TURNING_S, 1.0) * (newest_sq - s.turning_sq)
     # After a silence, the sample before is not of the begin of this step.
     if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
         return (gyro, accel)
@@ -123,13 +142,15 @@ def is_silent(
         Time since the sample before, s.
     """
     may_rest = is_sound(gyro, p.bias_limit_radps) and not moving
-    hangs = dt <= GAP_S and is_hanging(s, gyro, accel, may_rest, dt)
-    if dt > GAP_S or hangs:
+    # What fixes have lost in it, the sample at its end does not bring back.
+    silent_s = dt if s.lost == 1 else s.gap_s
+    hangs = silent_s <= GAP_S and is_hanging(s, gyro, accel, may_rest, dt)
+    if silent_s > GAP_S or hangs:
         # Samples that are lost on their way are no fault of the sensors.
         s.fault = 1 if hangs else 0
         begin_turn(s, (0.0, 0.0, 0.0))
         return True
-    s.silent_s, s.silent_rad, s.silent_rest = 0.0, 0.0, 0
+    s.silent_s, s.silent_rad, s.silent_turn_rad, s.silent_rest = 0.0, 0.0, 0.0, 0
     return False
 
 
@@ -168,3 +189,83 @@ def silent_variance(s: FilterState, radps: float, dt: float) -> float:
     before = s.silent_rad
     s.silent_rad += radps * dt
     return s.silent_rad * s.silent_rad - before * before
+
+
+@compiled
+def is_turn_lost(s: FilterState, still: bool) -> bool:
+    """Return whether a silence of which no end is told has lost the attitude.
+
+    One that is young may still be bridged by the sample at its end.
+    """
+    young = GAP_S < s.time_s - s.imu_s < STEADY_S
+    return bool(s.silent_rad > GAP_LOST_RAD and not still and not young)
+
+
+@compiled
+def is_end_told(s: FilterState, gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether a sample ends a silence in motion, so that it tells where that ended."""
+    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    moved = s.gap_s > GAP_S and not is_rest_silent(s)
+    return bool(moved and sound and not is_blank(gyro, accel))
+
+
+@compiled
+def turn_of(s: FilterState, q_nb: Quat, bias_b: Vec3) -> Vec3:
+    """Return the rate of the turn about down that the aircraft is in, in body FRD, rad/s."""
+    x, y, z = rotate_inverse(q_nb, (0.0, 0.0, 1.0))
+    g = s.gyro_lp
+    about = x * (g[0] - bias_b[0]) + y * (g[1] - bias_b[1]) + z * (g[2] - bias_b[2])
+    return (x * about, y * about, z * about)
+
+
+@compiled
+def end_silence(
+    s: FilterState, q_nb: Quat, bias_b: Vec3, gyro: Vec3, wander_radps: float
+) -> tuple[Vec3, float]:
+    """Tell the turn over a silence by both its ends, and how far that may be off.
+
+    The rate wanders about the turn that it was in: an Ornstein-Uhlenbeck process of the variance
+    `v` and the time constant `tau`. Over the time `T`, what either end differs from that turn by
+    counts for `tau tanh(T / 2 tau)`, and given both ends the angle has the variance
+    `2 v tau (T - 2 tau tanh(T / 2 tau))`. In a long silence, another turn may have begun.
+
+    Parameters
+    ----------
+    s : FilterState
+        How long it was, and how much has turned before.
+    q_nb : tuple of 4 floats
+        Attitude; the turn that it was in is about down.
+    bias_b : tuple of 3 floats
+        Of the gyroscope, rad/s.
+    gyro : tuple of 3 floats
+        Newest sample in body FRD, rad/s, bias still in.
+    wander_radps : float
+        By how much it may turn beside the turn that it was in.
+
+    Returns
+    -------
+    mean : tuple of 3 floats
+        Rate over the whole silence, rad/s, bias still in.
+    std : float
+        Standard deviation of the angle about one axis, rad.
+    """
+    gap_s, before, turn = s.gap_s, as_vec(s.gyro_held), turn_of(s, q_nb, bias_b)
+    steady = (bias_b[0] + turn[0], bias_b[1] + turn[1], bias_b[2] + turn[2])
+    ends_s = RATE_TAU_S * math.tanh(0.5 * gap_s / RATE_TAU_S)
+    share, ends_sq = ends_s / gap_s, 0.0
+    for k in range(3):
+        ends_sq += 0.5 * ((before[k] - steady[k]) ** 2 + (gyro[k] - steady[k]) ** 2)
+    # What turns is most often about one axis.
+    variance = max(s.turning_sq, ends_sq)
+    turned_sq = 2.0 * variance * RATE_TAU_S * (gap_s - 2.0 * ends_s)
+    rate = silent_rate(s, bias_b)
+    turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    begun = (wander_radps + turning) * max(gap_s - STEADY_S, 0.0)
+    return (
+        (
+            steady[0] + share * (before[0] + gyro[0] - 2.0 * steady[0]),
+            steady[1] + share * (before[1] + gyro[1] - 2.0 * steady[1]),
+            steady[2] + share * (before[2] + gyro[2] - 2.0 * steady[2]),
+        ),
+        math.sqrt(turned_sq + begun * begun),
+    )
