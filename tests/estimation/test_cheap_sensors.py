@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import ACCEL, GYRO
+from gateway.estimation.columns import ACCEL, GYRO, NAV_ATTITUDE_STD
 from gateway.estimation.complementary.complementary_state import (
     STATES,
     ComplementarySettings,
@@ -20,6 +21,7 @@ from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
+from tests.estimation.test_compass_lag import seen
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import attitude_scores, outages, run_complementary
 from tools.score_honesty import share, two_sigma
@@ -79,6 +81,40 @@ def test_a_wrong_scale_is_found_in_a_real_flight(
     within = two_sigma(off, out)
     assert share(within["tilt"]) > 0.8
     assert share(within["heading"]) > 0.88
+
+
+def tumbled(time_s: np.ndarray) -> np.ndarray:
+    """Roll round and round at 5 rad/s, and swing about the other axes."""
+    return np.column_stack(
+        [
+            5.0 * time_s + 0.8 * np.sin(1.3 * time_s),
+            0.9 * np.sin(1.1 * time_s),
+            1.2 * np.sin(0.9 * time_s) + 0.2 * time_s,
+        ]
+    )
+
+
+@pytest.mark.parametrize("scale", [0.98, 1.02])
+@pytest.mark.parametrize(
+    ("name", "limit_deg", "told"), [("complementary", 17.0, 0.6), ("eskf", 2.5, 0.9)]
+)
+def test_gravity_outdoes_a_wrong_scale_where_a_hand_spins_it(
+    name: str, limit_deg: float, told: float, scale: float
+) -> None:
+    """`complementary` falls behind by as much as its low-pass is slow; `eskf` finds the scale."""
+    log = seen(tumbled, 0.013, seconds=60.0)
+    time_s = log.imu_time_us * 1e-6
+    true = Rotation.from_euler("zyx", tumbled(time_s)[:, ::-1])
+    imu = log.imu.copy()
+    shaking = 2.0 * np.sin(5.0 * time_s[:, np.newaxis] + (0.0, 1.0, 2.0))
+    imu[:, ACCEL : ACCEL + 3] += true.inv().apply(shaking)
+    imu[:, GYRO : GYRO + 3] *= scale
+    out = make_estimator(EstimationSettings(estimator=name)).run(replace(log, imu=imu))
+    off = (true * Rotation.from_quat(out[:, :4], scalar_first=True).inv()).as_rotvec()
+    tilt = np.hypot(off[:, 0], off[:, 1])[time_s > 10.0]
+    assert np.degrees(np.sqrt(np.mean(tilt**2))) < limit_deg
+    std = np.hypot(*out[time_s > 10.0, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 2].T)
+    assert np.mean(tilt < 2.0 * std) > told
 
 
 def test_a_shaken_flight_is_as_unsure_as_it_is_off(flight: Flight) -> None:

@@ -28,7 +28,12 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.late_fix import position_row, velocity_row
-from gateway.estimation.eskf.measure import compass_row
+from gateway.estimation.eskf.measure import (
+    compass_row,
+    take_back,
+    update_by_compass,
+    update_by_velocity,
+)
 from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
@@ -162,14 +167,19 @@ def test_held_states_are_considered_but_not_changed(
     assert np.linalg.eigvalsh(state.P).min() > -1e-8
 
 
-def test_only_gps_tells_the_scale(state: EskfState, rng: np.random.Generator) -> None:
-    before, h = state.P.copy(), rng.normal(size=STATES)
-    clear(state)
-    state.h[:] = h
-    update_scalar(state, 2.0, 3.0, 1e12)
+def test_without_gps_gravity_tells_the_scale_and_the_compass_does_not(state: EskfState) -> None:
     held = slice(GYRO_SCALE, GYRO_SCALE + 3)
-    np.testing.assert_array_equal(state.dx[held], 0.0)
-    np.testing.assert_allclose(state.P[held, held], before[held, held])
+    before = state.P[held, held].copy()
+    update_by_compass(state, GAINS, (20.0, 3.0, 40.0), 0.0, 1.0, 0.1)
+    np.testing.assert_array_equal(state.gyro_scale_b, 0.0)
+    np.testing.assert_allclose(state.P[held, held], before)
+    state.vel_n[:] = 0.3, -0.2, 0.1
+    update_by_velocity(state, GAINS, 1.0)
+    assert np.all(state.gyro_scale_b != 0.0)
+    assert np.all(np.diag(state.P[held, held]) < np.diag(before))
+    np.testing.assert_array_equal(state.gyro_scale_b, state.assumed_scale)
+    take_back(state)
+    np.testing.assert_array_equal(state.gyro_scale_b, 0.0)
 
 
 def test_an_outlier_moves_little_and_is_never_ignored(state: EskfState) -> None:

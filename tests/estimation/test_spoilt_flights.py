@@ -310,17 +310,19 @@ def test_a_level_that_was_found_in_motion_is_kept(data_dir: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "how"),
+    ("name", "how", "most_deg"),
     [
-        ("broad_15_undisturbed_fast_translation_A", "silence"),
-        ("broad_15_undisturbed_fast_translation_A", "mid_air"),
-        ("broad_30_disturbed_stationary_magnet_C", "silence"),
+        ("broad_15_undisturbed_fast_translation_A", "silence", LIMIT_DEG),
+        ("broad_15_undisturbed_fast_translation_A", "mid_air", 3.5),
+        ("broad_30_disturbed_stationary_magnet_C", "silence", LIMIT_DEG),
     ],
 )
 def test_an_attitude_lost_in_a_motion_that_never_ends_is_found(
-    data_dir: Path, name: str, how: str
+    data_dir: Path, name: str, how: str, most_deg: float
 ) -> None:
-    check_back(read_flight(data_dir / f"{name}.csv.gz"), "eskf", how)
+    tilt_deg, heading_deg, _ = off(read_flight(data_dir / f"{name}.csv.gz"), "eskf", how)
+    assert tilt_deg < LIMIT_DEG
+    assert heading_deg < most_deg
 
 
 def test_fast_motion_is_no_noise_at_a_low_rate(data_dir: Path) -> None:
@@ -370,7 +372,7 @@ def test_a_heading_by_compass_alone_is_as_unsure_as_the_iron_left(
     assert share(two_sigma(flight, run_eskf(flight))["heading"]) > 0.95
 
 
-@pytest.mark.parametrize(("name", "most_deg"), [("complementary", 1.4), ("eskf", 1.25)])
+@pytest.mark.parametrize(("name", "most_deg"), [("complementary", 1.4), ("eskf", 1.6)])
 def test_a_real_compass_is_not_followed_into_its_slow_errors(
     data_dir: Path, name: str, most_deg: float
 ) -> None:

@@ -168,6 +168,8 @@ class ComplementaryState(FilterState):
     epoch_s: float
     gravity_tau_s: float
     """Time constant of gravity's low-pass, and what it follows from: see `unaided`."""
+    unaided_scaled: Annotated[FloatArray, (2, 3)]
+    """Level rate that the whole of each axis of the gyroscope makes up, low-passed, rad/s."""
     unaided_radps: float
     """Mean rate of turning."""
     unaided_pull: Annotated[FloatArray, (2,)]

@@ -18,12 +18,13 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.drift import (
     ATTITUDE_WALK_RAD2PS,
     FORCE,
+    SCALE_SHARE,
     TURN_WALK_RAD,
     bias_std,
 )
 from gateway.estimation.complementary.tilt import begin_pull
 from gateway.estimation.kernel_record import as_quat, as_vec
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 PULL_MEMORY_S: Final = 20.0
@@ -48,6 +49,7 @@ def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None
     share, tau, g = dt / PULL_MEMORY_S, s.gravity_tau_s, STANDARD_GRAVITY_MPS2
     x, y, z = as_vec(s.rate_b)
     s.unaided_radps += share * (math.sqrt(x * x + y * y + z * z) - s.unaided_radps)
+    watch_scaled(s, dt)
     drift_sq = level_drift_sq(s)
     pull_sq = unaided_pull_sq(s, drift_sq, dt)
     s.unaided_pull_sq += share * (pull_sq - s.unaided_pull_sq)
@@ -67,7 +69,20 @@ def level_drift_sq(s: ComplementaryState) -> float:
     tau = s.gravity_tau_s
     lag = bias_std(s) * tau
     walk = ATTITUDE_WALK_RAD2PS + TURN_WALK_RAD * s.unaided_radps + s.rate_density
-    return lag * lag + walk * tau
+    scaled_sq = 0.0
+    for k in range(3):
+        scaled_sq += 0.5 * (s.unaided_scaled[0, k] ** 2 + s.unaided_scaled[1, k] ** 2)
+    return lag * lag + walk * tau + (SCALE_SHARE * tau) ** 2 * scaled_sq
+
+
+@compiled
+def watch_scaled(s: ComplementaryState, dt: float) -> None:
+    """Low-pass what the scale of each axis of the gyroscope acts on: turns to and fro cancel."""
+    q, share = as_quat(s.q_eb), min(dt / s.gravity_tau_s, 1.0)
+    for k in range(2):
+        axis = rotate_inverse(q, (1.0 - k, float(k), 0.0))
+        for j in range(3):
+            s.unaided_scaled[k, j] += share * (axis[j] * s.rate_b[j] - s.unaided_scaled[k, j])
 
 
 @compiled

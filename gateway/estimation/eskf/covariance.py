@@ -152,9 +152,6 @@ def clear(s: EskfState) -> None:
     """Begin a measurement: an empty row, no state held."""
     fill(s.h, 0.0)
     fill(s.considered, 0.0)
-    if s.aided == 0:
-        # Only GPS tells the gyroscope's scale: iron turns the compass in step with each turn.
-        consider(s, GYRO_SCALE, 3)
 
 
 @compiled

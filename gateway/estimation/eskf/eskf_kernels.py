@@ -232,10 +232,9 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
         s.pending_turn[k, 0] += x[k] * dt
         s.pending_turn[k, 1] += y[k] * dt
         s.pending_turn[k, 2] += z[k] * dt
-        if s.aided == 1 or k == 2:
-            s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
-            s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
-            s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
+        s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
+        s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
+        s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
         s.integrals[3 + k] += a * dt

@@ -97,6 +97,8 @@ class EskfState(FilterState):
     """What the speed of about zero has lately corrected: attitude in rad, velocity in m/s."""
     assumed_bias: Annotated[FloatArray, (3,)]
     """The same of the gyroscope's bias, rad/s."""
+    assumed_scale: Annotated[FloatArray, (3,)]
+    """And of its scale."""
     pushed_mps: float
     """Speed to which a steady force would have pushed by now, were it no tilt."""
     flies: int

@@ -10,9 +10,16 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.covariance import clear, inject, propagate, renew, update_scalar
+from gateway.estimation.eskf.covariance import (
+    clear,
+    consider,
+    inject,
+    propagate,
+    renew,
+    update_scalar,
+)
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import MAG_BIAS, TILT, EskfState
+from gateway.estimation.eskf.eskf_state import GYRO_SCALE, MAG_BIAS, TILT, EskfState
 from gateway.estimation.eskf.measure import (
     MISFIT_S,
     STRENGTH_NOISE,
@@ -76,6 +83,8 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
     if s.aided == 0 or s.iron_doubted == 1:
         propagate(s, p)
         clear(s)
+        if s.aided == 0:
+            consider(s, GYRO_SCALE, 3)
         for k in range(3):
             s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
         update_scalar(s, off, noise * max(1.0, compass_correlation_s(s) / dt), p.gate_sq)

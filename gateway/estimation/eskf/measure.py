@@ -20,6 +20,7 @@ from gateway.estimation.eskf.eskf_state import (
     ACCEL_BIAS,
     BARO_BIAS,
     GYRO_BIAS,
+    GYRO_SCALE,
     MAG_BIAS,
     POS,
     TILT,
@@ -94,6 +95,8 @@ def update_by_compass(
         # The horizon rests on the accelerometer alone then: keep the field's dip out of it.
         consider(s, TILT, 2)
         consider(s, ACCEL_BIAS, 3)
+        # Iron turns the compass in step with each turn, as a wrong scale would.
+        consider(s, GYRO_SCALE, 3)
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
     steep = steepness(math.atan2(field_n[2], math.sqrt(level_sq)))
@@ -126,13 +129,17 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
     for k in range(3):
         clear(s)
         s.h[VEL + k] = 1.0
-        # An assumed velocity is wrong in step with the turns, and the bias would take the blame.
+        # An assumed velocity is wrong in step with the turns, and the bias would take the blame;
+        # in a hand the heading would, through the scale that both share.
         consider(s, ACCEL_BIAS, 3)
+        if s.unaided_sq < p.unaided_var:
+            consider(s, TILT + 2, 1)
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
     for k in range(6):
         s.assumed[k] += s.dx[TILT + k]
     for k in range(3):
         s.assumed_bias[k] += s.dx[GYRO_BIAS + k]
+        s.assumed_scale[k] += s.dx[GYRO_SCALE + k]
     fade_force_turn(s, level)
     inject(s)
 
@@ -150,6 +157,9 @@ def take_back(s: EskfState) -> None:
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += more
         s.bias_raised[k] += more
         s.assumed_bias[k] = 0.0
+        s.dx[GYRO_SCALE + k] = -s.assumed_scale[k]
+        s.P[GYRO_SCALE + k, GYRO_SCALE + k] += s.assumed_scale[k] * s.assumed_scale[k]
+        s.assumed_scale[k] = 0.0
     inject(s)
 
 

@@ -58,7 +58,7 @@ GAP_HAND_RATE: Final = 0.3
 GAP_ACCEL_MPS2: Final = 3.0
 UNAIDED_SCALE: Final = 0.01
 """Before the first fix each axis of the gyroscope is taken to be off scale by this share, a third
-of an MPU6050's tolerance: it is considered, for the heading alone."""
+of an MPU6050's tolerance; the level tells it as the motion turns."""
 
 
 @compiled
@@ -149,6 +149,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
     start_height(s, p, pos[2] + vel[2] * lag)
     s.aided = 1
     fill(s.assumed_bias, 0.0)
+    fill(s.assumed_scale, 0.0)
     if s.aided_before == 0:
         s.aided_before = 1
         for k in range(3):

@@ -69,6 +69,7 @@ def watch_way(s: EskfState, dt: float) -> None:
         s.assumed[k] *= math.exp(-dt / ASSUMED_S)
     for k in range(3):
         s.assumed_bias[k] *= math.exp(-dt / SETTLE_S)
+        s.assumed_scale[k] *= math.exp(-dt / SETTLE_S)
     if s.at_rest == 1:
         s.unaided_sq, s.hand_sq, s.flies = 0.0, 0.0, 0
     elif s.flies == 1:
