@@ -32,6 +32,7 @@ from gateway.estimation.eskf.start import (
     bridge_silence,
     end_dead_reckoning,
     forget_times,
+    rate_of,
     restart_baro,
     start,
     start_heading_by_compass,
@@ -207,13 +208,8 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
     dt : float
         Time step, s.
     """
-    b, c = s.gyro_bias_b, s.accel_bias_b
-    e = s.gyro_scale_b
-    rate = (
-        gyro[0] - b[0] - e[0] * gyro[0],
-        gyro[1] - b[1] - e[1] * gyro[1],
-        gyro[2] - b[2] - e[2] * gyro[2],
-    )
+    c = s.accel_bias_b
+    rate = rate_of(s, gyro)
     write_vec(s.rate_b, rate)
     carry_frame(s, rate, dt)
     # The force of the interval acts, on average, at the attitude half way through it.

@@ -233,22 +233,18 @@ def bridge_silence(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: floa
     if not is_end_told(s, gyro, accel):
         bridge_gap(s, p, dt)
         return
-    q_nb, b, e = as_quat(s.q_nb), as_vec(s.gyro_bias_b), as_vec(s.gyro_scale_b)
-    mean, std = end_silence(s, q_nb, b, gyro, wander_rate(s))
+    q_nb, bias_b = as_quat(s.q_nb), as_vec(s.gyro_bias_b)
+    mean, std = end_silence(s, q_nb, bias_b, gyro, wander_rate(s))
     if std > GAP_LOST_RAD:
         bridge_gap(s, p, dt)
         if s.silent_rad <= GAP_LOST_RAD:
             lose_attitude(s, p)
         return
     dt = min(dt, LONGEST_SILENCE_S)
-    turn_rad = rotate(q_nb, silent_rate(s, b))[2] * dt
+    turn_rad = rotate(q_nb, silent_rate(s, bias_b))[2] * dt
     turn_on(s, turn_rad)
     turn_heading(s, -turn_rad - s.silent_turn_rad)
-    rate = (
-        mean[0] - b[0] - e[0] * mean[0],
-        mean[1] - b[1] - e[1] * mean[1],
-        mean[2] - b[2] - e[2] * mean[2],
-    )
+    rate = rate_of(s, mean)
     carry_frame(s, rate, s.gap_s)
     turn = from_rotation_vector((rate[0] * s.gap_s, rate[1] * s.gap_s, rate[2] * s.gap_s))
     write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
@@ -257,6 +253,17 @@ def bridge_silence(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: floa
     s.silent_s = s.silent_rad = s.silent_turn_rad = 0.0
     write_vec(s.gyro_held, gyro)
     write_vec(s.accel_held, accel)
+
+
+@compiled
+def rate_of(s: EskfState, gyro: Vec3) -> Vec3:
+    """Return the angular rate of what the gyroscope reads, without its bias and scale, rad/s."""
+    b, e = s.gyro_bias_b, s.gyro_scale_b
+    return (
+        gyro[0] - b[0] - e[0] * gyro[0],
+        gyro[1] - b[1] - e[1] * gyro[1],
+        gyro[2] - b[2] - e[2] * gyro[2],
+    )
 
 
 @compiled
