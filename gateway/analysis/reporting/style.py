@@ -171,7 +171,7 @@ def legend_outside(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def fit_square(axes: Axes, x: FloatArray, y: FloatArray) -> None:
-    """Show all points at one scale in both directions."""
+    """Show all points at one scale in both directions, with 6 % of room at each end."""
     spread = max(float(np.ptp(x)), float(np.ptp(y)), 1e-9)
     half = 0.56 * spread
     middle_x, middle_y = 0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.min(y) + np.max(y))

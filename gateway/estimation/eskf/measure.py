@@ -27,7 +27,7 @@ from gateway.estimation.eskf.eskf_state import (
     VEL,
     EskfState,
 )
-from gateway.estimation.kernel_record import as_quat, as_vec
+from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import steepness
 from gateway.geometry.quaternion import rotate, wrap_pi
 from gateway.records import Vec3
@@ -135,11 +135,9 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
         if s.unaided_sq < p.unaided_var:
             consider(s, TILT + 2, 1)
         update_scalar(s, -s.vel_n[k], variance, FAR_SQ)
-    for k in range(6):
-        s.assumed[k] += s.dx[TILT + k]
-    for k in range(3):
-        s.assumed_bias[k] += s.dx[GYRO_BIAS + k]
-        s.assumed_scale[k] += s.dx[GYRO_SCALE + k]
+    note_assumed(s, s.assumed, TILT)
+    note_assumed(s, s.assumed_bias, GYRO_BIAS)
+    note_assumed(s, s.assumed_scale, GYRO_SCALE)
     fade_force_turn(s, level)
     inject(s)
 
@@ -147,20 +145,28 @@ def update_by_velocity(s: EskfState, p: EskfGains, variance: float) -> None:
 @compiled
 def take_back(s: EskfState) -> None:
     """Undo what the speed of about zero has lately corrected, and be unsure by as much."""
-    for k in range(6):
-        s.dx[TILT + k] = -s.assumed[k]
-        s.P[TILT + k, TILT + k] += s.assumed[k] * s.assumed[k]
-        s.assumed[k] = 0.0
     for k in range(3):
-        more = s.assumed_bias[k] * s.assumed_bias[k]
-        s.dx[GYRO_BIAS + k] = -s.assumed_bias[k]
-        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += more
-        s.bias_raised[k] += more
-        s.assumed_bias[k] = 0.0
-        s.dx[GYRO_SCALE + k] = -s.assumed_scale[k]
-        s.P[GYRO_SCALE + k, GYRO_SCALE + k] += s.assumed_scale[k] * s.assumed_scale[k]
-        s.assumed_scale[k] = 0.0
+        s.bias_raised[k] += s.assumed_bias[k] * s.assumed_bias[k]
+    take_states_back(s, s.assumed, TILT)
+    take_states_back(s, s.assumed_bias, GYRO_BIAS)
+    take_states_back(s, s.assumed_scale, GYRO_SCALE)
     inject(s)
+
+
+@compiled
+def note_assumed(s: EskfState, assumed: FloatArray, first: int) -> None:
+    """Add what the states from `first` on are being corrected by."""
+    for k in range(assumed.shape[0]):
+        assumed[k] += s.dx[first + k]
+
+
+@compiled
+def take_states_back(s: EskfState, assumed: FloatArray, first: int) -> None:
+    """Take a correction of the states from `first` on back, and forget it."""
+    for k in range(assumed.shape[0]):
+        s.dx[first + k] = -assumed[k]
+        s.P[first + k, first + k] += assumed[k] * assumed[k]
+        assumed[k] = 0.0
 
 
 @compiled

@@ -64,12 +64,13 @@ def watch_way(s: EskfState, dt: float) -> None:
     flew = s.flies
     s.flies = 1 if north * north + east * east > HAND_M * HAND_M + lag * lag * drift else 0
     s.unaided_sq *= math.exp(-dt / SPEED_MEMORY_S)
-    s.hand_sq *= math.exp(-dt / SETTLE_S)
+    settled = math.exp(-dt / SETTLE_S)
+    s.hand_sq *= settled
     for k in range(6):
         s.assumed[k] *= math.exp(-dt / ASSUMED_S)
     for k in range(3):
-        s.assumed_bias[k] *= math.exp(-dt / SETTLE_S)
-        s.assumed_scale[k] *= math.exp(-dt / SETTLE_S)
+        s.assumed_bias[k] *= settled
+        s.assumed_scale[k] *= settled
     if s.at_rest == 1:
         s.unaided_sq, s.hand_sq, s.flies = 0.0, 0.0, 0
     elif s.flies == 1:

@@ -210,11 +210,10 @@ def is_end_told(s: FilterState, gyro: Vec3, accel: Vec3) -> bool:
 
 
 @compiled
-def turn_of(s: FilterState, q_nb: Quat, bias_b: Vec3) -> Vec3:
-    """Return the rate of the turn about down that the aircraft is in, in body FRD, rad/s."""
+def turn_of(q_nb: Quat, rate: Vec3) -> Vec3:
+    """Return the part of a rate in body FRD that is a turn about down."""
     x, y, z = rotate_inverse(q_nb, (0.0, 0.0, 1.0))
-    g = s.gyro_lp
-    about = x * (g[0] - bias_b[0]) + y * (g[1] - bias_b[1]) + z * (g[2] - bias_b[2])
+    about = x * rate[0] + y * rate[1] + z * rate[2]
     return (x * about, y * about, z * about)
 
 
@@ -249,7 +248,8 @@ def end_silence(
     std : float
         Standard deviation of the angle about one axis, rad.
     """
-    gap_s, before, turn = s.gap_s, as_vec(s.gyro_held), turn_of(s, q_nb, bias_b)
+    gap_s, before, rate = s.gap_s, as_vec(s.gyro_held), silent_rate(s, bias_b)
+    turn = turn_of(q_nb, rate)
     steady = (bias_b[0] + turn[0], bias_b[1] + turn[1], bias_b[2] + turn[2])
     ends_s = RATE_TAU_S * math.tanh(0.5 * gap_s / RATE_TAU_S)
     share, ends_sq = ends_s / gap_s, 0.0
@@ -258,7 +258,6 @@ def end_silence(
     # What turns is most often about one axis.
     variance = max(s.turning_sq, ends_sq)
     turned_sq = 2.0 * variance * RATE_TAU_S * (gap_s - 2.0 * ends_s)
-    rate = silent_rate(s, bias_b)
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     begun = (wander_radps + turning) * max(gap_s - STEADY_S, 0.0)
     return (
