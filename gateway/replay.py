@@ -19,6 +19,7 @@ from gateway.flightlog.table.row import (
     fix_of_cells,
 )
 from gateway.flightlog.table.table import REMARK, TableHeader, TableMark
+from gateway.geometry.angle import wrap_180
 from gateway.pipeline import Pipeline
 from gateway.records import (
     BaroRaw,
@@ -35,7 +36,6 @@ from gateway.sensing.imu_log import ImuLog, IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.telemetry.events import INFO, StatusText
 
-HALF_TURN_DEGE7: Final = 1_800_000_000
 LONGEST_SILENCE_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""
 
@@ -254,11 +254,10 @@ class InterpolatedPosition:
             return state
         way = (arrival_us - a.time_us) / max(b.time_us - a.time_us, 1)
         # The shorter way, so that a flight over the date line does not go around the earth.
-        east_dege7 = (b.lon_dege7 - a.lon_dege7 + HALF_TURN_DEGE7) % (2 * HALF_TURN_DEGE7)
-        lon_dege7 = a.lon_dege7 + way * (east_dege7 - HALF_TURN_DEGE7)
+        east_deg = wrap_180((b.lon_dege7 - a.lon_dege7) * DEG_PER_DEGE7)
         return msgspec.structs.replace(
             state,
             lat_deg=(a.lat_dege7 + way * (b.lat_dege7 - a.lat_dege7)) * DEG_PER_DEGE7,
-            lon_deg=(lon_dege7 * DEG_PER_DEGE7 + 180.0) % 360.0 - 180.0,
+            lon_deg=wrap_180(a.lon_dege7 * DEG_PER_DEGE7 + way * east_deg),
             alt_amsl_m=a.alt_amsl_m + way * (b.alt_amsl_m - a.alt_amsl_m),
         )

@@ -36,6 +36,7 @@ from gateway.estimation.columns import (
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoothing.smoother import smooth
+from gateway.geometry.angle import wrap_180, wrap_pi
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
 from tools.peers import PEERS
 from tools.score_honesty import consistency, share, two_sigma
@@ -108,8 +109,7 @@ def attitude_scores(flight: Flight, q_nb: np.ndarray) -> Scores:
         found = Rotation.from_euler("z", -mean) * found
     off = found * true.inv()
     w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
-    angles = np.degrees(found.as_euler("ZYX") - true.as_euler("ZYX"))
-    angles = (angles + 180.0) % 360.0 - 180.0
+    angles = wrap_180(np.degrees(found.as_euler("ZYX") - true.as_euler("ZYX")))
     return {
         "roll": rms(angles[:, 2]),
         "pitch": rms(angles[:, 1]),
@@ -123,7 +123,7 @@ def attitude_scores(flight: Flight, q_nb: np.ndarray) -> Scores:
 def heading_rad(off: Rotation) -> np.ndarray:
     """Split the turn about down from small rotations in NED."""
     w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
-    return (2.0 * np.arctan2(z, w) + np.pi) % (2.0 * np.pi) - np.pi
+    return wrap_pi(2.0 * np.arctan2(z, w))
 
 
 def position_errors_m(flight: Flight, out: np.ndarray) -> np.ndarray:

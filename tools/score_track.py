@@ -26,6 +26,7 @@ from gateway.config import GatewaySettings
 from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import with_reference
 from gateway.flights.reading import ReadOptions
+from gateway.geometry.angle import wrap_pi
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
@@ -110,7 +111,7 @@ def attitude_errors_deg(flight: Flight, attitude: np.ndarray, offset_s: float) -
     inside = (at >= time_s[known][0]) & (at <= time_s[known][-1])
     sent = Rotation.from_quat(attitude[inside, 1:], scalar_first=True)
     difference = sent.as_euler("ZYX") - reference(at[inside]).as_euler("ZYX")
-    return np.degrees((difference[:, ::-1] + np.pi) % (2 * np.pi) - np.pi)
+    return np.degrees(wrap_pi(difference[:, ::-1]))
 
 
 def position_errors_m(flight: Flight, place: np.ndarray, offset_s: float) -> np.ndarray:

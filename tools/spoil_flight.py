@@ -28,6 +28,7 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_LON,
 )
+from gateway.geometry.angle import wrap_pi
 from gateway.records import NavFlags
 from tools.flights import GPS_NAMES, IMU_NAMES, Flight, north_east_m, read_flight
 
@@ -269,7 +270,7 @@ def departure(flight: Flight, out: np.ndarray, spoilt: Flight, spoilt_out: np.nd
     found = Rotation.from_quat(quats, scalar_first=True)
     off = found * Rotation.from_quat(out[left, :4], scalar_first=True).inv()
     w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
-    heading = (2.0 * np.arctan2(z, w) + np.pi) % (2.0 * np.pi) - np.pi
+    heading = wrap_pi(2.0 * np.arctan2(z, w))
     place = np.full(len(left), np.nan)
     if out.shape[1] > NAV_LON:
         ours = north_east_m(flight, out[left, NAV_LAT], out[left, NAV_LON])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gateway.estimation.reference import ReferenceSettings, is_usable
 from gateway.estimation.select import EstimationSettings
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.records import (
     UNKNOWN_VEC3,
@@ -210,7 +211,7 @@ class LocalFrame:
     def east_m(self, lon_deg: FloatArray) -> FloatArray:
         """Convert longitudes to metres east, the shortest way round."""
         _, parallel = radii_m(self.lat_deg, self.alt_m)
-        return np.asarray(np.radians((lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0) * parallel)
+        return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
 
     def place(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
         """Convert positions to metres, shape (N, 2): north and east."""

@@ -13,6 +13,7 @@ from gateway.analysis.flight_arrays import (
     IntArray,
 )
 from gateway.estimation.reference import is_usable
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.records import GpsFix
 from gateway.units import US_PER_S
@@ -56,7 +57,7 @@ def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
     lat, lon, alt, *vel = (
         np.where(known, np.interp(time_us, fixes.valid_us, column), np.nan) for column in columns
     )
-    lon = (lon + 180.0) % 360.0 - 180.0
+    lon = wrap_180(lon)
     return FlightTrack(time_us, np.full((size, 4), np.nan), lat, lon, alt, np.column_stack(vel))
 
 
@@ -115,8 +116,11 @@ def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
         return np.empty((0, 2))
     meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))
     lat = np.interp(fixes.valid_us, track.time_us, track.lat_deg, left=np.nan, right=np.nan)
-    lon = np.interp(fixes.valid_us, track.time_us, track.lon_deg, left=np.nan, right=np.nan)
-    east_deg = (lon - fixes.lon_deg + 180.0) % 360.0 - 180.0
+    # From the first fix, not from Greenwich: halfway over the date line is not longitude 0.
+    lon_deg = fixes.lon_deg[0]
+    east_deg = wrap_180(track.lon_deg - lon_deg)
+    east = np.interp(fixes.valid_us, track.time_us, east_deg, left=np.nan, right=np.nan)
+    away_deg = wrap_180(east - wrap_180(fixes.lon_deg - lon_deg))
     return np.column_stack(
-        [np.radians(lat - fixes.lat_deg) * meridian, np.radians(east_deg) * parallel]
+        [np.radians(lat - fixes.lat_deg) * meridian, np.radians(away_deg) * parallel]
     )

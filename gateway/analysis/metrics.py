@@ -3,6 +3,7 @@
 import numpy as np
 
 from gateway.analysis.flight_arrays import FlightTrack, FloatArray
+from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import radii_m
 
 
@@ -79,11 +80,6 @@ def euler_rad(q_nb: FloatArray) -> FloatArray:
     )
 
 
-def wrap_pi(angle_rad: FloatArray) -> FloatArray:
-    """Bring angles into [-pi, pi)."""
-    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
-
-
 def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
     """Displacement from the reference to the estimate, shape (N, 3): north, east, up."""
     known = np.isfinite(reference.lat_deg)
@@ -93,7 +89,7 @@ def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
     meridian, parallel = radii_m(
         float(reference.lat_deg[first]), float(np.nan_to_num(reference.alt_amsl_m[first]))
     )
-    east_deg = (track.lon_deg - reference.lon_deg + 180.0) % 360.0 - 180.0
+    east_deg = wrap_180(track.lon_deg - reference.lon_deg)
     return np.column_stack(
         [
             np.radians(track.lat_deg - reference.lat_deg) * meridian,

@@ -7,6 +7,7 @@ per-sample kernels, which only ever step a few metres from a known latitude.
 import math
 
 from gateway.compiled import compiled
+from gateway.geometry.angle import wrap_180
 
 SEMI_MAJOR_M = 6_378_137.0
 ECCENTRICITY_SQ = 6.694_379_990_141_317e-3
@@ -66,7 +67,7 @@ def offset_deg(
     meridian, parallel = radii_m(lat_deg, alt_m)
     lat = lat_deg + math.degrees(north_m / meridian)
     lon = lon_deg + math.degrees(east_m / max(parallel, 1.0))
-    return (lat, (lon + 180.0) % 360.0 - 180.0)
+    return (lat, wrap_180(lon))
 
 
 @compiled
@@ -88,7 +89,7 @@ def displacement_m(
         Metres north and east.
     """
     meridian, parallel = radii_m(from_lat_deg, alt_m)
-    delta_lon = (to_lon_deg - from_lon_deg + 180.0) % 360.0 - 180.0
+    delta_lon = wrap_180(to_lon_deg - from_lon_deg)
     return (
         math.radians(to_lat_deg - from_lat_deg) * meridian,
         math.radians(delta_lon) * parallel,

@@ -153,9 +153,3 @@ def to_euler(q: Quat) -> Vec3:
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return (roll, pitch, yaw)
-
-
-@compiled
-def wrap_pi(angle_rad: float) -> float:
-    """Bring an angle into [-pi, pi): the shortest way round."""
-    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi

@@ -27,6 +27,7 @@ from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.table import TableBlock
 from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.field_history import FloatArray
 from gateway.panel.state.sample_memory import TimedFrames
@@ -167,6 +168,6 @@ def _to_fixes_m(flight: Flight, track: FlightTrack) -> float:
     rows = np.clip(np.searchsorted(track.time_us, fixes.valid_us), 0, len(track.time_us) - 1)
     meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))
     north_m = np.radians(track.lat_deg[rows] - fixes.lat_deg) * meridian
-    turned_deg = (track.lon_deg[rows] - fixes.lon_deg + 180.0) % 360.0 - 180.0
+    turned_deg = wrap_180(track.lon_deg[rows] - fixes.lon_deg)
     away_m = np.hypot(north_m, np.radians(turned_deg) * parallel)
     return rms(away_m[flight.scored[rows]])

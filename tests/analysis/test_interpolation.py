@@ -33,6 +33,12 @@ def test_one_fix_is_no_line() -> None:
     assert np.isnan(interpolate(line([1.0]), np.array([1_000_000])).lat_deg).all()
 
 
+def test_a_track_over_the_date_line_is_compared_with_the_fixes_there() -> None:
+    fixes = line([0.0, 0.5, 0.8, 1.2, 2.0])
+    track = interpolate(fixes, np.array([0, 700_000, 1_100_000, 2_000_000]))
+    assert np.abs(error_at_fixes_m(track, fixes)).max() < 1e-6
+
+
 def test_thinning_keeps_one_fix_a_second() -> None:
     flight = short_flight()
     kept, dropped = split(flight, thin(flight, 1.0))

@@ -12,7 +12,6 @@ from gateway.analysis.metrics import (
     rotation_error,
     total_error_rad,
     worst,
-    wrap_pi,
 )
 from tests.analysis.flights import short_flight
 
@@ -54,10 +53,6 @@ def test_euler_angles_equal_scipys(rng: np.random.Generator) -> None:
     rotation = Rotation.random(50, rng=rng)
     expected = rotation.as_euler("ZYX")[:, ::-1]
     assert euler_rad(quats(rotation)) == pytest.approx(expected)
-
-
-def test_angles_wrap_the_short_way_round() -> None:
-    assert wrap_pi(np.radians([359.0, -181.0])) == pytest.approx(np.radians([-1.0, 179.0]))
 
 
 def test_position_error_is_north_east_up() -> None:

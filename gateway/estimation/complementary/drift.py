@@ -31,12 +31,12 @@ from gateway.estimation.filtering.covariance_scale import limit_variance, scale_
 from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
+from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
     normalise,
     rotate_inverse,
-    wrap_pi,
 )
 from gateway.units import RAD_PER_DEG
 

@@ -27,7 +27,8 @@ from gateway.estimation.complementary.drift import (
 )
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, steepness, take_field
-from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.geometry.angle import wrap_pi
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 

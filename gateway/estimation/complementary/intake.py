@@ -64,7 +64,8 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S, is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
-from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.geometry.angle import wrap_pi
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
 SPATIAL_SHARE: Final = math.sqrt(1.0 / 3.0)

@@ -29,7 +29,8 @@ from gateway.estimation.eskf.eskf_state import (
 )
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import steepness
-from gateway.geometry.quaternion import rotate, wrap_pi
+from gateway.geometry.angle import wrap_pi
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
 REST_VELOCITY_VAR: Final = 0.2**2

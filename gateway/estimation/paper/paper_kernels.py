@@ -21,6 +21,7 @@ from gateway.estimation.sensor_faults import (
     force_instead,
     rate_instead,
 )
+from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import offset_deg
 from gateway.geometry.quaternion import (
     from_euler,
@@ -30,7 +31,6 @@ from gateway.geometry.quaternion import (
     rotate,
     rotate_inverse,
     to_euler,
-    wrap_pi,
 )
 from gateway.records import Quat, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
@@ -252,9 +252,9 @@ def blend_fix(
     """Third complementary filter, its blend: eq. 1, 2, 7 and 8 as recursions."""
     vel = blend(alpha, vel, fix_vel)
     # The longitude may wrap between the two; blend the shortest way round.
-    fix_lon = place[1] + (fix_place[1] - place[1] + 180.0) % 360.0 - 180.0
+    fix_lon = place[1] + wrap_180(fix_place[1] - place[1])
     lat, lon, alt = blend(beta, place, (fix_place[0], fix_lon, fix_place[2]))
-    return ((lat, (lon + 180.0) % 360.0 - 180.0, alt), vel)
+    return ((lat, wrap_180(lon), alt), vel)
 
 
 @compiled

@@ -46,6 +46,7 @@ from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray, copy_record
 from gateway.estimation.magfield import PLACE_RAD
 from gateway.estimation.smoothing.forward import SHOWN, BoolArray, run_forward
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 
 NODE_S: Final = 0.5
@@ -262,7 +263,7 @@ def _correct(
         meridian_m, parallel_m = radii_m(lat_deg, 0.0)
         out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
         lon_deg = out[aided, NAV_LON] + np.degrees(off[aided, POS + 1] / parallel_m)
-        out[aided, NAV_LON] = (lon_deg + 180.0) % 360.0 - 180.0
+        out[aided, NAV_LON] = wrap_180(lon_deg)
         out[aided, NAV_ALT] -= off[aided, POS + 2]
     variance = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
     # The axes are off for a whole flight; averages do not lessen that.

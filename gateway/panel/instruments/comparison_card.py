@@ -8,6 +8,7 @@ from nicegui import ui
 
 from gateway.edges.clock import unix_time_us
 from gateway.edges.reasons import reason_of
+from gateway.geometry.angle import wrap_180
 from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
 from gateway.panel.instruments.strip_chart import StripChart
 from gateway.panel.state.field_history import FloatArray, IntArray
@@ -114,7 +115,7 @@ def _rms_text(estimate: Estimate, key: str, flown: tuple[str, IntArray, FloatArr
     rows = np.clip(np.searchsorted(flown_us, estimate.time_us), 0, len(flown_us) - 1)
     apart = getattr(estimate, key) - values[rows]
     if key.endswith("_deg"):
-        apart = (apart + 180.0) % 360.0 - 180.0
+        apart = wrap_180(apart)
     known = apart[np.isfinite(apart)]
     return _figure(float(np.sqrt(np.mean(known**2)))) if len(known) else "—"
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
 from gateway.panel.state.instant import Instant, Spot
 from gateway.panel.state.status_texts import StatusTexts
@@ -204,7 +205,7 @@ class VehiclePicture:
         lat_deg, lon_deg = vincenty.vreckon(
             place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
         )
-        lon_deg = (float(lon_deg) + 180.0) % 360.0 - 180.0
+        lon_deg = wrap_180(float(lon_deg))
         return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
 
     def _note_motion(self, _message: Any, now_us: int) -> None:

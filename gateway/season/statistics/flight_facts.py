@@ -1,6 +1,5 @@
 """What the catalogue says of one flight, computed from its positions and fixes in one pass."""
 
-import math
 from typing import Final
 
 import msgspec
@@ -11,6 +10,7 @@ from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.flightlog.damaged_times import DAY_US
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import GroundWay
+from gateway.geometry.angle import wrap_180
 from gateway.season.statistics.track_shape import Place, simplified
 from gateway.units import US_PER_S
 
@@ -179,6 +179,6 @@ def _greatest(values: NDArray[np.float64]) -> float | None:
 
 def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
     """Return the west and the east end, the short way round."""
-    turned = lon_deg[0] + (lon_deg - lon_deg[0] + 180.0) % 360.0 - 180.0
+    turned = lon_deg[0] + wrap_180(lon_deg - lon_deg[0])
     west, east = float(turned.min()), float(turned.max())
-    return (math.remainder(west, 360.0), math.remainder(east, 360.0))
+    return (wrap_180(west), wrap_180(east))

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 
 TOLERANCE_M: Final = 3.0
@@ -63,7 +64,7 @@ def feature_collection(features: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 def _in_metres(places: Sequence[Place]) -> NDArray[np.float64]:
     lat, lon, alt = np.array(places, np.float64).T
     meridian, parallel = radii_m(float(lat[0]), float(alt[0]))
-    east_deg = (lon - lon[0] + 180.0) % 360.0 - 180.0
+    east_deg = wrap_180(lon - lon[0])
     return np.column_stack([np.radians(lat - lat[0]) * meridian, np.radians(east_deg) * parallel])
 
 

@@ -11,6 +11,7 @@ from gateway.analysis.key_figures import changed_settings, summarise
 from gateway.analysis.metrics import position_error_m, rotation_error, total_error_rad
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.geometry.angle import wrap_180
 
 SAME_PLACE_DEG: Final = 0.5
 """Flights further apart do not fit on one map."""
@@ -80,7 +81,7 @@ def _on_one_map(a: Case, b: Case) -> bool:
     if a.frame is None or b.frame is None:
         return False
     north_deg = abs(a.frame.lat_deg - b.frame.lat_deg)
-    east_deg = abs((a.frame.lon_deg - b.frame.lon_deg + 180.0) % 360.0 - 180.0)
+    east_deg = abs(wrap_180(a.frame.lon_deg - b.frame.lon_deg))
     return max(north_deg, east_deg) < SAME_PLACE_DEG
 
 

@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 
 from gateway.analysis.case import Case
 from gateway.analysis.flight_arrays import FloatArray, IntArray
-from gateway.analysis.metrics import euler_rad, rms, worst, wrap_pi
+from gateway.analysis.metrics import euler_rad, rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
 from gateway.compiled.entry_point import dispatched
+from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 from gateway.units import US_PER_S
 
@@ -70,7 +71,7 @@ class YawLines:
         error = self.yaw_deg[name] - self.reference_deg
         if name == GYRO:
             return error
-        return np.degrees(wrap_pi(np.radians(error)))
+        return wrap_180(error)
 
 
 def yaw_lines(case: Case) -> YawLines:
