@@ -134,9 +134,9 @@ async def serve(
             else:
                 await _live_view(daemon, view, stopped, panel)
         finally:
-            if panel is not None:
-                panel.close()
             daemon.close()
+            if panel is not None:
+                await panel.close()
 
 
 @contextmanager

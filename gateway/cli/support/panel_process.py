@@ -18,6 +18,9 @@ RESTART_S: Final = 5.0
 LONGEST_RESTART_S: Final = 300.0
 """Longest pause between restarts, so that repeated failures do not fill the log."""
 
+END_S: Final = 3.0
+"""Within which it ends by itself when asked to; the loop must not close before it has."""
+
 
 def is_installed() -> bool:
     """Return whether the extra is installed."""
@@ -52,13 +55,22 @@ class PanelProcess:
         """
         self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
 
-    def close(self) -> None:
-        """End it."""
+    async def close(self) -> None:
+        """End it, and wait until it has ended."""
         if self._task is not None:
             self._task.cancel()
-        if self._child is not None and self._child.returncode is None:
+            await asyncio.wait([self._task])
+        child = self._child
+        if child is None or child.returncode is not None:
+            return
+        with suppress(ProcessLookupError):
+            child.terminate()
+        try:
+            await asyncio.wait_for(child.wait(), END_S)
+        except TimeoutError:
             with suppress(ProcessLookupError):
-                self._child.terminate()
+                child.kill()
+            await child.wait()
 
     async def _keep(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
         environment = os.environ | {"MAVGATE_SOCKET": str(await control_socket())}
