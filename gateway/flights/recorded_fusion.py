@@ -15,6 +15,7 @@ from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableBlock, TableReader
 from gateway.flightlog.tlog.stamps import Stamper
 from gateway.flightlog.tlog.tlog import TlogRecord
+from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
 from gateway.flights.reading import ReadOptions, RecordedTable, csv_reader, is_table, open_rows
@@ -60,7 +61,10 @@ class RecordedFusion:
         if smooth:
             self._aircraft = with_smoothed_estimator(self._aircraft)
             blocks = _blocks_of(files, options)
-            time_us, states, latency_s = smooth_blocks(blocks, self._aircraft)
+            try:
+                time_us, states, latency_s = smooth_blocks(blocks, self._aircraft)
+            except ValueError as error:
+                raise FlightError(f"{files[0]}: {error}") from error
             self._aircraft = note_smoothed_latency(files[0], table, self._aircraft, latency_s)
             correct = SmoothedStates(time_us, states)
         elif options.position == "interpolated":

@@ -12,13 +12,14 @@ from gateway.estimation.columns import GPS_COLUMNS, imu_rows, nav_state
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.smoothing.smoother import smooth
+from gateway.flightlog.damaged_times import ORDER_US
 from gateway.flightlog.table.cells import has_group
 from gateway.flightlog.table.row import RAW, SI
 from gateway.flightlog.table.table import NO_ROWS, TableBlock
-from gateway.flights.flight_terms import FlightError
 from gateway.records import BaroRaw, GpsFix, NavState
 from gateway.replay import calibrated_of, heard_of
 from gateway.sensing.chain import SensorChain
+from gateway.units import US_PER_S
 
 SMOOTHED_ESTIMATOR: Final = "eskf"
 """The filter that the smoother goes over."""
@@ -53,12 +54,11 @@ def smooth_blocks(
 
     Raises
     ------
-    FlightError
-        If the clock went back: there is no order to smooth in.
+    ValueError
+        If the clock was set back: there is no order to smooth in.
     """
     log, estimator = gather_samples(blocks, aircraft)
-    if np.any(np.diff(log.imu_time_us) < 0):
-        raise FlightError("its clock goes back, so it cannot be smoothed; cut it there")
+    log = _in_order(log)
     return log.imu_time_us, *smooth(estimator, log)
 
 
@@ -107,6 +107,29 @@ def gather_samples(
         np.concatenate([getattr(log, field.name) for log in logs]) for field in fields(SampleLog)
     ]
     return SampleLog(*joined), estimator
+
+
+def _in_order(log: SampleLog) -> SampleLog:
+    """Put the samples that came late into their place."""
+    if not len(log.imu_time_us):
+        return log
+    back_us = -np.diff(log.imu_time_us, prepend=log.imu_time_us[:1])
+    sample = int(np.argmax(back_us))
+    if back_us[sample] > ORDER_US:
+        back_s = back_us[sample] / US_PER_S
+        raise ValueError(
+            f"its clock goes back by {back_s:.1f} s at IMU sample {sample + 1}, so it cannot be "
+            "smoothed; cut it there, or leave out --smooth"
+        )
+    imu, baro, gps = (
+        np.argsort(time_us, kind="stable")
+        for time_us in (log.imu_time_us, log.baro_time_us, log.gps_time_us)
+    )
+    return SampleLog(
+        log.imu_time_us[imu], log.imu[imu],
+        log.baro_time_us[baro], log.baro_alt_m[baro],
+        log.gps_time_us[gps], log.gps[gps],
+    )  # fmt: skip
 
 
 def _sample_log(
