@@ -11,6 +11,7 @@ from gateway.estimation.eskf.covariance import (
     NO_HEADING_VAR,
     clear,
     consider,
+    innovation_variance,
     propagate,
     update_scalar,
 )
@@ -26,6 +27,13 @@ from gateway.estimation.eskf.eskf_state import (
     VEL,
     WANDER,
     EskfState,
+)
+from gateway.estimation.eskf.iron import (
+    dip_by_iron,
+    dip_by_tilt,
+    doubt_iron,
+    spread_heading,
+    update_by_dip,
 )
 from gateway.estimation.eskf.late_fix import position_row, velocity_row
 from gateway.estimation.eskf.measure import (
@@ -236,3 +244,56 @@ def test_the_compass_row_tells_what_iron_does_to_the_heading(rng: np.random.Gene
         bent = field_n + attitude.apply(1e-6 * np.eye(3)[k])
         slope = (heading(bent) - heading(field_n)) / 1e-6
         assert s.h[MAG_BIAS + k] == pytest.approx(slope, rel=1e-4)
+
+
+def dip_of(field: np.ndarray) -> float:
+    return math.atan2(field[2], math.hypot(field[0], field[1]))
+
+
+def test_the_row_of_the_dip_tells_what_iron_and_tilt_do_to_it(rng: np.random.Generator) -> None:
+    s = new_record(EskfState)
+    attitude = Rotation.from_quat(rng.normal(size=4), scalar_first=True)
+    s.q_nb[:] = attitude.as_quat(scalar_first=True)
+    field_n = np.array([20.0, 6.0, 40.0])
+    dip_by_iron(s, tuple(field_n))
+    dip_by_tilt(s, tuple(field_n))
+    for k in range(3):
+        less = field_n - attitude.apply(1e-6 * np.eye(3)[k])
+        slope = (dip_of(less) - dip_of(field_n)) / 1e-6
+        assert s.h[MAG_BIAS + k] == pytest.approx(slope, rel=1e-4)
+        tilted = Rotation.from_rotvec(1e-6 * np.eye(3)[k]).apply(field_n)
+        slope = (dip_of(tilted) - dip_of(field_n)) / 1e-6
+        assert s.h[TILT + k] == pytest.approx(slope, abs=1e-5)
+
+
+def test_the_dip_tells_iron_no_better_than_the_dip_itself_is_known() -> None:
+    s = new_record(EskfState)
+    s.q_nb[0] = 1.0
+    s.aided = s.iron_search_started = 1
+    earth_n = np.array([20.0, 6.0, 40.0])
+    s.earth_dip_rad = dip_of(earth_n)
+    for k in range(3):
+        s.P[TILT + k, TILT + k], s.P[MAG_BIAS + k, MAG_BIAS + k] = 0.01**2, 15.0**2
+    iron = np.array([0.0, 0.0, -12.0])
+    for _ in range(500):
+        update_by_dip(s, GAINS, tuple(earth_n + iron - s.mag_bias_b), 0.05)
+    left = dip_of(earth_n + iron - s.mag_bias_b) - s.earth_dip_rad
+    assert abs(left) < math.radians(2.0)
+    clear(s)
+    dip_by_iron(s, tuple(earth_n))
+    assert math.radians(2.0) < math.sqrt(s.h @ s.P @ s.h) < math.radians(3.5)
+    assert list(s.q_nb) == [1.0, 0.0, 0.0, 0.0]
+
+
+def test_a_field_that_proves_less_level_is_no_evidence_of_iron_across_it() -> None:
+    """A heading that followed the compass agrees with it, whatever the iron is."""
+    s = new_record(EskfState)
+    s.q_nb[0] = 1.0
+    s.field_n[:] = (31.0, 5.0, 28.0)
+    s.heading_known, s.compass_share = 1, 1.0
+    doubt_iron(s, 3.0**2)
+    spread_heading(s, tuple(s.field_n), 0.5)
+    clear(s)
+    compass_row(s, tuple(s.field_n / 1.5))
+    assert math.sqrt(innovation_variance(s, 0.0)) < 1e-9
+    assert math.sqrt(s.P[TILT + 2, TILT + 2]) == pytest.approx(1.5 * 3.0 / math.hypot(31.0, 5.0))

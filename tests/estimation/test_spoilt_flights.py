@@ -88,12 +88,14 @@ def test_real_car(data_dir: Path, name: str, how: str) -> None:
 @pytest.mark.parametrize(
     ("how", "limit_deg"),
     [
-        *((how, LIMIT_DEG) for how in ("zero_rows", "no_height", "no_baro")),
-        *((how, 5.0) for how in ("silence", "gyro_off")),
+        *((how, LIMIT_DEG) for how in ("zero_rows", "no_height", "no_baro", "silence", "gyro_off")),
+        ("mid_air", 4.0),
+        ("no_mag", 4.5),
+        ("mag_hangs", 5.5),
     ],
 )
 def test_real_quadrotor(data_dir: Path, how: str, limit_deg: float) -> None:
-    """Its compass carries iron, which the field's strength tells in the first turns.
+    """Its compass carries iron, which the field's dip tells, and its strength in the first turns.
 
     Its GPS velocities are noisier than is expected of any: what they tell of a heading that was
     lost comes later.

@@ -13,7 +13,12 @@ from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
-from gateway.estimation.eskf.iron import doubt_standing_field, follow_field, look_for_iron
+from gateway.estimation.eskf.iron import (
+    doubt_standing_field,
+    follow_field,
+    look_for_iron,
+    update_by_dip,
+)
 from gateway.estimation.eskf.measure import (
     update_by_baro,
     update_by_compass,
@@ -296,6 +301,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
         return
     dip = math.asin(field[2] / norm)
     dt = min(s.time_s - s.mag_s, STALE_MAG_S)
+    update_by_dip(s, p, field, dt)
     follow_field(s, dip, dt)
     weight = take_field(s, p, norm, field[2]) / recent_unlikeness(s, p, norm, dip, dt)
     doubt_standing_field(s, p, dt)

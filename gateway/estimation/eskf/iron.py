@@ -3,7 +3,7 @@
 A field that grows and shrinks as the aircraft turns has a part that turns along. With `B` the
 Earth's strength and `b` that part, `|m|^2 - |m - b|^2 = b . (2 m - b)` makes the strength of the
 raw field `|m| = B + b . d` with `d = (2 m - b) / (|m| + |m - b|)`. `B` goes out with the means of
-both sides.
+both sides. What of it points up or down, or along the field's level part, also bends the dip.
 """
 
 import math
@@ -11,29 +11,34 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import (
+    NO_HEADING_VAR,
     clear,
     consider,
     inject,
+    innovation_variance,
     propagate,
     renew,
     update_scalar,
 )
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import GYRO_SCALE, MAG_BIAS, TILT, EskfState
+from gateway.estimation.eskf.eskf_state import GYRO_SCALE, MAG_BIAS, STATES, TILT, EskfState
 from gateway.estimation.eskf.measure import (
     MISFIT_S,
     STRENGTH_NOISE,
     compass_correlation_s,
     compass_row,
 )
-from gateway.estimation.kernel_record import as_vec
+from gateway.estimation.filtering.covariance_scale import limit_variance
+from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.magfield import (
+    DIP_ERROR_RAD,
     FIELD_TAU_S,
     FIRST_FIELD_S,
     PLACE_RAD,
     STALE_MAG_S,
     bent_share_sq,
 )
+from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
 MEAN_S: Final = 60.0
@@ -89,6 +94,86 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
             s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
         update_scalar(s, off, noise * max(1.0, compass_correlation_s(s) / dt), p.gate_sq)
         inject(s)
+
+
+@compiled
+def update_by_dip(s: EskfState, p: EskfGains, field_n: Vec3, dt: float) -> None:
+    """Compare the dip of the field with that of the Earth's field at the place.
+
+    Iron bends it, and is told so without a turn, to within what the dip is off by itself. The level
+    is left to the fixes.
+
+    Parameters
+    ----------
+    s : EskfState
+        Changed in place.
+    p : EskfGains
+        Constants.
+    field_n : tuple of 3 floats
+        Field in NED by the present attitude, uT; the iron that is known is out of it.
+    dt : float
+        Time since the field before, s.
+    """
+    if s.aided == 0 or s.iron_search_started == 0 or not math.isfinite(s.earth_dip_rad):
+        return
+    clear(s)
+    dip_by_iron(s, field_n)
+    if innovation_variance(s, 0.0) < DIP_ERROR_RAD * DIP_ERROR_RAD:
+        return
+    propagate(s, p)
+    dip_by_tilt(s, field_n)
+    consider(s, TILT, 2)
+    before = as_vec(s.mag_bias_b)
+    off = s.earth_dip_rad - math.atan2(field_n[2], math.hypot(field_n[0], field_n[1]))
+    update_scalar(s, off, p.mag_var * max(1.0, compass_correlation_s(s) / dt), p.gate_sq)
+    inject(s)
+    b = s.mag_bias_b
+    more = (b[0] - before[0], b[1] - before[1], b[2] - before[2])
+    iron_n = rotate(as_quat(s.q_nb), more)
+    level = math.hypot(field_n[0] - iron_n[0], field_n[1] - iron_n[1])
+    spread_heading(s, field_n, math.hypot(field_n[0], field_n[1]) / level - 1.0)
+
+
+@compiled
+def spread_heading(s: EskfState, field_n: Vec3, more: float) -> None:
+    """Let iron turn a heading that follows the compass by a share `more` than was reckoned with.
+
+    The less of the field lies level, the more the same iron turns it. Left as it was, the next
+    compass would take the difference for evidence of the iron across the field.
+    """
+    if s.heading_known == 0:
+        return
+    compass_row(s, field_n)
+    for k in range(MAG_BIAS, MAG_BIAS + 3):
+        s.h[k] *= s.compass_share * more
+    for j in range(STATES):
+        for k in range(MAG_BIAS, MAG_BIAS + 3):
+            s.P[TILT + 2, j] -= s.h[k] * s.P[k, j]
+    for i in range(STATES):
+        for k in range(MAG_BIAS, MAG_BIAS + 3):
+            s.P[i, TILT + 2] -= s.h[k] * s.P[i, k]
+    limit_variance(s.P, TILT + 2, NO_HEADING_VAR)
+
+
+@compiled
+def dip_by_iron(s: EskfState, field_n: Vec3) -> None:
+    """Write into the row how the iron changes the field's dip, rad/uT."""
+    north, east, down = field_n
+    level = math.hypot(north, east)
+    norm_sq = level * level + down * down
+    q = as_quat(s.q_nb)
+    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
+    for k in range(3):
+        along = (north * axes[k][0] + east * axes[k][1]) / level
+        s.h[MAG_BIAS + k] = (down * along - level * axes[k][2]) / norm_sq
+
+
+@compiled
+def dip_by_tilt(s: EskfState, field_n: Vec3) -> None:
+    """Write into the row how the tilt changes the field's dip."""
+    level = math.hypot(field_n[0], field_n[1])
+    s.h[TILT] = field_n[1] / level
+    s.h[TILT + 1] = -field_n[0] / level
 
 
 @compiled
