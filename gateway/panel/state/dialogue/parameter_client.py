@@ -22,6 +22,8 @@ QUIET_US: Final = US_PER_S
 MISSING_AT_ONCE: Final = 20
 MAX_ATTEMPTS: Final = 5
 MAX_PARAMETERS: Final = 5000
+NOT_REQUESTED: Final = 65_535
+"""The index that a value may have which nobody asked for by its index."""
 """Large autopilots have some 1500; more are forged."""
 AUTOPILOT: Final = 1
 
@@ -148,12 +150,12 @@ class ParameterClient:
             return
         value = self._decoded(message.param_value, kind)
         known = self.entries.get(name)
-        # 65535 is the index of one that was not requested.
-        index = (
-            message.param_index if message.param_index != 65535 or known is None else known.index
-        )
+        index = message.param_index
+        if index == NOT_REQUESTED and known is not None:
+            index = known.index
         self.entries[name] = ParameterEntry(name, value, kind, index)
-        self._indices.add(index)
+        if index != NOT_REQUESTED:
+            self._indices.add(index)
         self.count = min(message.param_count, MAX_PARAMETERS) or self.count
         wanted = self._answered(name, now_us)
         if wanted is not None and not is_same_value(value, wanted):

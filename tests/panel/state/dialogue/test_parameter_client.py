@@ -6,7 +6,12 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import EstimationSettings
 from gateway.panel.state.dialogue.file_client import FileClient
-from gateway.panel.state.dialogue.parameter_client import ListState, ParameterClient
+from gateway.panel.state.dialogue.parameter_client import (
+    MAX_ATTEMPTS,
+    MAX_PARAMETERS,
+    ListState,
+    ParameterClient,
+)
 from gateway.panel.state.dialogue.parameter_meta import parameter_path, parse_parameters
 from gateway.records import Incoming
 from gateway.sensing.calibration import NodeCalibration
@@ -91,6 +96,42 @@ def test_a_value_that_follows_one_without_an_answer_is_sent_in_its_place() -> No
     assert not client.change("P", 3.0, 0)
     [message] = client.poll(US_PER_S)
     assert message.param_value == 3.0
+
+
+def value_of(name: str, *, index: int, count: int = 2) -> Any:
+    return mavlink.MAVLink_param_value_message(name.encode(), 1.0, 9, count, index)
+
+
+def test_a_value_that_nobody_asked_for_does_not_complete_the_list() -> None:
+    client = ParameterClient(1)
+    client.load(0)
+    for message in (value_of("NEW", index=65535), value_of("A", index=0)):
+        client.take(message, 0)
+    assert client.state is ListState.LOADING
+    assert [m.param_index for m in client.poll(2 * US_PER_S)] == [1]
+    client.take(value_of("B", index=1), 0)
+    client.take(value_of("A", index=65535), 0)
+    assert client.state is ListState.COMPLETE
+    assert {name: entry.index for name, entry in client.entries.items()} == {
+        "NEW": 65535, "A": 0, "B": 1,
+    }  # fmt: skip
+
+
+def test_a_vehicle_of_endless_parameters_fills_no_memory() -> None:
+    client = ParameterClient(1)
+    for index in range(MAX_PARAMETERS + 3):
+        client.take(value_of(f"P{index}", index=index, count=65_000), 0)
+    assert len(client.entries) == MAX_PARAMETERS
+
+
+def test_a_change_without_an_answer_is_given_up() -> None:
+    client = ParameterClient(1)
+    client.take(value_of("P", index=0), 0)
+    sent = client.change("P", 2.0, 0)
+    for second in range(1, 30):
+        sent += client.poll(second * US_PER_S)
+    assert len(sent) == MAX_ATTEMPTS
+    assert client.refused == {"P": "no answer"}
 
 
 def test_a_client_that_may_not_change_is_refused_with_the_reason() -> None:
