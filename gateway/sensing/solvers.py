@@ -27,7 +27,7 @@ from gateway.sensing.calibration import (
     gyro_from_counts,
     mag_from_counts,
 )
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import STANDARD_GRAVITY_MPS2, counted
 
 FloatArray = NDArray[np.float64]
 
@@ -190,7 +190,8 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
         If poses are missing, or if the result is too large for a sensor error.
     """
     if len(poses) < MIN_POSES:
-        raise CalibrationError(f"{len(poses)} poses where {MIN_POSES} are needed, one on each side")
+        found = counted(len(poses), "pose")
+        raise CalibrationError(f"{found} where {MIN_POSES} are needed, one on each side")
     _check_spread(poses, STANDARD_GRAVITY_MPS2, "lay the node on every one of its six sides")
     fit = _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=len(poses) >= POSES_FOR_SKEW)
     scale_off = float(np.abs(np.linalg.eigvalsh(np.array(fit.matrix)) - 1.0).max())
@@ -222,7 +223,8 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
         If it was not turned enough, or if the measured field cannot be the Earth's.
     """
     if len(field) < MIN_MAG_SAMPLES:
-        raise CalibrationError(f"{len(field)} samples where {MIN_MAG_SAMPLES} are needed")
+        found = counted(len(field), "sample")
+        raise CalibrationError(f"{found} where {MIN_MAG_SAMPLES} are needed")
     centre = _sphere_centre(field)
     radius = float(np.linalg.norm(field - centre, axis=1).mean())
     _check_spread(field, radius, "turn the aircraft about all its axes, upside down too")

@@ -100,6 +100,12 @@ def test_long_text_is_put_together(vehicle: VehiclePicture) -> None:
     assert texts == [(1, 4, "a" * 50 + "b" * 50 + "c"), (2, 2, "next")]
 
 
+def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehiclePicture) -> None:
+    for chunk, text in enumerate(("a" * 50, "", "b")):
+        vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
+    assert [entry.text for entry in vehicle.texts.all] == ["a" * 50, "b"]
+
+
 def test_fleet_keeps_aircraft_apart_and_others_out() -> None:
     fleet, heard = FleetPicture(), []
     leave = fleet.listen(lambda system_id, message, _: heard.append(system_id))

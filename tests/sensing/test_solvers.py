@@ -74,8 +74,10 @@ def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
     flat = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.full(300, 20.0)])
     with pytest.raises(CalibrationError, match="turn the aircraft"):
         solve_magnetometer(flat)
-    with pytest.raises(CalibrationError, match="samples"):
+    with pytest.raises(CalibrationError, match="10 samples"):
         solve_magnetometer(flat[:10])
+    with pytest.raises(CalibrationError, match="1 sample where"):
+        solve_magnetometer(flat[:1])
 
 
 @pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])

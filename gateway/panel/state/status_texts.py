@@ -34,13 +34,16 @@ class StatusTexts:
         """Id and next chunk of the newest entry, while it is incomplete."""
 
     def take(self, message: Any, now_us: int) -> None:
-        """Take one STATUSTEXT; the chunks of a long one go into the same entry."""
+        """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
         text, number, chunk = message.text, message.id, message.chunk_seq
         if self._open == (number, chunk) and self.all:
             joined = (self.all[-1].text + text)[:MAX_LETTERS]
             self.all[-1] = replace(self.all[-1], text=joined)
-        else:
+        elif text.strip():
             self._count += 1
             self.all.append(TimedText(self._count, now_us, message.severity, text))
+        else:
+            self._open = None
+            return
         continues = number and len(text) == CHUNK
         self._open = (number, chunk + 1) if continues else None

@@ -81,6 +81,10 @@ export default {
     colour(name) {
       return getComputedStyle(document.body).getPropertyValue(`--${name}`).trim();
     },
+    // Beyond 2^53 a number has no exact digits to tell apart: a damaged field fills no half chart with noughts.
+    label(value) {
+      return Math.abs(value) < 2 ** 53 ? value.toLocaleString("en", { maximumFractionDigits: 10 }) : value.toExponential(1);
+    },
     noteZoom() {
       const [from, to] = this.range();
       this.$el.dataset.spanS = ((to - from) / 1000).toFixed(1);
@@ -144,7 +148,7 @@ export default {
           yAxis: (units.length ? units : [""]).map((unit, n) => ({
             type: "value", scale: true, name: unit, nameTextStyle: text, position: n ? "right" : "left",
             offset: 48 * Math.max(0, n - 1), nameGap: 6,
-            axisLabel: text, splitLine: { show: n === 0, lineStyle: { color: grid, opacity: 0.5 } },
+            axisLabel: { ...text, formatter: this.label }, splitLine: { show: n === 0, lineStyle: { color: grid, opacity: 0.5 } },
           })),
           dataZoom: [
             {

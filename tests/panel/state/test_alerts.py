@@ -102,6 +102,14 @@ def test_grave_words_of_any_vehicle_stand_for_a_while() -> None:
     assert titles(picture, 30 * US_PER_S) == []
 
 
+def test_words_of_nothing_are_no_alert() -> None:
+    picture = picture_at()
+    say(picture, "", 0)
+    say(picture, "  ", 0)
+    assert titles(picture, 1) == []
+    assert not picture.texts.all
+
+
 def test_silent_aircraft_hides_what_is_no_longer_known() -> None:
     picture = picture_at()
     say(picture, "IMU node 1 silent", 0)
