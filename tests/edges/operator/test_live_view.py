@@ -67,11 +67,11 @@ SNAPSHOT = Snapshot(
 )
 
 
-def text_of(*snapshots: Snapshot, width: int = 100) -> str:
+def text_of(*snapshots: Snapshot, width: int = 100, coloured: bool = False) -> str:
     view = LiveView()
     for snapshot in snapshots:
         drawn = view.draw(snapshot)
-    console = Console(width=width, no_color=True)
+    console = Console(width=width, no_color=not coloured, force_terminal=coloured or None)
     with console.capture() as captured:
         console.print(drawn)
     return captured.get()
@@ -216,6 +216,15 @@ def test_a_wide_terminal_is_used() -> None:
 )
 def test_the_recorder_is_reported(recorder: RecorderStatus, text: str) -> None:
     assert text in text_of(replace(WELL_KNOWN, recorder=recorder))
+
+
+def test_a_fix_that_is_none_is_red() -> None:
+    [known] = WELL_KNOWN.aircraft
+    assert known.fix is not None
+    lost = replace(known, fix=msgspec.structs.replace(known.fix, fix_ok=False))
+    red = "\x1b[31mnone"
+    assert red in text_of(replace(WELL_KNOWN, aircraft=(lost,)), coloured=True)
+    assert "\x1b[31m3D" not in text_of(WELL_KNOWN, coloured=True)
 
 
 def test_what_is_not_known_is_no_figure() -> None:

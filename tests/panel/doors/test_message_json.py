@@ -97,6 +97,8 @@ def test_every_message_tells_what_pymavlink_reads() -> None:
 def test_every_template_can_be_sent() -> None:
     for name in sorted(CLASSES):
         assert from_json(template(name)).pack(mavlink.MAVLink(None, 255, 0))
+    message = from_json(template("ATTITUDE_QUATERNION"))
+    assert {getattr(message, name) for name in ("time_boot_ms", "q1", "yawspeed")} == {0}
 
 
 def test_a_heartbeat_as_mavlink2rest_shows_it() -> None:

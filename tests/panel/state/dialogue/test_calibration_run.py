@@ -153,3 +153,15 @@ def test_every_direction_has_its_own_cell() -> None:
     assert sum(seen_cells(middles[:1])) == 1
     assert not any(seen_cells(np.empty((0, 3))))
     assert not any(seen_cells(np.full((2, 3), np.nan)))
+
+
+@pytest.mark.parametrize(
+    "kind", [mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_raw_imu_message]
+)
+def test_other_vehicles_tell_their_samples_in_thousandths(kind: Any) -> None:
+    run = CalibrationRun(1, CalibrationStep.MAG, 0)
+    run.state = RunState.RUNNING
+    for mag in ((200, -30, 400), (0, 0, 0)):
+        run.take(kind(0, 0, 0, -1000, 0, 0, 0, *mag), 0)
+    # A field of nothing is that of a vehicle without a magnetometer.
+    assert run.field_points.tolist() == [pytest.approx([20.0, -3.0, 40.0])]
