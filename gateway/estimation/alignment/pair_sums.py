@@ -36,6 +36,8 @@ class PairSums:
     """Of the force in the gyroscope's frame, alone and by the time."""
     force_squares: Annotated[FloatArray, (3, 3)]
     """Of the products of the force with itself."""
+    pair_turned_var: float
+    """Of the turn in the present pair that was not seen, rad2."""
     noise_excess: float
     """Variance of the level noise of GPS velocities over that of the weights, 1 or more; 0 while
     nothing is known of it. Not forgotten with the pairs: it is the receiver's."""
@@ -47,34 +49,65 @@ def clear_pairs(s: PairSums) -> None:
     for i in range(3):
         for j in range(3):
             s.outer[i, j] = s.information[i, j] = s.force_squares[i, j] = 0.0
-    s.squares = s.pairs = s.gathered_s = 0.0
+    s.squares = s.pairs = s.gathered_s = s.pair_turned_var = 0.0
     fill(s.weight_sums, 0.0)
     fill(s.reference_sums, 0.0)
     fill(s.force_sums, 0.0)
 
 
 @compiled
-def take_pair(s: PairSums, force: Vec3, reference: Vec3, weight: float, dt: float) -> None:
-    """Add the mean force of an interval in the gyroscope's frame and in NED, m/s2."""
-    kept = math.exp(-dt / MEMORY_S)
-    r_sq = reference[0] ** 2 + reference[1] ** 2 + reference[2] ** 2
-    f_sq = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
+def fade_pairs(s: PairSums, kept: float) -> None:
+    """Keep a share of the weight of all pairs."""
     for i in range(3):
         for j in range(3):
-            s.outer[i, j] = kept * s.outer[i, j] + weight * reference[i] * force[j]
-            told = (r_sq if i == j else 0.0) - reference[i] * reference[j]
-            s.information[i, j] = kept * s.information[i, j] + weight * told
-            s.force_squares[i, j] = kept * s.force_squares[i, j] + weight * force[i] * force[j]
-    s.squares = kept * s.squares + 0.5 * weight * (r_sq + f_sq)
-    s.pairs = kept * s.pairs + 1.0
-    s.gathered_s = kept * s.gathered_s + dt
-    W, R, F = s.weight_sums, s.reference_sums, s.force_sums
-    W[2] = kept * (W[2] - 2.0 * dt * W[1] + dt * dt * W[0])
-    W[1] = kept * (W[1] - dt * W[0])
-    W[0] = kept * W[0] + weight
-    for i in range(2):
-        R[2 + i] = kept * (R[2 + i] - dt * R[i])
-        R[i] = kept * R[i] + weight * reference[i]
+            s.outer[i, j] *= kept
+            s.information[i, j] *= kept
+            s.force_squares[i, j] *= kept
+    s.squares *= kept
+    s.pairs *= kept
+    s.gathered_s *= kept
     for i in range(3):
-        F[3 + i] = kept * (F[3 + i] - dt * F[i])
-        F[i] = kept * F[i] + weight * force[i]
+        s.weight_sums[i] *= kept
+    for i in range(4):
+        s.reference_sums[i] *= kept
+    for i in range(6):
+        s.force_sums[i] *= kept
+
+
+@compiled
+def doubt_pairs(s: PairSums, turned_var: float) -> None:
+    """Be less sure of all pairs after a turn that was not seen, of a variance in rad2 an axis."""
+    told = 0.5 * (s.information[0, 0] + s.information[1, 1])
+    fade_pairs(s, 1.0 / (1.0 + told * turned_var))
+    s.pair_turned_var += turned_var
+
+
+@compiled
+def take_pair(s: PairSums, force: Vec3, reference: Vec3, weight: float, dt: float) -> None:
+    """Add the mean force of an interval in the gyroscope's frame and in NED, m/s2."""
+    r_sq = reference[0] ** 2 + reference[1] ** 2 + reference[2] ** 2
+    f_sq = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
+    weight /= 1.0 + weight * f_sq * s.pair_turned_var
+    s.pair_turned_var = 0.0
+    W, R, F = s.weight_sums, s.reference_sums, s.force_sums
+    W[2] += dt * dt * W[0] - 2.0 * dt * W[1]
+    W[1] -= dt * W[0]
+    for i in range(2):
+        R[2 + i] -= dt * R[i]
+    for i in range(3):
+        F[3 + i] -= dt * F[i]
+    fade_pairs(s, math.exp(-dt / MEMORY_S))
+    for i in range(3):
+        for j in range(3):
+            s.outer[i, j] += weight * reference[i] * force[j]
+            told = (r_sq if i == j else 0.0) - reference[i] * reference[j]
+            s.information[i, j] += weight * told
+            s.force_squares[i, j] += weight * force[i] * force[j]
+    s.squares += 0.5 * weight * (r_sq + f_sq)
+    s.pairs += 1.0
+    s.gathered_s += dt
+    W[0] += weight
+    for i in range(2):
+        R[i] += weight * reference[i]
+    for i in range(3):
+        F[i] += weight * force[i]

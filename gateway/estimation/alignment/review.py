@@ -42,6 +42,8 @@ GAP_TILT_RATE: Final = 0.05
 """In a silence the attitude may change by this beside the turn that it was in, rad/s."""
 GAP_LOST_RAD: Final = 0.35
 """An attitude that may have changed by more is no attitude any more."""
+BROUGHT_BACK_RAD: Final = 0.75
+"""Up to this, the velocities of GPS bring one back whose change both ends of a silence tell."""
 MOVING_MPS: Final = 3.0
 """From this speed on, an attitude that was found without GPS is not believed."""
 

@@ -6,6 +6,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import forget_way
+from gateway.estimation.alignment.pair_sums import doubt_pairs
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
@@ -39,13 +40,21 @@ from gateway.estimation.complementary.reorientation import (
     lose_attitude,
     watch_gravity,
 )
-from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown, take_gravity
+from gateway.estimation.complementary.tilt import (
+    doubt_held_level,
+    hold_level,
+    refresh,
+    strapdown,
+    take_gravity,
+)
 from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.filtering.sample_clock import (
     begin_clock,
     is_silent,
     mean_over_step,
     step_clock,
+    unseen_before,
+    unseen_variances,
 )
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
@@ -151,14 +160,7 @@ def take_imu(
         bridge_silence(s, p, gyro, accel, dt)
         write_attitude_std(s)
         return
-    gyro_before, accel_before = as_vec(s.gyro_held), as_vec(s.accel_held)
-    sound_gyro, sound_accel = check_sensors(s, gyro, accel, row[CLIPPED], dt)
-    if sound_gyro and sound_accel:
-        collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
-        gyro, accel = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
-    if row[CLIPPED] != 0.0:
-        doubt_clipped(s, dt)
-    advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
+    move(s, p, gyro, accel, row[CLIPPED], dt)
     follow_rate(s, dt)
     misplaced = s.mag_misplaced
     if is_field_told(s, mag, dt):
@@ -170,6 +172,27 @@ def take_imu(
         doubt_sensors(s, p)
         lose_attitude(s, p)
     refresh(s)
+
+
+@compiled
+def move(
+    s: ComplementaryState, p: ComplementaryGains, gyro: Vec3, accel: Vec3, clipped: float, dt: float
+) -> None:
+    """Integrate one sample, or what stands in for it."""
+    gyro_before, accel_before = as_vec(s.gyro_held), as_vec(s.accel_held)
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
+    newest, unseen_s = gyro, 0.0
+    if sound_gyro and sound_accel:
+        collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
+        unseen_s = unseen_before(s, gyro, dt)
+        if unseen_s > 0.0:
+            gyro = mean_over_step(gyro_before, gyro, unseen_s / dt)
+            accel = mean_over_step(accel_before, accel, unseen_s / dt)
+    if clipped != 0.0:
+        doubt_clipped(s, dt)
+    advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)
+    if unseen_s > 0.0:
+        doubt_lost(s, gyro_before, newest, accel, unseen_s)
 
 
 @compiled
@@ -214,6 +237,18 @@ def advance(
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
     watch_accuracy(s, p)
+
+
+@compiled
+def doubt_lost(
+    s: ComplementaryState, gyro_before: Vec3, gyro: Vec3, accel: Vec3, unseen_s: float
+) -> None:
+    """Doubt the attitude where samples were lost: the mean of both ends stands in for them."""
+    turned, pulled = unseen_variances(s, gyro_before, gyro, as_vec(s.bias_b), accel, unseen_s)
+    s.unseen_m2ps2 += pulled
+    raise_attitude_variance(s, math.sqrt(turned))
+    doubt_held_level(s, turned)
+    doubt_pairs(s, turned)
 
 
 @compiled

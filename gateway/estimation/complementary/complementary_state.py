@@ -222,6 +222,8 @@ class ComplementaryState(FilterState):
     """Heights of fixes above the sea, m: the newest, and the newest that was believed."""
     fix_height_agreed: int
     """1 once a second one has agreed with the one that the height began at."""
+    unseen_m2ps2: float
+    """Variance of the velocity by samples that were lost since `fix_valid_s`."""
     clipped_mps: float
     """What force beyond an accelerometer's range may have done to the velocity since a fix."""
     fix_valid_s: float

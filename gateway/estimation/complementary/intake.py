@@ -11,7 +11,7 @@ from gateway.estimation.alignment.gps_velocity import (
     velocity_noise,
     velocity_of_fix,
 )
-from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.alignment.review import BROUGHT_BACK_RAD, GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.columns import GPS_SPEED_ACC
 from gateway.estimation.complementary.accuracy import doubt_place, settle_place
 from gateway.estimation.complementary.bias import update_bias_at_rest
@@ -23,7 +23,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.drift import doubt_sensors, raise_attitude_variance
-from gateway.estimation.complementary.manoeuvre import LEVEL_STD_RAD, take_fix_velocity
+from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,
     doubt_height,
@@ -35,7 +35,7 @@ from gateway.estimation.complementary.reorientation import (
     lose_attitude,
     review_attitude,
 )
-from gateway.estimation.complementary.tilt import hold_level, refresh, strapdown
+from gateway.estimation.complementary.tilt import doubt_held_level, hold_level, refresh, strapdown
 from gateway.estimation.filtering.fix_intake import (
     accept_fix,
     is_fix_told,
@@ -99,9 +99,9 @@ def bridge_silence(
         return
     q_nb, bias_b = as_quat(s.q_nb), as_vec(s.bias_b)
     mean, std = end_silence(s, q_nb, bias_b, gyro, GAP_TILT_RATE)
-    if std > GAP_LOST_RAD:
+    if std > (BROUGHT_BACK_RAD if s.level_by_gps == 1 else GAP_LOST_RAD):
         bridge_gap(s, p, dt)
-        if s.silent_rad <= GAP_LOST_RAD:
+        if s.lost == 0:
             lose_attitude(s, p)
         return
     go_straight_on(s, rotate(q_nb, silent_rate(s, bias_b))[2] * dt, dt)
@@ -115,10 +115,7 @@ def bridge_silence(
     write_vec(s.accel_held, accel)
     if s.lost == 0:
         hold_level(s)
-        # As sure of the level as a mean over so long.
-        s.force_lp_s = s.gravity_tau_s / (1.0 + (std / LEVEL_STD_RAD) ** 2)
-        if s.level_by_gps == 0:
-            s.unaided_level_sq += more_sq
+        doubt_held_level(s, std * std)
 
 
 @compiled

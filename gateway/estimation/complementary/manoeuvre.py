@@ -27,6 +27,7 @@ from gateway.estimation.complementary.drift import (
     start_level,
 )
 from gateway.estimation.complementary.heading import is_heading_good
+from gateway.estimation.complementary.tilt import LEVEL_STD_RAD
 from gateway.estimation.complementary.unaided import unaided_level_std
 from gateway.estimation.kernel_record import as_quat, as_vec, write_vec
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -41,8 +42,6 @@ JITTER_S: Final = 0.03
 """How much the latency of a fix varies."""
 FORCE_NOISE_MPS2: Final = 0.1
 """Error of the accelerometer beside its bias, with a correlation time of a second."""
-LEVEL_STD_RAD: Final = 0.05
-"""Error of a level that came from gravity."""
 OUTLIER_SIGMA: Final = 3.0
 
 
@@ -84,6 +83,7 @@ def take_fix_velocity(
     write_vec(s.fix_force_i, force_i)
     write_vec(s.fix_vel, vel)
     s.fix_valid_s = valid_s
+    unseen_m2ps2, s.unseen_m2ps2 = s.unseen_m2ps2, 0.0
     if dt > MAX_BASELINE_S or s.heading_known == 0:
         return 0.0
     mean = (
@@ -98,7 +98,7 @@ def take_fix_velocity(
     if s.level_by_gps == 0 and is_heading_good(s):
         start_level(s, p, max(LEVEL_STD_RAD, unaided_level_std(s)))
     force = rotate(as_quat(s.q_ei), mean)
-    variance = match_variance(s, force, noise_mps) / dt
+    variance = match_variance(s, force, noise_mps) / dt + unseen_m2ps2 / (dt * dt)
     for axis in range(3):
         match_force(s, p, axis, mean, accel, variance)
     if s.at_rest == 0:

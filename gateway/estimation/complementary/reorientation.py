@@ -23,8 +23,7 @@ from gateway.estimation.complementary.drift import (
     start_heading,
     start_level,
 )
-from gateway.estimation.complementary.manoeuvre import LEVEL_STD_RAD
-from gateway.estimation.complementary.tilt import hold_level, refresh
+from gateway.estimation.complementary.tilt import LEVEL_STD_RAD, hold_level, refresh
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.quaternion import multiply, normalise

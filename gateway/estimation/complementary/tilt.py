@@ -11,6 +11,7 @@ References
 """
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.complementary.complementary_state import ComplementaryState
@@ -24,6 +25,9 @@ from gateway.geometry.quaternion import (
 )
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
+
+LEVEL_STD_RAD: Final = 0.05
+"""Error of a level that came from gravity."""
 
 
 @compiled
@@ -135,6 +139,17 @@ def hold_level(s: ComplementaryState) -> None:
         s.force_lp_i[k] = s.force_in_i[k] = s.force_mean_i[k]
         s.force_lp_rate_i[k] = 0.0
     s.tilt_sum[0] = s.tilt_sum[1] = 0.0
+
+
+@compiled
+def doubt_held_level(s: ComplementaryState, variance: float) -> None:
+    """Be less sure of a level that gravity holds, after a turn unseen of a variance in rad2."""
+    if s.level_by_gps == 0:
+        s.unaided_level_sq += variance
+    if variance > LEVEL_STD_RAD**2:
+        hold_level(s)
+        # As sure of the level as a mean over so long.
+        s.force_lp_s = s.gravity_tau_s / (1.0 + variance / LEVEL_STD_RAD**2)
 
 
 @compiled

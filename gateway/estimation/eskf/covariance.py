@@ -58,12 +58,12 @@ def propagate(s: EskfState, p: EskfGains) -> None:
     mirror(s.P)
     apply_transition(s, s.P, MOVED)
     symmetrise(s.P)
-    turned = p.gyro_roughness_sq * s.rough_gyro + p.gyro_turn_var * s.pending_rad + s.clipped_rad2
+    turned = p.gyro_roughness_sq * s.rough_gyro + p.gyro_turn_var * s.pending_rad + s.unseen_rad2
     s.force_turn_var += GYRO_BY_FORCE**2 * SCALE_S * s.pending_accel_sq
     pulled = p.accel_scale_sq * SCALE_S * s.pending_accel_sq + p.accel_roughness_sq * s.rough_accel
-    pulled += s.clipped_m2ps2
+    pulled += s.unseen_m2ps2
     note_force_noise(s, dt)
-    s.clipped_rad2 = s.clipped_m2ps2 = 0.0
+    s.unseen_rad2 = s.unseen_m2ps2 = 0.0
     s.pending_accel_sq = s.rough_gyro = s.rough_accel = s.pending_rad = 0.0
     kept = math.exp(-dt / p.gps_wander_s)
     for k in range(3):

@@ -4,7 +4,8 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.review import GAP_S
+from gateway.estimation.alignment.pair_sums import doubt_pairs
+from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S
 from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import follow_rate, present_field
@@ -45,7 +46,13 @@ from gateway.estimation.eskf.start import (
 from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
 from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.filtering.roughness import collect_roughness
-from gateway.estimation.filtering.sample_clock import is_silent, mean_over_step, step_clock
+from gateway.estimation.filtering.sample_clock import (
+    is_silent,
+    mean_over_step,
+    step_clock,
+    unseen_before,
+    unseen_variances,
+)
 from gateway.estimation.filtering.sample_loop import kernels_of
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
@@ -149,7 +156,11 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
-        gyro, accel = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
+        unseen_s = unseen_before(s, gyro, dt)
+        if unseen_s > 0.0:
+            doubt_lost(s, gyro_before, gyro, accel, unseen_s)
+            gyro = mean_over_step(gyro_before, gyro, unseen_s / dt)
+            accel = mean_over_step(accel_before, accel, unseen_s / dt)
     if not sound_gyro:
         gyro = rate_instead(s, as_vec(s.gyro_bias_b))
     if not sound_accel:
@@ -159,11 +170,21 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
 
 
 @compiled
+def doubt_lost(s: EskfState, gyro_before: Vec3, gyro: Vec3, accel: Vec3, unseen_s: float) -> None:
+    """Add noise where samples were lost: the mean of both ends stands in for them."""
+    steady = as_vec(s.gyro_bias_b)
+    turned, pulled = unseen_variances(s, gyro_before, gyro, steady, accel, unseen_s)
+    s.unseen_rad2 += turned
+    s.unseen_m2ps2 += pulled
+    doubt_pairs(s, turned)
+
+
+@compiled
 def doubt_clipped(s: EskfState, dt: float) -> None:
     """Add noise where a sensor was at the end of its range."""
     turned_sq, pulled_sq = clipped_squares(s)
-    s.clipped_rad2 += dt * dt * turned_sq
-    s.clipped_m2ps2 += dt * dt * pulled_sq
+    s.unseen_rad2 += dt * dt * turned_sq
+    s.unseen_m2ps2 += dt * dt * pulled_sq
 
 
 @compiled
@@ -260,6 +281,8 @@ def take_substitutes(s: EskfState, p: EskfGains) -> None:
         end_dead_reckoning(s, p)
     if s.aided == 0:
         propagate(s, p)
+        if s.lost == 0 and level_variance(s) > GAP_LOST_RAD**2:
+            lose_attitude(s, p)
         watch_way(s, dt)
     if s.at_rest == 1:
         update_by_rest(s, p)

@@ -47,9 +47,10 @@ class EskfState(FilterState):
     pending_force_n: Annotated[FloatArray, (3,)]
     pending_rad: float
     """How far the aircraft turned in that time."""
-    clipped_rad2: float
-    clipped_m2ps2: float
-    """Variances of angle and velocity by what a sensor at the end of its range left out since."""
+    unseen_rad2: float
+    unseen_m2ps2: float
+    """Variances of angle and velocity by what has not been seen since: samples that were lost, and
+    what lies beyond the range of a sensor."""
     pending_accel_sq: float
     """Integral of the squared acceleration over that time."""
     pending_turn: Annotated[FloatArray, (3, 3)]

@@ -6,7 +6,11 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import begin_latency, forget_velocities
 from gateway.estimation.alignment.gps_velocity import FASTEST_MPS, forget_way
-from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_TILT_RATE
+from gateway.estimation.alignment.review import (
+    BROUGHT_BACK_RAD,
+    GAP_LOST_RAD,
+    GAP_TILT_RATE,
+)
 from gateway.estimation.alignment.wahba import carry_frame
 from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, propagate, renew, update_scalar
@@ -235,9 +239,9 @@ def bridge_silence(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: floa
         return
     q_nb, bias_b = as_quat(s.q_nb), as_vec(s.gyro_bias_b)
     mean, std = end_silence(s, q_nb, bias_b, gyro, wander_rate(s))
-    if std > GAP_LOST_RAD:
+    if std > (BROUGHT_BACK_RAD if s.aided == 1 else GAP_LOST_RAD):
         bridge_gap(s, p, dt)
-        if s.silent_rad <= GAP_LOST_RAD:
+        if s.lost == 0:
             lose_attitude(s, p)
         return
     dt = min(dt, LONGEST_SILENCE_S)

@@ -30,6 +30,8 @@ RATE_TAU_S: Final = 0.3
 wind, and that of what flies on wings."""
 TURNING_S: Final = 5.0
 """How much turns is averaged over this time."""
+UNSEEN_MPS2: Final = 3.0
+"""By so much a force may differ between two samples from what both tell."""
 STEADY_S: Final = 1.0
 """What turned in a longer silence, both ends of it do not tell."""
 
@@ -78,26 +80,17 @@ def step_clock(s: FilterState, time_us: int) -> float:
 
 
 @compiled
-def mean_over_step(
-    s: FilterState, gyro_before: Vec3, accel_before: Vec3, gyro: Vec3, accel: Vec3, dt: float
-) -> tuple[Vec3, Vec3]:
-    """Return the mean rate and force since the sample before, where samples between were lost.
-
-    A sample tells the usual step before it; over what is missing they changed evenly.
+def unseen_before(s: FilterState, gyro: Vec3, dt: float) -> float:
+    """Return how long samples were lost before the newest one, in s; 0 where none was.
 
     Parameters
     ----------
     s : FilterState
         Follows the usual step, and how much turns.
-    gyro_before, accel_before, gyro, accel : tuple of 3 floats
-        The sample before and the newest one, in body FRD.
+    gyro : tuple of 3 floats
+        Newest sample in body FRD, rad/s.
     dt : float
-        Time between them, s.
-
-    Returns
-    -------
-    tuple of 2 vectors
-        In rad/s and m/s2.
+        Time since the sample before, s.
     """
     if s.usual_step_s == 0.0:
         s.usual_step_s = dt
@@ -106,20 +99,74 @@ def mean_over_step(
     s.turning_sq += min(dt / TURNING_S, 1.0) * (newest_sq - s.turning_sq)
     # After a silence, the sample before is not of the begin of this step.
     if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
-        return (gyro, accel)
-    share = 0.5 * (1.0 - s.usual_step_s / dt)
+        return 0.0
+    return dt - s.usual_step_s
+
+
+@compiled
+def mean_over_step(before: Vec3, newest: Vec3, unseen_share: float) -> Vec3:
+    """Return the mean over a step of which a share was lost: in that it changed evenly.
+
+    The newest sample tells the rest.
+    """
+    share = 0.5 * unseen_share
     return (
-        (
-            gyro[0] + share * (gyro_before[0] - gyro[0]),
-            gyro[1] + share * (gyro_before[1] - gyro[1]),
-            gyro[2] + share * (gyro_before[2] - gyro[2]),
-        ),
-        (
-            accel[0] + share * (accel_before[0] - accel[0]),
-            accel[1] + share * (accel_before[1] - accel[1]),
-            accel[2] + share * (accel_before[2] - accel[2]),
-        ),
+        newest[0] + share * (before[0] - newest[0]),
+        newest[1] + share * (before[1] - newest[1]),
+        newest[2] + share * (before[2] - newest[2]),
     )
+
+
+@compiled
+def turning_variance(s: FilterState, before: Vec3, newest: Vec3, steady: Vec3) -> float:
+    """Return the variance of a rate about a steady one, by what lies behind and by both ends.
+
+    What turns is most often about one axis: that of the three together.
+    """
+    ends_sq = 0.0
+    for k in range(3):
+        ends_sq += 0.5 * ((before[k] - steady[k]) ** 2 + (newest[k] - steady[k]) ** 2)
+    return max(s.turning_sq, ends_sq)
+
+
+@compiled
+def bridged_variance(unseen_s: float) -> float:
+    """Return the variance of the integral over a time of which both ends are told, in s2.
+
+    For an Ornstein-Uhlenbeck process of the variance 1 and the time constant `tau`, over the time
+    `T`: `2 tau (T - 2 tau tanh(T / 2 tau))`.
+    """
+    ends_s = RATE_TAU_S * math.tanh(0.5 * unseen_s / RATE_TAU_S)
+    return 2.0 * RATE_TAU_S * (unseen_s - 2.0 * ends_s)
+
+
+@compiled
+def unseen_variances(
+    s: FilterState, before: Vec3, newest: Vec3, steady: Vec3, force: Vec3, unseen_s: float
+) -> tuple[float, float]:
+    """Return how far the mean of both ends may be off what was lost between them.
+
+    Parameters
+    ----------
+    s : FilterState
+        How much has turned before.
+    before, newest, steady : tuple of 3 floats
+        Rates at both ends and of a steady turn, rad/s.
+    force : tuple of 3 floats
+        Specific force, m/s2: it turns with what turned unseen.
+    unseen_s : float
+        How long samples were lost.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Variances of the angle about one axis, rad2, and of the velocity along one, (m/s)2.
+    """
+    spread = bridged_variance(unseen_s)
+    turned = turning_variance(s, before, newest, steady) * spread
+    force_sq = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
+    pulled = UNSEEN_MPS2 * UNSEEN_MPS2 * spread
+    return (turned, pulled + 0.25 * unseen_s * unseen_s * turned * force_sq)
 
 
 @compiled
@@ -225,8 +272,8 @@ def end_silence(
 
     The rate wanders about the turn that it was in: an Ornstein-Uhlenbeck process of the variance
     `v` and the time constant `tau`. Over the time `T`, what either end differs from that turn by
-    counts for `tau tanh(T / 2 tau)`, and given both ends the angle has the variance
-    `2 v tau (T - 2 tau tanh(T / 2 tau))`. In a long silence, another turn may have begun.
+    counts for `tau tanh(T / 2 tau)`; see `bridged_variance` for how far that may be off. In a long
+    silence, another turn may have begun.
 
     Parameters
     ----------
@@ -252,12 +299,8 @@ def end_silence(
     turn = turn_of(q_nb, rate)
     steady = (bias_b[0] + turn[0], bias_b[1] + turn[1], bias_b[2] + turn[2])
     ends_s = RATE_TAU_S * math.tanh(0.5 * gap_s / RATE_TAU_S)
-    share, ends_sq = ends_s / gap_s, 0.0
-    for k in range(3):
-        ends_sq += 0.5 * ((before[k] - steady[k]) ** 2 + (gyro[k] - steady[k]) ** 2)
-    # What turns is most often about one axis.
-    variance = max(s.turning_sq, ends_sq)
-    turned_sq = 2.0 * variance * RATE_TAU_S * (gap_s - 2.0 * ends_s)
+    share = ends_s / gap_s
+    turned_sq = turning_variance(s, before, gyro, steady) * bridged_variance(gap_s)
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     begun = (wander_radps + turning) * max(gap_s - STEADY_S, 0.0)
     return (
