@@ -116,12 +116,14 @@ class ClockTracker:
         return remote_u32
 
     def _add(self, remote_us: int, delta_us: int) -> bool:
-        """Take in a point if it is the soonest of its bucket; tell whether the line is new."""
+        """Take in a point if beside the drift it is its bucket's soonest; tell whether it is."""
         buckets = self._buckets
         if buckets:
             soonest = buckets[-1]
             bucket, newest = remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
-            if bucket < newest or (bucket == newest and delta_us >= soonest.delta_us):
+            # Of a clock that runs fast, each packet alone seems to come sooner than the last.
+            expected_us = soonest.delta_us + self._skew * (remote_us - soonest.remote_us)
+            if bucket < newest or (bucket == newest and delta_us >= expected_us):
                 return False
             if bucket == newest:
                 buckets.pop()

@@ -40,6 +40,19 @@ def test_offset_and_drift(skew_ppm: float, start_us: int, seed: int) -> None:
     assert tracker.restarts == 0
 
 
+@pytest.mark.parametrize("skew_ppm", [-5000.0, 5000.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_soonest_packet_is_so_beside_the_drift(skew_ppm: float, seed: int) -> None:
+    """By its delay alone it would be the first or the last of its bucket, in a queue or not."""
+    rng = np.random.default_rng(seed)
+    stamps, true_us, _ = packets(rng, seconds=60, skew_ppm=skew_ppm, rate_hz=250.0)
+    arrivals = np.maximum.accumulate(true_us + rng.exponential(2000.0, true_us.size))
+    tracker = ClockTracker()
+    told = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
+    settled = (np.array(told) - true_us)[true_us - true_us[0] > 15e6]
+    assert np.sqrt(np.mean(settled**2)) < 6.0
+
+
 def test_time_is_never_later_than_the_arrival(rng: np.random.Generator) -> None:
     stamps, _, arrivals = packets(rng, seconds=5, skew_ppm=200.0)
     tracker = ClockTracker()
