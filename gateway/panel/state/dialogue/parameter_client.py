@@ -22,9 +22,9 @@ QUIET_US: Final = US_PER_S
 MISSING_AT_ONCE: Final = 20
 MAX_ATTEMPTS: Final = 5
 MAX_PARAMETERS: Final = 5000
+"""Large autopilots have some 1500; more are forged."""
 NOT_REQUESTED: Final = 65_535
 """The index that a value may have which nobody asked for by its index."""
-"""Large autopilots have some 1500; more are forged."""
 AUTOPILOT: Final = 1
 
 ERRORS: Final = {
