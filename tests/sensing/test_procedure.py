@@ -81,7 +81,7 @@ def test_a_pose_that_moved_does_not_count() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
     assert not is_still(shaken)
     assert missing_sides([shaken, pose(SIDES[1])]) == [SIDE_NAMES[0], *SIDE_NAMES[2:]]
-    with pytest.raises(CalibrationError, match="1 poses"):
+    with pytest.raises(CalibrationError, match="1 pose where 6 are needed"):
         calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
 
 
