@@ -35,6 +35,7 @@ LONG_S, LONG_EVERY_S = 0.6, 6.7
 GPS_LOST_S, GPS_EVERY_S = 0.7, 7.7
 FIXES_HZ = 5
 SLOW_HZ = 0.2
+GENTLE_HZ = 0.02
 
 
 def swinging(swing_hz: float = SWING_HZ) -> tuple[SampleLog, Rotation]:
@@ -122,3 +123,12 @@ def test_gps_brings_back_what_a_silence_left_unsure() -> None:
     after = log.imu_time_us > 2e6 * STANDS_S
     assert np.sqrt(np.mean(tilt_deg[after] ** 2)) < 3.0
     assert tilt_deg[after & valid].max() < 6.0
+
+
+def test_after_a_silence_no_single_sample_is_taken_for_gravity() -> None:
+    log, truth = swinging(GENTLE_HZ)
+    log.imu[:, ACCEL : ACCEL + 3] += np.random.default_rng(5).normal(0.0, 1.0, (len(log.imu), 3))
+    seconds = log.imu_time_us * 1e-6
+    keep = (seconds % LONG_EVERY_S >= LONG_S) | (seconds < 4.0 * STANDS_S)
+    tilt_deg, _ = tilt_errors_deg("complementary", without(log, keep), truth[keep])
+    assert tilt_deg[seconds[keep] > 2.0 * STANDS_S].max() < 2.0

@@ -115,6 +115,7 @@ def bridge_silence(
     write_vec(s.accel_held, accel)
     if s.lost == 0:
         hold_level(s)
+        s.force_lp_s = s.gravity_tau_s
         doubt_held_level(s, std * std)
 
 
