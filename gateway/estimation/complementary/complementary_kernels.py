@@ -53,7 +53,6 @@ from gateway.estimation.filtering.sample_clock import (
     is_silent,
     mean_over_step,
     step_clock,
-    unseen_before,
     unseen_variances,
 )
 from gateway.estimation.filtering.sample_loop import kernels_of
@@ -184,10 +183,7 @@ def move(
     newest, unseen_s = gyro, 0.0
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
-        unseen_s = unseen_before(s, gyro, dt)
-        if unseen_s > 0.0:
-            gyro = mean_over_step(gyro_before, gyro, unseen_s / dt)
-            accel = mean_over_step(accel_before, accel, unseen_s / dt)
+        gyro, accel, unseen_s = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
     if clipped != 0.0:
         doubt_clipped(s, dt)
     advance(s, p, gyro, accel, sound_gyro, sound_accel, dt)

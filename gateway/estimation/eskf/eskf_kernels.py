@@ -50,7 +50,6 @@ from gateway.estimation.filtering.sample_clock import (
     is_silent,
     mean_over_step,
     step_clock,
-    unseen_before,
     unseen_variances,
 )
 from gateway.estimation.filtering.sample_loop import kernels_of
@@ -156,11 +155,10 @@ def move(s: EskfState, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bo
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
     if sound_gyro and sound_accel:
         collect_roughness(s, gyro, accel, gyro_before, accel_before, dt)
-        unseen_s = unseen_before(s, gyro, dt)
+        rate, force, unseen_s = mean_over_step(s, gyro_before, accel_before, gyro, accel, dt)
         if unseen_s > 0.0:
             doubt_lost(s, gyro_before, gyro, accel, unseen_s)
-            gyro = mean_over_step(gyro_before, gyro, unseen_s / dt)
-            accel = mean_over_step(accel_before, accel, unseen_s / dt)
+        gyro, accel = rate, force
     if not sound_gyro:
         gyro = rate_instead(s, as_vec(s.gyro_bias_b))
     if not sound_accel:

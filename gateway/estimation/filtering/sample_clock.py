@@ -80,17 +80,26 @@ def step_clock(s: FilterState, time_us: int) -> float:
 
 
 @compiled
-def unseen_before(s: FilterState, gyro: Vec3, dt: float) -> float:
-    """Return how long samples were lost before the newest one, in s; 0 where none was.
+def mean_over_step(
+    s: FilterState, gyro_before: Vec3, accel_before: Vec3, gyro: Vec3, accel: Vec3, dt: float
+) -> tuple[Vec3, Vec3, float]:
+    """Return the mean rate and force since the sample before, where samples between were lost.
+
+    A sample tells the usual step before it; over what is missing they changed evenly.
 
     Parameters
     ----------
     s : FilterState
         Follows the usual step, and how much turns.
-    gyro : tuple of 3 floats
-        Newest sample in body FRD, rad/s.
+    gyro_before, accel_before, gyro, accel : tuple of 3 floats
+        The sample before and the newest one, in body FRD.
     dt : float
-        Time since the sample before, s.
+        Time between them, s.
+
+    Returns
+    -------
+    tuple of 2 vectors and a float
+        In rad/s and m/s2, and how long samples were lost, in s; 0 where none was.
     """
     if s.usual_step_s == 0.0:
         s.usual_step_s = dt
@@ -99,17 +108,15 @@ def unseen_before(s: FilterState, gyro: Vec3, dt: float) -> float:
     s.turning_sq += min(dt / TURNING_S, 1.0) * (newest_sq - s.turning_sq)
     # After a silence, the sample before is not of the begin of this step.
     if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
-        return 0.0
-    return dt - s.usual_step_s
+        return (gyro, accel, 0.0)
+    unseen_s = dt - s.usual_step_s
+    share = 0.5 * (unseen_s / dt)
+    return (part_way(gyro, gyro_before, share), part_way(accel, accel_before, share), unseen_s)
 
 
 @compiled
-def mean_over_step(before: Vec3, newest: Vec3, unseen_share: float) -> Vec3:
-    """Return the mean over a step of which a share was lost: in that it changed evenly.
-
-    The newest sample tells the rest.
-    """
-    share = 0.5 * unseen_share
+def part_way(newest: Vec3, before: Vec3, share: float) -> Vec3:
+    """Return what lies a share of the way from one vector to another."""
     return (
         newest[0] + share * (before[0] - newest[0]),
         newest[1] + share * (before[1] - newest[1]),
@@ -136,8 +143,13 @@ def bridged_variance(unseen_s: float) -> float:
     For an Ornstein-Uhlenbeck process of the variance 1 and the time constant `tau`, over the time
     `T`: `2 tau (T - 2 tau tanh(T / 2 tau))`.
     """
-    ends_s = RATE_TAU_S * math.tanh(0.5 * unseen_s / RATE_TAU_S)
-    return 2.0 * RATE_TAU_S * (unseen_s - 2.0 * ends_s)
+    return 2.0 * RATE_TAU_S * (unseen_s - 2.0 * told_by_an_end(unseen_s))
+
+
+@compiled
+def told_by_an_end(unseen_s: float) -> float:
+    """Return for how much of such a time either end counts, in s: `tau tanh(T / 2 tau)`."""
+    return RATE_TAU_S * math.tanh(0.5 * unseen_s / RATE_TAU_S)
 
 
 @compiled
@@ -298,8 +310,7 @@ def end_silence(
     gap_s, before, rate = s.gap_s, as_vec(s.gyro_held), silent_rate(s, bias_b)
     turn = turn_of(q_nb, rate)
     steady = (bias_b[0] + turn[0], bias_b[1] + turn[1], bias_b[2] + turn[2])
-    ends_s = RATE_TAU_S * math.tanh(0.5 * gap_s / RATE_TAU_S)
-    share = ends_s / gap_s
+    share = told_by_an_end(gap_s) / gap_s
     turned_sq = turning_variance(s, before, gyro, steady) * bridged_variance(gap_s)
     turning = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     begun = (wander_radps + turning) * max(gap_s - STEADY_S, 0.0)
