@@ -149,7 +149,13 @@ bool ubx_read(UbxReader *reader, uint8_t byte) {
     }
 }
 
-bool ubx_reading(const UbxReader *reader) { return reader->state != SYNC_1; }
+bool ubx_begun(const UbxReader *reader) { return reader->state == SYNC_2; }
+
+void ubx_cut(UbxReader *reader) {
+    if (reader->state != SYNC_1) {
+        fail(reader, 0);
+    }
+}
 
 uint8_t ubx_write(uint16_t id, const uint8_t *payload, uint8_t size, uint8_t *out) {
     out[0] = UBX_SYNC_1;

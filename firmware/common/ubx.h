@@ -40,8 +40,11 @@ struct UbxReader {
 // Takes one byte. True if it completes a message: `id`, `size` and `payload` hold until the next.
 bool ubx_read(UbxReader *reader, uint8_t byte);
 
-// True between the first sync byte and the end of a message.
-bool ubx_reading(const UbxReader *reader);
+// True if the last byte may be the first of a message.
+bool ubx_begun(const UbxReader *reader);
+
+// Gives up a message, if one is being read, whose rest stays away.
+void ubx_cut(UbxReader *reader);
 
 // Writes a message around `payload`; `out` holds size + UBX_OVERHEAD bytes. Returns that number.
 uint8_t ubx_write(uint16_t id, const uint8_t *payload, uint8_t size, uint8_t *out);

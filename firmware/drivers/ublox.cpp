@@ -14,6 +14,8 @@ constexpr uint32_t ANSWER_US = 300000;
 // After its port's speed changed the M8N answers at once; the pause lets its last old byte pass.
 constexpr uint32_t SETTLE_US = 50000;
 constexpr uint32_t SILENT_US = 1500000;
+// A message comes in one piece; ten a second leave 74 ms between them at the lowest speed.
+constexpr uint32_t CUT_US = 50000;
 
 enum Step : uint8_t { SET_PORT, SET_MESSAGE, SET_RATE, SET_MODEL, RUNNING };
 
@@ -118,12 +120,15 @@ bool ublox_poll(Ublox *ublox) {
     bool solution = false;
     uint8_t byte;
     while (!solution && uart_read(&byte)) {
-        const bool complete = ubx_read(&ublox->reader, byte);
-        const bool reading = ubx_reading(&ublox->reader);
-        if (reading && !ublox->reading) {
-            ublox->message_us = clock_us();
+        const uint32_t now_us = clock_us();
+        if (clock_passed(now_us, ublox->byte_us + CUT_US)) {
+            ubx_cut(&ublox->reader);
         }
-        ublox->reading = reading;
+        ublox->byte_us = now_us;
+        const bool complete = ubx_read(&ublox->reader, byte);
+        if (ubx_begun(&ublox->reader)) {
+            ublox->message_us = now_us;
+        }
         solution = complete && take_message(ublox);
     }
     if (ublox->step != RUNNING) {

@@ -23,9 +23,9 @@ struct Ublox {
     uint8_t step;
     bool at_factory_speed;
     bool sent;
-    bool reading;
     bool seen;  // since the start
     uint32_t since_us;
+    uint32_t byte_us;  // arrival of the last byte
     uint32_t message_us;  // arrival of the message's first byte
     uint16_t failures;    // configurations not answered or refused, wraps
     UbxReader reader;

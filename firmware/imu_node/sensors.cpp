@@ -33,6 +33,7 @@ bool set_up(Sensors *sensors, uint8_t index) {
         case SENSOR_IMU:
             return mpu6050_set_up();
         case SENSOR_MAG:
+            sensors->mag_due_us = clock_us();
             return hmc5883l_set_up();
         default:
             sensors->baro_step = BEGIN_TEMPERATURE;
@@ -152,10 +153,8 @@ uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
             readings->imu_us = sensors->imu_taken_us;
             return ok ? SENSOR_NEWS_IMU : 0;
         case MAG_READ:
+            ok = ok && hmc5883l_read_bytes(sensors->bytes, readings->mag);
             note(&sensors->states[SENSOR_MAG], ok);
-            if (ok) {
-                hmc5883l_read_bytes(sensors->bytes, readings->mag);
-            }
             return ok ? SENSOR_NEWS_MAG : 0;
         default:
             return end_baro(sensors, ok, readings);
@@ -164,9 +163,9 @@ uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
 
 void watch_imu(Sensors *sensors, uint32_t now_us) {
     SensorState *imu = &sensors->states[SENSOR_IMU];
-    if (imu->answering && clock_passed(now_us, sensors->imu_taken_us + IMU_SILENT_US)) {
+    if (imu->answering && clock_passed(now_us, imu->retry_us)) {
         imu->answering = false;
-        imu->retry_us = now_us;
+        sensors->imu_silent = true;
     }
 }
 
@@ -174,13 +173,15 @@ void begin_job(Sensors *sensors, uint32_t now_us) {
     const uint32_t imu_us = lines_imu_us();
     if (sensors->states[SENSOR_IMU].answering && imu_us != sensors->imu_taken_us) {
         sensors->imu_taken_us = imu_us;
+        sensors->imu_silent = false;
+        sensors->states[SENSOR_IMU].retry_us = imu_us + IMU_SILENT_US;
         read(sensors, IMU_READ, MPU6050_ADDRESS, MPU6050_DATA, MPU6050_DATA_SIZE);
     } else if (sensors->states[SENSOR_MAG].answering && clock_passed(now_us, sensors->mag_due_us)) {
         sensors->mag_due_us += MAG_EVERY_US;
         if (clock_passed(now_us, sensors->mag_due_us)) {
             sensors->mag_due_us = now_us + MAG_EVERY_US;  // it was away: do not catch up
         }
-        read(sensors, MAG_READ, HMC5883L_ADDRESS, HMC5883L_DATA, HMC5883L_DATA_SIZE);
+        read(sensors, MAG_READ, HMC5883L_ADDRESS, HMC5883L_FROM, HMC5883L_SIZE);
     } else if (sensors->states[SENSOR_BARO].answering && clock_passed(now_us, sensors->baro_due_us)) {
         begin_baro(sensors);
     } else {
@@ -195,16 +196,14 @@ void sensors_start(Sensors *sensors, bool self_test) {
     twi_start();
     if (self_test) {
         mpu6050_reset();
+        sensors->self_test_failed = mpu6050_set_up() && !mpu6050_self_test();
     }
-    try_set_up(sensors, SENSOR_IMU);
-    if (self_test && sensors->states[SENSOR_IMU].answering) {
-        sensors->self_test_failed = !mpu6050_self_test();
+    // The MPU6050 once more: a test that broke off may have left its ranges behind.
+    for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
+        try_set_up(sensors, index);
     }
-    try_set_up(sensors, SENSOR_MAG);
-    try_set_up(sensors, SENSOR_BARO);
     lines_start_imu();
     sensors->imu_taken_us = lines_imu_us();
-    sensors->mag_due_us = clock_us();
 }
 
 uint8_t sensors_poll(Sensors *sensors, uint32_t now_us, SensorReadings *readings) {
@@ -231,7 +230,7 @@ uint8_t sensors_present(const Sensors *sensors) {
 }
 
 uint8_t sensors_failed(const Sensors *sensors) {
-    uint8_t bits = sensors->self_test_failed ? WIRE_SENSOR_MPU6050 : 0;
+    uint8_t bits = sensors->self_test_failed || sensors->imu_silent ? WIRE_SENSOR_MPU6050 : 0;
     for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
         bits = static_cast<uint8_t>(bits | (sensors->states[index].answering ? 0 : 1 << index));
     }

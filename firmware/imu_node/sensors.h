@@ -3,7 +3,8 @@
 //
 // One transfer runs at a time. The MPU6050's goes first, since its registers hold a reading for
 // one period only; magnetometer and barometer fill the gaps. A sensor that fails three times in a
-// row, or an MPU6050 whose interrupt stays away, counts as absent and is set up again every 0.2 s.
+// row, lost its set-up, or is an MPU6050 whose interrupt stays away, counts as absent and is set up
+// again every 0.2 s.
 #pragma once
 
 #include <stdint.h>
@@ -18,7 +19,7 @@ struct SensorState {
     bool answering;
     bool seen;  // since the start
     uint8_t failures;
-    uint32_t retry_us;
+    uint32_t retry_us;  // while the MPU6050 answers: when it counts as silent
 };
 
 struct Sensors {
@@ -26,6 +27,7 @@ struct Sensors {
     uint8_t baro_step;
     uint8_t baro_cycle;
     bool self_test_failed;
+    bool imu_silent;  // set up, but without an interrupt since
     SensorState states[SENSOR_COUNT];
     uint32_t imu_taken_us;  // interrupt time of the reading last taken
     uint32_t mag_due_us;

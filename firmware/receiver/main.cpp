@@ -55,6 +55,8 @@ void send_frame(const void *content, uint8_t size) {
 void set_up_radio() {
     receiver.radio_present = nrf24_start_receiver();
     receiver.set_up_due_us = clock_us() + SET_UP_EVERY_US;
+    receiver.noise_state = NOISE_IDLE;
+    receiver.noise_due_us = clock_us() + NOISE_EVERY_US;
 }
 
 void pass_on(const Nrf24Packet &packet, uint32_t arrived_us) {
@@ -131,6 +133,7 @@ void poll_status(uint32_t now_us) {
     send_frame(&status, sizeof status);
     if (receiver.radio_present && !nrf24_configured()) {
         receiver.radio_present = false;
+        receiver.set_up_due_us = now_us;  // the last one may lie more than half a wrap back
     }
 }
 
@@ -143,7 +146,6 @@ int main() {
     board_start();
     set_up_radio();
     receiver.status_due_us = clock_us() + STATUS_EVERY_US;
-    receiver.noise_due_us = clock_us() + NOISE_EVERY_US;
     for (;;) {
         events_wait();
         board_feed_watchdog();

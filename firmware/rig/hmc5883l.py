@@ -26,6 +26,10 @@ class Hmc5883l(RegisterDevice):
     def __init__(self, world: World, clock: Clock, behind: Mpu6050) -> None:
         super().__init__()
         self._world, self._clock, self._behind = world, clock, behind
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Return to the state after power-on: idle, at its own rate."""
         self._registers = {0: 0x10, 1: 0x20, 2: 0x03} | _IDENTIFICATION
 
     def reachable(self) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
+from firmware.rig.boards import Board
 from firmware.rig.mcu import BROWN_OUT, WATCHDOG
 from gateway.records import ImuFlags
 from gateway.wire.link import Link
@@ -14,6 +15,7 @@ from tests.firmware.harness import Bench
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 MakeBench = Callable[..., Bench]
+MAG_NEW = ImuFlags.MAG_NEW
 OVERFLOWS_16_MHZ = 1 << 17
 """Of timer 1 in 2**32 us: 65536 ticks of half a microsecond each."""
 
@@ -80,6 +82,35 @@ def test_time_wraps_after_71_minutes_without_a_gap(bench: MakeBench) -> None:
     assert all((b - a) % 2**32 < 50_000 for a, b in itertools.pairwise(arrivals))
     assert rig.statuses[-1].pipes[0].lost == 0
     assert node.mcu.resets == rig.receiver.mcu.resets == 0
+
+
+def pass_forty_minutes(rig: Bench, board: Board) -> None:
+    """Put a board's clock on: past half of its wrap, where an old time looks like one to come."""
+    for twenty_minutes in (1, 2):
+        board.mcu.write_variable("clock_overflows", twenty_minutes * OVERFLOWS_16_MHZ * 2 // 7, 4)
+        rig.run(1.5)  # the reports that fell due meanwhile
+
+
+def test_a_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBench) -> None:
+    rig = bench()
+    rig.imu_node()
+    rig.run(0.6)
+    pass_forty_minutes(rig, rig.receiver)
+    rig.receiver.radio.power_cycle()
+    rig.run(1.6)
+    assert len(rig.payloads(ImuPayload, since_s=rig.now_s - 0.4)) == pytest.approx(40, abs=3)
+
+
+def test_a_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
+    rig = bench()
+    node = rig.imu_node()
+    node.hmc5883l.absent = True
+    rig.run(0.6)
+    pass_forty_minutes(rig, node)
+    node.hmc5883l.absent = False
+    rig.run(0.5)
+    new = [p for p in rig.payloads(ImuPayload, since_s=rig.now_s - 0.2) if MAG_NEW in p.flags]
+    assert len(new) > 10
 
 
 def test_the_gateways_link_sees_every_sample_and_a_restart(bench: MakeBench) -> None:

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from firmware.rig.m8n import FACTORY_BAUD
+from firmware.rig.m8n import FACTORY_BAUD, ubx
 from firmware.rig.world import Solution, World
 from gateway.records import GpsFixType
 from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, NodeStatusPayload, RadioFrame
@@ -128,6 +128,20 @@ def test_garbage_on_the_line_costs_no_more_than_the_message_it_hits(bench: MakeB
     assert all((f.lat_dege7, f.satellites) == (-77_123_456, 14) for f in fixes)
     assert rig.last(NodeStatusPayload).bus_errors > 0
     assert not rig.faults
+
+
+@pytest.mark.parametrize(
+    "left", [b"\xb5", ubx(0x01, 0x07, bytes(92))[:60]], ids=["one byte", "a head"]
+)
+def test_a_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left: bytes) -> None:
+    rig = bench()
+    node = rig.gps_node()
+    rig.run(CONFIGURED_S + 0.1)
+    node.m8n._say(left)
+    rig.run(0.8)
+    fixes = [f for t, f in rig.frames if t > CONFIGURED_S and isinstance(f.payload, GpsFixPayload)]
+    assert len(fixes) == 5
+    assert all(abs(f.header.node_time_us % 200_000 - 150_000) < 1000 for f in fixes)
 
 
 def test_without_a_receiver_the_node_says_so_and_goes_on_asking(bench: MakeBench) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from firmware.rig.bmp180 import Words
+from firmware.rig.mpu6050 import PWR_MGMT_1, SELF_TEST
 from firmware.rig.world import Moment, World
 from gateway.records import ImuFlags
 from gateway.wire.payloads import BaroPayload, ImuPayload, NodeStatusPayload
@@ -194,6 +195,56 @@ def test_an_mpu6050_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> No
     rig.run(0.5)
     assert len(rig.payloads(ImuPayload, since_s=1.15)) > 30
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
+
+
+def test_a_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -> None:
+    rig = bench(world=World(moment=lambda time_s: Moment(mag_ut=(22.0 + 10.0 * time_s, 1.5, 42.0))))
+    node = rig.imu_node()
+    rig.run(0.8)
+    node.hmc5883l.power_cycle()
+    rig.run(0.6)
+    last = rig.last(ImuPayload)
+    assert last.mag[0] == pytest.approx(10.9 * (22.0 + 10.0 * rig.now_s), abs=5)
+    assert ImuFlags.MAG_ABSENT not in last.flags
+    stale = [p for p in rig.payloads(ImuPayload, since_s=0.85) if p.mag[0] < 10.9 * 30.5]
+    assert not any(ImuFlags.MAG_NEW in p.flags for p in stale)
+
+
+def test_an_mpu6050_without_its_interrupt_is_asked_at_times_and_told(bench: MakeBench) -> None:
+    rig = bench()
+    chip = rig.imu_node().mpu6050
+    rig.run(0.8)
+    woken = 0
+    write, irq = chip.write_register, chip._set_irq
+
+    def count(register: int, value: int) -> None:
+        nonlocal woken
+        woken += register == PWR_MGMT_1
+        write(register, value)
+
+    chip.write_register, chip._set_irq = count, lambda high: None
+    rig.run(1.4)
+    assert 3 <= woken <= 8
+    assert rig.last(NodeStatusPayload).sensors_failed == MPU6050
+    assert len(rig.payloads(BaroPayload, since_s=1.2)) == pytest.approx(25, abs=2)
+    chip._set_irq = irq
+    rig.run(1.2)
+    assert rig.last(NodeStatusPayload).sensors_failed == 0
+
+
+def test_a_self_test_that_breaks_off_leaves_no_range_behind(bench: MakeBench) -> None:
+    rig = bench(world=still(gyro_radps=(1.0, 0.0, 0.0)))
+    chip = rig.imu_node(noise=False).mpu6050
+    read = chip.read_register
+
+    def refuse_what_follows(register: int) -> int:
+        if register == SELF_TEST + 3:
+            chip.refuse_bytes = 1
+        return read(register)
+
+    chip.read_register = refuse_what_follows
+    rig.run(START_S + 0.3)
+    assert rig.last(ImuPayload).gyro == (round(math.degrees(1.0) * 32.8), 0, 0)
 
 
 def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
