@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import logging
+import os
 import shutil
 import subprocess
 import sys
@@ -24,7 +25,14 @@ from gateway.compiled.entry_point import (
     dispatched,
     nothing_compiled,
 )
-from gateway.compiled.machine_code import ONCE, compiling, keep_code
+from gateway.compiled.machine_code import (
+    ONCE,
+    OTHERS_KEPT,
+    MachineCode,
+    compiling,
+    keep_code,
+    kept_code,
+)
 from gateway.estimation.complementary.complementary_kernels import KERNELS
 
 FLOAT = np.dtype(np.float64)
@@ -109,6 +117,38 @@ def test_code_of_an_earlier_source_goes(folder: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(globals(), "scaled", compiled(lambda x: 5.0 * x))
     assert use(EntryPoint(scale)) == [5.25, 12.75]
     assert len(kept_in(folder)) == 1
+
+
+@pytest.mark.io
+def test_installations_leave_each_other_their_code(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_by(installation: str) -> None:
+        monkeypatch.setattr("gateway.compiled.machine_code._made_for", lambda: installation)
+
+    def keep(digest: str, time_s: int) -> None:
+        before = kept_in(folder)
+        keep_code("f", digest, MachineCode(digest.encode(), None))
+        [new] = set(kept_in(folder)).difference(before)
+        os.utime(new, (time_s, time_s))
+
+    run_by("Debian's")
+    keep("first source", 1)
+    run_by("another")
+    assert kept_code("f", "first source") is None
+    keep("first source", 2)
+    keep("second source", 3)
+    assert kept_code("f", "first source") is None
+    run_by("Debian's")
+    assert kept_code("f", "first source") == MachineCode(b"first source", None)
+    for time_s in range(4, 9):
+        run_by(f"one of {time_s}")
+        keep("second source", time_s)
+    assert len(kept_in(folder)) == 1 + OTHERS_KEPT
+    run_by("one of 5")
+    assert kept_code("f", "second source") is not None
+    run_by("Debian's")
+    assert kept_code("f", "first source") is None
 
 
 @pytest.mark.io

@@ -29,6 +29,9 @@ DIGEST_SIZE: Final = hashlib.sha256().digest_size
 READABLE: Final = 0o644
 ENTRY: Final = "entry"
 """The function's symbol."""
+OTHERS_KEPT: Final = 3
+"""Other installations of this minor version of Python (another build, another numba) whose code
+stays: each would else compile anew when another had run."""
 ONCE: Final = "compiling machine code, once after an upgrade: it takes up to a minute"
 
 _HAS_TOLD: Final = mmap.mmap(-1, 1)
@@ -52,8 +55,12 @@ def _made_for() -> str:
 
 
 def _file(folder: Path, name: str, digest: str) -> Path:
-    key = hashlib.sha256((digest + _made_for()).encode()).hexdigest()
-    return folder / f"{name}.{sys.implementation.cache_tag}-{key[:32]}.code"
+    return folder / f"{_begin_of_own(name)}{digest[:32]}.code"
+
+
+def _begin_of_own(name: str) -> str:
+    made_for = hashlib.sha256(_made_for().encode()).hexdigest()
+    return f"{name}.{sys.implementation.cache_tag}-{made_for[:16]}-"
 
 
 def _folders() -> Iterator[Path]:
@@ -107,10 +114,22 @@ def keep_code(name: str, digest: str, code: MachineCode) -> None:
             temporary.chmod(READABLE)
             # Atomic, because another process may be writing the same file.
             temporary.replace(target)
-            for old in folder.glob(f"{name}.{sys.implementation.cache_tag}-*.code"):
-                if old != target:
-                    old.unlink()
+            with contextlib.suppress(OSError):
+                _remove_older(target, name)
             return
+
+
+def _remove_older(target: Path, name: str) -> None:
+    """Remove what earlier sources made, and of other installations' code all but the newest."""
+    code = target.parent.glob(f"{name}.{sys.implementation.cache_tag}-*.code")
+    others = []
+    for file in code:
+        if not file.name.startswith(_begin_of_own(name)):
+            others.append((file.stat().st_mtime_ns, file))
+        elif file != target:
+            file.unlink()
+    for _, file in sorted(others, reverse=True)[OTHERS_KEPT:]:
+        file.unlink()
 
 
 def tell_of_compiling(text: str = ONCE) -> None:
