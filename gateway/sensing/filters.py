@@ -137,6 +137,14 @@ def run(c: Coefficients, z: Delays, x: FloatArray) -> tuple[FloatArray, Delays]:
     return (y, z)
 
 
+def _last_input(c: Coefficients, z: Delays, y: Vec3) -> Vec3:
+    """Return the input of a first-order filter that left these delays with this output."""
+    b1, a1 = c[1], c[3]
+    if b1 == 0.0:
+        return y  # of a pass-through
+    return ((z[0] + a1 * y[0]) / b1, (z[2] + a1 * y[1]) / b1, (z[4] + a1 * y[2]) / b1)
+
+
 class VectorFilter:
     """One filter on three axes, fed one sample at a time or a whole array.
 
@@ -166,11 +174,14 @@ class VectorFilter:
         rate_hz : float
             The new rate.
         """
-        self._coefficients = self._design(rate_hz)
+        before, self._coefficients = self._coefficients, self._design(rate_hz)
         if self.state is not None:
             y = self.state[1]
             gain = gain_at_rest(self._coefficients)
-            x = y if abs(gain) < 1e-9 else (y[0] / gain, y[1] / gain, y[2] / gain)
+            if abs(gain) < 1e-9:
+                x = _last_input(before, *self.state)
+            else:
+                x = (y[0] / gain, y[1] / gain, y[2] / gain)
             self.state = (settled(self._coefficients, x, y), y)
 
     def step(self, x: Vec3) -> Vec3:

@@ -284,3 +284,26 @@ class TestFetch:
         assert sizes[4:9] == [MAX_PIECE] * 5
         assert sizes[-1] == MAX_PIECE // 8
         assert fetching.LARGEST == MAX_PIECE
+        for _ in range(10):
+            pace.note(5.0)
+        assert pace.size == fetching.SMALLEST
+
+    @pytest.mark.parametrize(("took_s", "waited_s"), [(0.1, 0.1), (3.0, fetching.SLOW_S)])
+    def test_telemetry_gets_its_share_of_the_link(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float
+    ) -> None:
+        now_s = 0.0
+        waits: list[float] = []
+
+        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+            nonlocal now_s
+            now_s += took_s
+            if verb == "fleet.digest":
+                return {"sha256": hashlib.sha256(CONTENT[: params["size"]]).hexdigest()}
+            begin = params["offset"]
+            return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
+
+        monkeypatch.setattr(fetching.time, "monotonic", lambda: now_s)
+        one = RecordingFetch("site", tmp_path, ask, wait=waits.append)
+        assert one.fetch(NAME, 3 * fetching.SMALLEST, lambda _: None)
+        assert waits == pytest.approx([waited_s] * 3)

@@ -83,6 +83,25 @@ def test_highpass_forgets_a_constant_at_once() -> None:
     assert f.step((1.5, 0.5, 0.5))[0] == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_highpass_keeps_what_it_has_forgotten_when_retuned() -> None:
+    f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
+    f.step((0.5, -0.3, 0.0))
+    before = f.step((1.5, -0.3, 0.0))
+    f.retune(60.0)
+    assert f.step((1.5, -0.3, 0.0)) == pytest.approx(before, abs=2e-3)
+    assert f.step((0.5, -0.3, 0.0)) == pytest.approx((0.0, 0.0, 0.0), abs=4e-3)
+
+
+def test_a_lowpass_goes_on_from_its_output_when_retuned() -> None:
+    f = VectorFilter(lambda rate: design_lowpass("butterworth", 5.0, rate), 200.0)
+    f.step((0.0, 0.0, 0.0))
+    for _ in range(6):
+        before = f.step((1.0, -1.0, 0.0))
+    f.retune(100.0)
+    after = f.step((1.0, -1.0, 0.0))
+    assert 0.05 < before[0] < after[0] < before[0] + 0.05
+
+
 def test_empty_array() -> None:
     f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
     assert f.run(np.empty((0, 3))).shape == (0, 3)
