@@ -12,6 +12,7 @@ from gateway.estimation.select import EstimationSettings
 from gateway.flightlog.table.row import RowBuilder, TableRow, row_to_line
 from gateway.flightlog.table.table import (
     TableHeader,
+    TableMark,
     TableReader,
     encode_head,
     encode_header,
@@ -284,6 +285,26 @@ def test_replay_tells_the_vehicle_at_its_rates(rng: np.random.Generator) -> None
     times = [now_us for now_us, _ in told]
     assert times == sorted(times)
     assert 9 <= sum(message_id == 0 for _, message_id in told) <= 11
+
+
+def test_what_was_noted_in_flight_happens_again_at_its_time(rng: np.random.Generator) -> None:
+    settings = make_settings("complementary")
+    _, rows = read(fly(settings, make_flight(rng, 3))[0])
+    for follow in (True, False):
+        pipeline = Pipeline(PipelineSettings(settings))
+        playing = Replay(pipeline, follow=follow)
+        for row in rows:
+            *_, (last_us, _) = playing.take(row)
+        texts = [
+            (now_us, action.message_id)
+            for now_us, action in playing.take(TableMark(last_us + 40_000, "over the gate"))
+            if isinstance(action, Outgoing) and b"over the gate" in action.frame
+        ]
+        assert texts == [(last_us + 40_000, 253)]
+        changed = list(playing.take(header_for(make_settings("paper"), 1)))
+        assert {now_us for now_us, _ in changed} == ({last_us + 40_000} if follow else set())
+        estimator = pipeline.aircraft[1].settings.estimation.estimator
+        assert estimator == ("paper" if follow else "complementary")
 
 
 def test_settings_come_back_from_the_head() -> None:

@@ -1,6 +1,7 @@
 """Ctrl-C while the command line starts."""
 
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -31,6 +32,23 @@ PROGRAM = """
     sys.argv.append("check-config")
     main()
 """
+
+
+@pytest.mark.parametrize("module", ["typer", "gateway.daemon"])
+def test_a_background_job_of_a_script_is_ended_while_it_starts(module: str) -> None:
+    """Such a job ignores Ctrl-C from the start on; what `kill` sends ends it at once."""
+    program = textwrap.dedent(PROGRAM).replace("SIGINT)", "SIGTERM)")
+    program = program.replace("signal.default_int_handler", "signal.SIG_IGN")
+    program = program.replace('"check-config"', '"demo"')
+    found = subprocess.run(
+        [sys.executable, "-c", program, module],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        check=False,
+    )
+    assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGTERM, "", "")
 
 
 @pytest.mark.parametrize("module", ["gateway.cli.app", "typer", "numpy", "gateway.config"])

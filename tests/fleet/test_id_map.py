@@ -125,6 +125,18 @@ def test_by_hand() -> None:
             ids.set_by_hand("a", 1, wrong)
 
 
+def test_an_id_that_is_left_by_hand_goes_to_one_that_waits() -> None:
+    ids = IdMap()
+    for n in range(LAST_ID):
+        ids.id_of(f"site-{n}", 1)
+    ids.leave_out("site-7", 1)
+    assert ids.id_of("late", 1) == 8
+    assert ids.id_of("later", 1) is None
+    ids.leave_out("site-9", 1)
+    ids.set_by_hand("site-0", 1, 10)
+    assert ids.id_of("later", 1) == 1
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_no_two_share_an_id_whatever_is_done(seed: int) -> None:
     chance = random.Random(seed)

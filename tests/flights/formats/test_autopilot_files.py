@@ -84,6 +84,21 @@ def test_what_was_logged_is_read(folder: Path, name: str) -> None:
     np.testing.assert_allclose(baros, sent, rtol=1e-6)
 
 
+def test_a_field_that_was_not_new_is_not_read_again(tmp_path: Path) -> None:
+    """PX4 of 2017 repeated the last one in every row, and marked it."""
+    form = flown.FORMATS["sensor_combined"]
+    form += "int32_t magnetometer_timestamp_relative;float[3] magnetometer_ga;"
+    log = flown.Ulog({"sensor_combined": form}, {"MAV_SYS_ID": 7})
+    inertial = (0.0, 0.0, 0.0, 4000, 0, 0.0, 0.0, -9.8, 4000)
+    for number in range(12):
+        mark = -500 if number % 3 == 0 else 0x7FFF_FFFF
+        log.add("sensor_combined", 4000 * number, *inertial, mark, 0.2, 0.0, 0.4)
+    path = tmp_path / "older.ulg"
+    path.write_bytes(b"".join(log.parts))
+    fields = [row.imu.mag_b_ut for row in rows_of(path)[1] if row.imu is not None]
+    assert [bool(field) for field in fields] == [True, False, False] * 4
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
     table, rows = whole(folder / name)

@@ -54,6 +54,9 @@ class Ftp:
         missing = set(range(size))
         burst = self.packet(Opcode.BURST_READ_FILE, session=opened.session, size=239)
         pieces = self.send(burst) + self.packets(self.station.wait(0.5))
+        if len(pieces) * 239 >= size:  # none was lost
+            after = range(burst.sequence + 1, burst.sequence + 1 + len(pieces))
+            assert [piece.sequence for piece in pieces] == list(after)
         for piece in pieces:
             content[piece.offset : piece.offset + piece.size] = piece.data
             missing -= set(range(piece.offset, piece.offset + piece.size))
