@@ -20,7 +20,14 @@ from gateway.estimation.columns import (
     MAG,
     NAV_ATTITUDE_STD,
 )
+from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
+from gateway.estimation.eskf.eskf_state import VEL, EskfState
+from gateway.estimation.eskf.recovery import begin_attitude, found_level_var
 from gateway.estimation.kernel import SampleLog
+from gateway.estimation.kernel_record import new_record
+from gateway.estimation.magfield import CompassSettings
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
@@ -116,3 +123,19 @@ def test_a_hover_that_was_taken_for_a_hand_leaves_no_false_bias() -> None:
         told.append(out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 2])
     assert np.degrees(np.sqrt(np.mean(np.square(off)))) < 12.0
     assert np.mean(np.abs(off) < 2.0 * np.array(told)) > 0.6
+
+
+def test_an_attitude_found_in_flight_knows_of_the_speed_that_has_shown_itself() -> None:
+    """Not of a hand's: neither the velocity, nor the level that the mean force has told."""
+    s, gains = (
+        new_record(EskfState),
+        make_gains(EskfSettings(), ReferenceSettings(), RestSettings(), CompassSettings()),
+    )
+    s.q_nb[0] = 1.0
+    s.unaided_sq, s.level_std, s.gathered_s = 12.0**2, 0.02, 10.0
+    leans = math.sqrt(2.0) * 12.0 / (G * 10.0)
+    assert found_level_var(s) == pytest.approx(leans**2)
+    s.by_gps = 1
+    assert found_level_var(s) == pytest.approx(0.02**2)
+    begin_attitude(s, gains, 0.01, 1.0)
+    assert np.diag(s.P)[VEL : VEL + 3].tolist() == [12.0**2] * 3

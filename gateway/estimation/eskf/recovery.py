@@ -19,12 +19,15 @@ from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS, SHAKEN
 from gateway.geometry.quaternion import multiply, normalise
 from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 ENOUGH_HEADING_RAD: Final = 0.3
 """A heading no surer than this is a beginning: the fixes that follow tell it."""
 LOST_TILT_VAR: Final = 0.5**2
 HAND_VAR: Final = (0.5 * HAND_MPS) ** 2
 """Of each axis of the velocity where an attitude begins in a hand's motion."""
+PULLED_LEVEL_VAR: Final = 0.2**2
+"""A level is found no less sure than this, or it would be lost again at once."""
 OWN_FRAME_VAR: Final = 0.0
 """While no heading is known, it is counted from where the filter began: that it knows."""
 
@@ -48,7 +51,7 @@ def begin_attitude(s: EskfState, p: EskfGains, level_var: float, heading_var: fl
     renew(s, TILT + 2, heading_var)
     s.compass_share = 0.0
     for k in range(3):
-        renew(s, VEL + k, HAND_VAR)
+        renew(s, VEL + k, max(HAND_VAR, s.unaided_sq))
         s.vel_n[k] = 0.0
     s.hand_sq = HAND_VAR
     s.aided = 0
@@ -114,4 +117,18 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
         s.heading_true = 1
     heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else OWN_FRAME_VAR
     raise_bias_variance(s, BIAS_CHANGE_RADPS)
-    begin_attitude(s, p, s.level_std * s.level_std, heading_var)
+    begin_attitude(s, p, found_level_var(s), heading_var)
+
+
+@compiled
+def found_level_var(s: EskfState) -> float:
+    """Return the variance of a level that the alignment has found, rad2.
+
+    By gravity alone, a flight that changes its velocity in the time of the pairs leans the mean
+    force by as much: two velocities of the size that has shown itself, an axis each.
+    """
+    told = s.level_std * s.level_std
+    if s.by_gps == 1:
+        return told
+    span = STANDARD_GRAVITY_MPS2 * max(s.gathered_s, GRAVITY_PAIR_S)
+    return max(told, min(2.0 * s.unaided_sq / (span * span), PULLED_LEVEL_VAR))
