@@ -152,6 +152,8 @@ def clear(s: EskfState) -> None:
     """Begin a measurement: an empty row, no state held."""
     fill(s.h, 0.0)
     fill(s.considered, 0.0)
+    if s.scale_known == 1:
+        consider(s, GYRO_SCALE, 3)
 
 
 @compiled

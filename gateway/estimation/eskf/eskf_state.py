@@ -74,6 +74,8 @@ class EskfState(FilterState):
     compass_share: float
     """How much of what the compass is off on its board the heading is off: 1 while only it tells
     the heading, less the more GPS does."""
+    scale_known: int
+    """1 where the gyroscope's scale is known beforehand, to a smoother: it is only considered."""
     iron_search_started: int
     """1 once the iron that the calibration left is looked for."""
     aided_before: int

@@ -99,8 +99,8 @@ def begin_node(s: EskfState, p: EskfGains, P: FloatArray, F: FloatArray) -> None
 def end_node(s: EskfState, copy: EskfState, F: FloatArray, foreseen: FloatArray) -> None:
     """Keep the covariance foreseen; of what began anew the stretch's begin tells nothing.
 
-    Nor does it of a place that follows the fixes, which is no state, nor of a scale that is only
-    considered: what that adds to the heading is noise to a stretch.
+    Nor does it of a place that follows the fixes, which is no state, nor of a scale without GPS,
+    which a pass of its own has told: what is left of it is noise to a stretch.
     """
     for i in range(STATES):
         for j in range(STATES):

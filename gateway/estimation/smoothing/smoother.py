@@ -11,6 +11,10 @@ with the one that they show.
 A flight without GPS surprises the filter, which took it for rest or for a hand's motion up to then.
 So it is run over once more, knowing of the flight beforehand.
 
+Without any GPS, the filter learns the gyroscope's bias and scale on the way, from an assumed speed;
+the compass must not tell the scale, which the gains of a smoother cannot know. So these passes
+begin with the bias that the one before has ended with, and the last one takes the scale for known.
+
 References
 ----------
 .. [1] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic
@@ -39,7 +43,7 @@ from gateway.estimation.columns import (
 from gateway.estimation.eskf.covariance import MOVED
 from gateway.estimation.eskf.eskf_output import LEVEL_VAR
 from gateway.estimation.eskf.eskf_settings import LASTING_RAD, EskfGains
-from gateway.estimation.eskf.eskf_state import POS, STATES, TILT, VEL
+from gateway.estimation.eskf.eskf_state import GYRO_SCALE, POS, STATES, TILT, VEL
 from gateway.estimation.eskf.unaided_velocity import WAY_S
 from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.kernel import KernelEstimator, SampleLog
@@ -105,12 +109,16 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
         out, P, F, foreseen, d, anew, shown, doubt, on_compass,
     )  # fmt: skip
     run_forward(*arguments)
-    if shown.any():
+    unaided = states[0]["aided_before"] == 0 and state.started == 0
+    for left in range(int(shown.any()) + int(unaided), 0, -1):
         shown[:] = _hindsight(shown)
+        found = states[0].copy()
         states[0] = state
+        if unaided:
+            _begin_with(states[0], found, scale_known=left == 1)
         run_forward(*arguments)
-    found = _backward(P, F, foreseen, d, states[0]["P"], on_compass)
-    begins, ends, variances = (numbers[:, :MOVED] for numbers in found)
+    smoothed = _backward(P, F, foreseen, d, states[0]["P"], on_compass)
+    begins, ends, variances = (numbers[:, :MOVED] for numbers in smoothed)
     variances[:, TILT + 2] += _lasting_doubt(doubt, F) + (PLACE_RAD * on_compass) ** 2
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, anew)
     return out, latency_s
@@ -123,6 +131,20 @@ def _gains_of(estimator: KernelEstimator[Any, Any]) -> EskfGains:
     gains.field_memory_s = FIELD_MEMORY_S
     gains.gyro_roughness_sq *= LASTING_ROUGHNESS
     return gains
+
+
+def _begin_with(state: Any, found: Any, *, scale_known: bool) -> None:
+    """Begin a pass with the gyroscope's bias, and its scale, that the one before has found.
+
+    The bias is as unsure as ever: what is found is where to look for it.
+    """
+    state["gyro_bias_b"] = found["gyro_bias_b"]
+    if not scale_known:
+        return
+    state["scale_known"] = 1
+    state["gyro_scale_b"] = found["gyro_scale_b"]
+    for k in range(GYRO_SCALE, GYRO_SCALE + 3):
+        state["P"][k, k] = found["P"][k, k]
 
 
 def _nodes(time_us: IntArray) -> IntArray:
