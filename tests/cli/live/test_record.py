@@ -1,6 +1,7 @@
 """`mavgate record …` with a gateway that runs."""
 
 import asyncio
+import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -50,8 +51,10 @@ async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
     await gateway.recorder.settle()
     assert "stop it first" in await run("delete", "first", "--yes", code=2)
     assert "idle" in await run("stop")
+    assert "idle: first, part 1" in await run("status")
     # The folder is the one of the gateway that runs, whatever the user's settings say.
-    assert "first" in await run("list")
+    [listed] = [line for line in (await run("list")).splitlines() if "first" in line]
+    assert re.search(r" 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d ", listed), listed
     assert '"name":"first"' in await run("list", "--json")
     assert "first_01.tlog" in await run("delete", "first", "--yes")
     assert f"no recordings in {gateway.recorder.folder}" in await run("list")
