@@ -37,6 +37,7 @@ from gateway.estimation.eskf.fix_doubt import (
     doubt_velocity,
     fade_doubt,
     lag_variance,
+    shared_by,
 )
 from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
@@ -55,6 +56,8 @@ SLOW_MPS: Final = 0.05
 SLOW_S: Final = 4.0
 """Beside their noise GPS velocities are off by as much again, or this, for so long: they do not
 hold the place for ever against the slow error of its fixes."""
+POOR_MPS: Final = 0.5
+"""No receiver in the open tells worse: what it tells beyond is of reflections, and lasts."""
 LEAST_LAG_S: Final = 0.1
 """Over less, an acceleration is mostly vibration."""
 LEAST_S: Final = 0.05
@@ -161,6 +164,20 @@ def velocity_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int) -> fl
 
 
 @compiled
+def lasting_variance(s: EskfState, p: EskfGains, row: FloatArray, k: int, since_s: float) -> float:
+    """Return the noise that errs as much as one component of a fix's velocity does, m2/s2.
+
+    Its errors are alike for a moment; those by reflections, of which the receiver tells, are alike
+    in all fixes of some seconds: noise as large as told would average out.
+    """
+    told = row[GPS_SPEED_ACC]
+    beyond = told * told - POOR_MPS * POOR_MPS if told > POOR_MPS else 0.0
+    reflected = shared_by(since_s) * SPEED_SHARE[k] * SPEED_SHARE[k] * beyond
+    repeated = max(1.0, p.velocity_correlation_s / since_s)
+    return float(repeated * velocity_variance(s, p, row, k) + reflected)
+
+
+@compiled
 def place_variance(p: EskfGains, row: FloatArray, k: int) -> float:
     """Return the noise of one coordinate of a fix from one to the next, m2."""
     usual = p.gps_position_var if k < 2 else p.gps_height_var
@@ -238,12 +255,11 @@ def update_by_fix(
     accel = mean_acceleration(s, lag)
     fade_doubt(s, accel, since)
     late_pos, late_vel = jitter_variances(p, as_vec(s.vel_n)), jitter_variances(p, accel)
-    repeated = max(1.0, p.velocity_correlation_s / since)
     unexpected = lasting_noise_sq(s, accel[0] * accel[0] + accel[1] * accel[1], since)
     noise_vel = (
-        max(repeated * velocity_variance(s, p, row, 0) + late_vel[0], unexpected),
-        max(repeated * velocity_variance(s, p, row, 1) + late_vel[1], unexpected),
-        max(repeated * velocity_variance(s, p, row, 2) + late_vel[2], unexpected),
+        max(lasting_variance(s, p, row, 0, since) + late_vel[0], unexpected),
+        max(lasting_variance(s, p, row, 1, since) + late_vel[1], unexpected),
+        max(lasting_variance(s, p, row, 2, since) + late_vel[2], unexpected),
     )
     noise_pos = (
         place_variance(p, row, 0) + late_pos[0],
