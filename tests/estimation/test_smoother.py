@@ -20,12 +20,13 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_POS_STD,
 )
+from gateway.estimation.eskf.covariance import MOVED
 from gateway.estimation.eskf.eskf_state import STATES
 from gateway.estimation.flagbits import HEADING_VALID, HEADING_VALID_RAD
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
-from gateway.estimation.smoothing.smoother import LASTING_RAD, _backward, smooth
+from gateway.estimation.smoothing.smoother import LASTING_RAD, _backward, _correct, smooth
 from tests.estimation.test_compass_lag import seen
 from tests.estimation.test_flown_unaided import hovering
 from tools.flights import Flight, read_flight, simulated_flight
@@ -116,6 +117,19 @@ def test_a_wrong_scale_is_known_from_the_first_sample_on(scale: float) -> None:
     imu[:, GYRO : GYRO + 3] *= scale
     off, _ = smoothed_off(replace(log, imu=imu), true, 10.0)
     assert rms(np.hypot(off[:, 0], off[:, 1])) < 0.2
+
+
+def test_what_began_anew_is_as_unsure_as_the_filter_told_it() -> None:
+    """An attitude that is lost and found within one stretch is not told as found before it is."""
+    nodes, told = np.array([0, 4, 8]), slice(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3)
+    out, none = np.zeros((8, NAV_COLUMNS)), np.zeros((2, MOVED))
+    out[:, 0] = 1.0
+    anew = np.isin(np.arange(8), (2, 3))
+    out[anew, told] = 0.5
+    variances = np.full((3, MOVED), 0.02**2)
+    _correct(out, np.arange(8) * 125_000, nodes, np.zeros((3, MOVED)), none, variances, anew)
+    expected = np.where(anew, math.hypot(0.5, LASTING_RAD), math.hypot(0.02, LASTING_RAD))
+    np.testing.assert_allclose(out[:, told], np.tile(expected[:, np.newaxis], 3))
 
 
 def rolled(time_s: np.ndarray) -> np.ndarray:

@@ -132,17 +132,19 @@ def share_doubt(s: EskfState, copy: EskfState) -> None:
 
 
 @compiled
-def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
-    """Leave of the standard deviations told only what is no state and no lasting doubt.
-
-    An attitude and a heading that have begun are flagged as valid, however unsure they are.
-    """
+def flag_begun(s: EskfState, row: FloatArray) -> None:
+    """Flag an attitude and a heading that have begun as valid, however unsure they are."""
     flags = int(row[NAV_FLAGS])
     if s.started == 1:
         flags |= ATTITUDE_VALID
     if s.heading_known == 1 and s.heading_true == 1:
         flags |= HEADING_VALID
     row[NAV_FLAGS] = float(flags)
+
+
+@compiled
+def keep_unmodelled(s: EskfState, row: FloatArray) -> None:
+    """Leave of the standard deviations told only what is no state and no lasting doubt."""
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
         for k in range(3):
             beyond = row[column + k] ** 2 - s.P[first + k, first + k]
@@ -199,9 +201,9 @@ def run_forward(
     imu_time_us, imu, baro_time_us, baro_alt_m, gps_time_us, gps : ndarray
         See `SampleLog`.
     out : ndarray, shape (n, NAV_COLUMNS)
-        Filled with what the copy tells; with what the filter tells where that began anew. Of the
-        standard deviations only what is to be added to those of the states; see
-        `keep_unmodelled`.
+        Filled with what the copy tells, of the standard deviations only what is to be added to
+        those of the states; see `keep_unmodelled`. Where the filter began anew, with what that
+        tells: it may begin once more before the stretch ends, as lost and found.
     P, F, foreseen : ndarray, shape (m, STATES, STATES)
         Filled: the covariance at each node, the transition to the next, the covariance foreseen.
     d : ndarray, shape (m, STATES)
@@ -236,7 +238,9 @@ def run_forward(
             if s.aided == 0:
                 # The place is no state then: it is that of the newest fix.
                 write_place(s, out[i])
-            keep_unmodelled(told, out[i])
+            flag_begun(told, out[i])
+            if not anew[i]:
+                keep_unmodelled(told, out[i])
         propagate(s, p)
         foresee(copy, p, F[k])
         end_node(s, copy, F[k], foreseen[k])

@@ -288,6 +288,7 @@ def _correct(
         out[aided, NAV_LON] = wrap_180(lon_deg)
         out[aided, NAV_ALT] -= off[aided, POS + 2]
     variance = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
+    variance[anew] = 0.0
     # The axes are off for a whole flight; averages do not lessen that.
     variance[:, TILT : TILT + 3] += LASTING_RAD**2
     for column, first in ((NAV_ATTITUDE_STD, TILT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
