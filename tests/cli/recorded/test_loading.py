@@ -1,0 +1,59 @@
+"""Flights loaded for the analysis commands."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.support.loading import STORIES, Loading, load_flight
+from gateway.config import GatewaySettings
+from gateway.edges.disk.recording_streams import FileKind
+from gateway.estimation.alignment.latency_of_log import GpsLatency
+from gateway.estimation.select import EstimationSettings
+from gateway.flightlog.table.row import TableRow, row_to_line
+from gateway.flightlog.table.table import encode_head
+from gateway.flights import log_facts
+from gateway.records import ImuCalibrated, ImuFlags, NodeId
+from gateway.replay import header_for
+
+pytestmark = pytest.mark.io
+
+RECORDED = AircraftSettings(estimation=EstimationSettings(estimator="paper"))
+TODAY = Loading(GatewaySettings())
+
+
+def recording(path: Path, samples: int) -> Path:
+    lines = [encode_head(header_for(RECORDED, 1))]
+    for time_us in range(10_000, 10_000 * (samples + 1), 10_000):
+        imu = ImuCalibrated(
+            time_us, NodeId(1, 0), (0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0)
+        )
+        lines.append(row_to_line(TableRow(time_us, imu=imu)))
+    path.write_text("".join(lines))
+    return path
+
+
+def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
+    flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
+    assert flight.fusion.estimation == RECORDED.estimation
+    assert flight.story == STORIES[FileKind.TABLE]
+    today = load_flight(tmp_path / "flight.csv", replace(TODAY, choice="current"))
+    assert today.fusion.estimation == TODAY.settings.default_aircraft.estimation
+
+
+def test_a_doubtful_latency_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(log_facts, "estimate_latency", lambda log: GpsLatency(0.9, 0.01))
+    load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
+    assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
+
+
+def test_too_short_a_recording_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(typer.Exit):
+        load_flight(recording(tmp_path / "flight.csv", 1), TODAY)
+    assert "flight.csv: 1 IMU samples are no flight" in capsys.readouterr().err
