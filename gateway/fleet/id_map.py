@@ -130,8 +130,6 @@ class IdMap:
             self._give(holder, former)
         elif holder is not None:
             self.id_of(*holder)
-        elif former is not None:
-            self.unmapped.clear()
 
     def leave_out(self, site: str, system_id: int) -> None:
         """Take a vehicle's id away and give it none again; the next one that waits gets it."""
