@@ -3,6 +3,8 @@
 import gc
 import multiprocessing
 import os
+import select
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -48,8 +50,8 @@ def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connec
     Parameters
     ----------
     work : callable
-        Called there with the argument and with what it sends by. It ends where it sends and nobody
-        can receive any more, also if this process is killed.
+        Called there with the argument and with what it sends by. That process ends when nobody
+        can receive any more, also if this one is killed.
     argument : object
         In a forked process it need not be picklable.
 
@@ -75,10 +77,19 @@ def _send(
     sender: Connection,
     receiver: Connection,
 ) -> None:
-    # So that sending fails, and does not wait for ever, once nobody receives.
+    # So that the pipe tells once nobody receives.
     receiver.close()
+    threading.Thread(target=_end_unheard, args=(sender,), daemon=True).start()
     with suppress(BrokenPipeError):
         work(argument, sender)
+
+
+def _end_unheard(sender: Connection) -> None:
+    """End this process when nobody can receive any more; it may be long before it sends."""
+    heard = select.poll()
+    heard.register(sender, 0)  # no event but that one
+    heard.poll()
+    os._exit(1)
 
 
 def _begin(work: Callable[..., None], *arguments: Any) -> None:
