@@ -11,10 +11,11 @@ from gateway.cli.live import calibrate
 from gateway.config import load, load_aircraft
 from gateway.flightlog.table.row import TableRow, row_to_line
 from gateway.flightlog.table.table import TableHeader, encode_head
-from gateway.records import GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
+from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.solvers import NodeSamples
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tests.estimation.samples import fix
 
 NODE = NodeId(3, 0)
 G = 9.80665
@@ -159,8 +160,8 @@ def test_a_steady_turn_counts_as_no_rest(tmp_path: Path, config: Path) -> None:
     for time_us in range(0, 80_000_000, 20_000):
         turns = time_us >= 20_000_000
         if time_us % 200_000 == 0:
-            fix = make_fix(time_us, (15.0 if turns else 0.0, 0.0, 0.0))
-            lines.append(row_to_line(TableRow(time_us, gps=fix)))
+            vel = (15.0 if turns else 0.0, 0.0, 0.0)
+            lines.append(row_to_line(TableRow(time_us, gps=fix(time_us, vel=vel))))
         rates = (np.array([5, -8, 330 if turns else 11]) + rng.normal(0, 1, 3)).round()
         lines.append(row_to_line(TableRow(time_us, raw=make_raw(time_us, rates))))
     (tmp_path / "flight_01_v3.csv").write_text("".join(lines))
@@ -176,27 +177,4 @@ def make_raw(time_us: int, rates: np.ndarray) -> ImuRaw:
     mag, no_flags = (200, 30, -400), ImuFlags(0)
     return ImuRaw(
         time_us, NODE, time_us, (0, 0, 4096), (x, y, z), mag, 500, 8, 1000, 1090, no_flags
-    )
-
-
-def make_fix(time_us: int, vel_n_mps: tuple[float, float, float]) -> GpsFix:
-    return GpsFix(
-        time_us=time_us,
-        node=NODE,
-        node_time_us=time_us,
-        itow_ms=time_us // 1000,
-        fix_type=GpsFixType.FIX_3D,
-        fix_ok=True,
-        satellites=11,
-        lat_dege7=471_234_567,
-        lon_dege7=85_678_901,
-        alt_amsl_m=430.0,
-        vel_n_mps=vel_n_mps,
-        alt_ellipsoid_m=np.nan,
-        h_acc_m=1.5,
-        v_acc_m=2.5,
-        speed_acc_mps=0.3,
-        course_acc_deg=2.0,
-        pdop=1.4,
-        utc_us=None,
     )
