@@ -133,6 +133,19 @@ def test_a_comparison_that_fails_says_why_and_may_be_tried_again(
     assert failures == []
 
 
+@pytest.mark.parametrize("may_change", [True, False])
+def test_a_comparison_asks_for_more_samples_where_it_may(
+    monkeypatch: pytest.MonkeyPatch, *, may_change: bool
+) -> None:
+    card, _ = comparison_of(monkeypatch, [ComparisonError("no samples")])
+    asked: list[int] = []
+    context: Any = card._context
+    context.may_change = may_change
+    context.parts.dialogues.ask_for_samples = asked.append
+    asyncio.run(card._compare())
+    assert asked == [1] * may_change
+
+
 def comparison_of(
     monkeypatch: pytest.MonkeyPatch, failures: list[Exception]
 ) -> tuple[ComparisonCard, list[Exception]]:
