@@ -24,6 +24,7 @@ from gateway.edges.disk.recordings import (
     rename_recording,
 )
 from gateway.flightlog.moment import civil_time
+from gateway.flightlog.session import SessionState
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
@@ -46,8 +47,11 @@ def register(app: typer.Typer) -> None:
 
 @group.command()
 def start() -> None:
-    """Record from now on, whatever the setting `mode`."""
-    _show(ask("record.start"))
+    """Record from now on, whatever the setting `mode`; exit code 1 if that is not possible now."""
+    found = ask("record.start")
+    _show(found)
+    if found["state"] == SessionState.BLOCKED:
+        raise typer.Exit(1)
 
 
 @group.command()

@@ -59,3 +59,9 @@ async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
     assert "first_01.tlog" in await run("delete", "first", "--yes")
     assert f"no recordings in {gateway.recorder.folder}" in await run("list")
     assert list(gateway.recorder.folder.iterdir()) == []
+
+
+async def test_a_start_that_records_nothing_is_told_by_its_exit_code(gateway: Bench) -> None:
+    gateway.recorder.folder.write_text("a file in its place")
+    assert "blocked" in await run("start", code=1)
+    assert "exists" in await run("status")
