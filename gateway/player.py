@@ -19,6 +19,7 @@ from gateway.flightlog.answers import VehicleAnswers
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import Player
 from gateway.flights.flight_terms import FlightError
+from gateway.flights.joined import NOTHING_WITHIN
 from gateway.flights.opening import PlayedFlight
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.routing.endpoint import parse_endpoint, stays_here
@@ -50,17 +51,19 @@ class PlayPlan:
 
 
 def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
-    """Fuse tables up to the requested start; raises FlightError if the flights end before."""
+    """Fuse tables up to the requested start; raises FlightError if nothing is to be played."""
     tracks = [track for flight in flights for track in flight.tracks]
+    first_us = begin_us = min(track.first_us for track in tracks)
     if plan.begin is not None:
-        begin_us = place_in(plan.begin, min(track.first_us for track in tracks))
+        begin_us = max(place_in(plan.begin, first_us), first_us)
         while not all(track.prepare(begin_us) for track in tracks):
             pass
         if begin_us > (end_us := max(track.last_us for track in tracks)):
-            first_us = min(track.first_us for track in tracks)
             raise FlightError(
                 f"it ends after {(end_us - first_us) / US_PER_S:.1f} s, before --from"
             )
+    if plan.end is not None and place_in(plan.end, first_us) < begin_us:
+        raise FlightError(NOTHING_WITHIN)
 
 
 def endpoints_beyond(settings: HubSettings) -> list[str]:

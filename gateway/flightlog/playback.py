@@ -83,7 +83,8 @@ class Player:
         loop: bool = False,
     ) -> None:
         self._tracks = tracks
-        self.begin_us = min(t.first_us for t in tracks) if begin_us is None else begin_us
+        first_us = min(t.first_us for t in tracks)
+        self.begin_us = first_us if begin_us is None else max(begin_us, first_us)
         self._end_us = end_us
         self.max_gap_us = max_gap_us
         self.loop = loop
@@ -98,7 +99,8 @@ class Player:
     @property
     def end_us(self) -> int:
         """End of the range; may move while a table is being fused during playback."""
-        return max(t.last_us for t in self._tracks) if self._end_us is None else self._end_us
+        last_us = max(t.last_us for t in self._tracks)
+        return last_us if self._end_us is None else min(self._end_us, last_us)
 
     @property
     def speed(self) -> float:

@@ -119,6 +119,12 @@ def test_a_range_is_played_with_its_context() -> None:
     assert frames[2:] == FRAMES[10:21]
 
 
+def test_a_range_that_is_wider_than_the_recording_is_no_longer_than_it() -> None:
+    player = make_player(begin_us=START_US - 10**15, end_us=START_US + 10**15)
+    assert (player.begin_us, player.end_us) == (START_US, START_US + SPAN_US)
+    assert play_to_end(player)[-1] == (SPAN_US, FRAMES[-1])
+
+
 def test_loop_begins_again_at_once() -> None:
     player = make_player(loop=True)
     assert len(player.poll(SPAN_US, MANY)) == 100

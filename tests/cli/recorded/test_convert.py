@@ -260,6 +260,12 @@ def test_a_beginning_behind_the_end_is_refused(tlog: Path) -> None:
     assert "it ends after 10.0 s, before --from" in text
 
 
+@pytest.mark.parametrize("range_", [("--to", "2010-01-01"), ("--from", "9", "--to", "2010-01-01")])
+def test_an_end_before_the_beginning_is_refused(tlog: Path, range_: tuple[str, ...]) -> None:
+    text = run("play", tlog, *range_, "--endpoint", "udp:127.0.0.1:1", code=2)
+    assert "nothing between that begin and end" in " ".join(text.split())
+
+
 def test_info_for_programs(tlog: Path, table: Path) -> None:
     info = json.loads(run("info", tlog, "--json"))
     assert (info["kind"], info["records"]) == ("tlog", 500)
