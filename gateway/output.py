@@ -58,12 +58,12 @@ def check_output(
 
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
-    if path.exists() or path.is_symlink():
-        if not path.is_dir():
-            raise OSError(errno.ENOTDIR, "is no folder", str(path))
-        if not overwrite and any(path.iterdir()):
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    _check_writable(path, next(folder for folder in (path, *path.parents) if folder.is_dir()))
+    there = next(place for place in (path, *path.parents) if place.exists() or place.is_symlink())
+    if not there.is_dir():
+        raise OSError(errno.ENOTDIR, "is no folder", str(there))
+    if there == path and not overwrite and any(path.iterdir()):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    _check_writable(path, there)
 
 
 def _check_writable(path: Path, folder: Path) -> None:

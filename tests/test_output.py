@@ -133,8 +133,9 @@ def test_a_folder_that_holds_something_is_asked_about(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         check_folder(tmp_path)
     check_folder(tmp_path, overwrite=True)
-    with pytest.raises(OSError, match="no folder"):
-        check_folder(tmp_path / "a", overwrite=True)
+    for below in (tmp_path / "a", tmp_path / "a" / "b" / "c"):
+        with pytest.raises(OSError, match="no folder"):
+            check_folder(below, overwrite=True)
 
 
 def test_an_output_is_checked_before_the_work(tmp_path: Path) -> None:

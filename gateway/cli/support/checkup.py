@@ -172,6 +172,8 @@ def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 def _writable(what: str, folder: Path, text: str) -> Diagnosis:
     existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        return Diagnosis(Grade.WRONG, what, f"{existing} is no folder")
     if os.access(existing, os.W_OK):
         return Diagnosis(Grade.GOOD, what, text)
     return Diagnosis(

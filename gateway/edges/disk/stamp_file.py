@@ -48,7 +48,7 @@ class StampFile:
                 "%s cannot be read: %s. Signed commands of the last minute could be sent again "
                 "by whoever recorded them.",
                 self._file,
-                error,
+                reason_of(error),
             )
             return {}
 

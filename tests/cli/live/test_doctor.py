@@ -87,6 +87,14 @@ def test_folders_that_cannot_be_written(
     assert one(checkup.check_disk, settings).grade is Grade.WRONG
 
 
+def test_folders_below_a_file(settings: GatewaySettings, tmp_path: Path) -> None:
+    (tmp_path / "aircraft").touch()
+    below = replace(settings.recording, folder=str(tmp_path / "aircraft" / "recordings"))
+    for check in (checkup.check_aircraft, checkup.check_disk):
+        found = one(check, replace(settings, recording=below))
+        assert (found.grade, found.text) == (Grade.WRONG, f"{tmp_path}/aircraft is no folder")
+
+
 @pytest.mark.parametrize(("room_mb", "grade"), [(300, Grade.WRONG), (500, Grade.GOOD)])
 def test_room_for_recordings(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, room_mb: int, grade: Grade
