@@ -54,6 +54,8 @@ def _options(
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
     logging.basicConfig(level=level, handlers=[handler])
+    # It tells of each font that it finds.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
 class _StderrNow:

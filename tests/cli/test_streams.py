@@ -72,3 +72,12 @@ def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) ->
     logging.getLogger("gateway").warning("the port has gone")
     assert "the port has gone" in above_the_bar.getvalue()
     assert before.getvalue() == ""
+
+
+def test_fonts_are_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first report of a machine collects them."""
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    app._options(verbose=True)
+    assert logging.getLogger("gateway").isEnabledFor(logging.DEBUG)
+    assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.INFO)

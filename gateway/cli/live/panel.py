@@ -14,6 +14,7 @@ from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
+from gateway.edges.printable import PrintableFormatter
 from gateway.routing.endpoint import parse_endpoint
 
 log = logging.getLogger(__name__)
@@ -58,8 +59,10 @@ def panel(
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
     if attached:
-        # Its important lines come into the gateway's own log.
+        # Its important lines come into the gateway's own log, which stamps them.
         logging.getLogger().setLevel(logging.WARNING)
+        for handler in logging.getLogger().handlers:
+            handler.setFormatter(PrintableFormatter("%(message)s"))
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = Path(settings.recording.folder).expanduser()

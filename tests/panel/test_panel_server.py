@@ -1,0 +1,45 @@
+"""The panel's port, and what it logs as a part of a gateway."""
+
+import logging
+import socket
+from collections.abc import Iterator
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.panel import panel_server
+from gateway.panel.panel_server import PanelError
+from gateway.panel.panel_settings import PanelSettings
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def taken() -> Iterator[PanelSettings]:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        yield PanelSettings(address="127.0.0.1", port=other.getsockname()[1])
+
+
+def test_a_panel_of_a_gateway_takes_another_port(
+    taken: PanelSettings, caplog: pytest.LogCaptureFixture
+) -> None:
+    with panel_server._bound(taken, or_any=True) as bound:
+        assert bound.getsockname()[1] not in (0, taken.port)
+    assert f"127.0.0.1:{taken.port} is in use" in caplog.text
+
+
+def test_a_panel_of_its_own_says_which_port_is_taken(taken: PanelSettings) -> None:
+    with pytest.raises(PanelError, match=f"{taken.port}: Address already in use; --port"):
+        panel_server._bound(taken, or_any=False)
+
+
+def test_the_gateway_alone_stamps_lines_of_its_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_panel(*_: object, **__: object) -> None:
+        logging.getLogger("gateway").info("a page was opened")
+        logging.getLogger("gateway").warning("the port is taken")
+
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    monkeypatch.setattr(panel_server, "run_panel", run_panel)
+    assert CliRunner().invoke(app, ["panel", "--attached"]).output == "the port is taken\n"
