@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import ACCEL, GYRO, NAV_ATTITUDE_STD
 from gateway.estimation.complementary.complementary_state import (
+    SCALE,
     STATES,
     ComplementarySettings,
     ComplementaryState,
     make_gains,
 )
-from gateway.estimation.complementary.drift import SCALE, correct_drift
+from gateway.estimation.complementary.errors.drift_update import correct_drift
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings

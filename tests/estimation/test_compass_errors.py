@@ -46,7 +46,7 @@ def field_of(seed: int, heading: np.ndarray, iron_ut: float) -> np.ndarray:
     return np.asarray(field)
 
 
-def errors_beside_iron(iron_ut: float, *, fixes: bool) -> tuple[np.ndarray, np.ndarray]:
+def errors_beside_iron(name: str, iron_ut: float, *, fixes: bool) -> tuple[np.ndarray, np.ndarray]:
     """Tell how far headings are off beside iron, and what they are told to be, rad."""
     off, told = [], []
     settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
@@ -57,20 +57,25 @@ def errors_beside_iron(iron_ut: float, *, fixes: bool) -> tuple[np.ndarray, np.n
         imu[:, MAG : MAG + 3] = field_of(seed, heading, iron_ut)
         count = len(log.gps) if fixes else 0
         log = replace(log, imu=imu, gps_time_us=log.gps_time_us[:count], gps=log.gps[:count])
-        out = estimator_of("eskf").run(log)
+        out = estimator_of(name).run(log)
         off.append(heading_off(out, heading)[settled:])
         told.append(out[settled:, NAV_ATTITUDE_STD + 2])
     return np.concatenate(off), np.concatenate(told)
 
 
-def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure() -> None:
-    errors, std = errors_beside_iron(IRON_UT, fixes=True)
-    assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
-    assert np.mean(errors < 2.0 * std) > 0.88
+@pytest.mark.parametrize(
+    ("name", "most_deg", "least_share"), [("complementary", 5.0, 0.82), ("eskf", 4.0, 0.88)]
+)
+def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure(
+    name: str, most_deg: float, least_share: float
+) -> None:
+    errors, std = errors_beside_iron(name, IRON_UT, fixes=True)
+    assert np.degrees(np.sqrt(np.mean(errors**2))) < most_deg
+    assert np.mean(errors < 2.0 * std) > least_share
 
 
 def test_iron_is_found_by_turning_without_gps() -> None:
-    errors, std = errors_beside_iron(LEFT_UT, fixes=False)
+    errors, std = errors_beside_iron("eskf", LEFT_UT, fixes=False)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < 4.0
     assert np.mean(errors < 2.0 * std) > 0.95
     assert np.degrees(np.sqrt(np.mean(std**2))) < 5.5

@@ -26,8 +26,15 @@ from gateway.estimation.columns import (
     NAV_POS_STD,
 )
 from gateway.estimation.complementary.accuracy import STEP_S, push_place
-from gateway.estimation.complementary.complementary_state import STATES, ComplementaryState
-from gateway.estimation.complementary.drift import FORCE, PLACE, SPEED, TILT, push_state
+from gateway.estimation.complementary.complementary_state import (
+    FORCE,
+    PLACE,
+    SPEED,
+    STATES,
+    TILT,
+    ComplementaryState,
+)
+from gateway.estimation.complementary.errors.drift_update import push_state
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.geometry.geodesy import radii_m

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import GPS_COLUMNS, GPS_SPEED_ACC
-from gateway.estimation.complementary.compass_error import compass_variance, note_strength
 from gateway.estimation.complementary.complementary_state import (
     ComplementarySettings,
     ComplementaryState,
     make_gains,
 )
+from gateway.estimation.complementary.errors.compass_error import compass_variance, note_field
 from gateway.estimation.complementary.intake import reported_noise
 from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
@@ -134,34 +134,22 @@ class TestField:
         self.feed(state, 70.0, NEW_FIELD_S + 5.0, rate=0.0)
         assert state.mag_disturbed == 1
 
-    @pytest.mark.parametrize("iron_ut", [0.0, 6.0])
-    def test_iron_shows_in_the_strength_and_tells_the_error_of_the_heading(
-        self, iron_ut: float
-    ) -> None:
-        """A flat field of 30 uT with iron to the front, turned about down; white noise is none."""
-        state, headings = new_record(ComplementaryState), []
-        rng = np.random.default_rng(3)
+    def test_turns_that_leave_the_strength_the_same_show_a_compass_without_iron(self) -> None:
+        state = new_record(ComplementaryState)
         for k in range(1200):
             angle = 0.3 * 0.05 * k
-            field = (30.0 * math.cos(angle) + iron_ut, -30.0 * math.sin(angle), 5.0)
-            headings.append(math.remainder(math.atan2(-field[1], field[0]) - angle, math.tau))
-            note_strength(state, field, math.hypot(*field) + rng.normal(0.0, 0.3), 0.05)
-        assert math.sqrt(compass_variance(state, GAINS)[0]) < 0.7 * GAINS.heading_noise_rad
+            field = (30.0 * math.cos(angle), -30.0 * math.sin(angle), 5.0)
+            note_field(state, field, math.hypot(*field), 0.05)
+        assert math.sqrt(compass_variance(state, GAINS)) < 0.7 * GAINS.heading_noise_rad
         state.level_by_gps = 1
-        variance, iron = compass_variance(state, GAINS)
-        assert variance == pytest.approx(GAINS.heading_noise_rad**2 + iron)
-        if iron_ut:
-            assert np.std(headings) == pytest.approx(math.sqrt(iron), rel=0.25)
-        else:
-            assert math.sqrt(iron) < 0.01
+        assert math.sqrt(compass_variance(state, GAINS)) == pytest.approx(GAINS.heading_noise_rad)
 
     def test_a_compass_that_has_not_turned_is_as_good_as_expected(self) -> None:
         state = new_record(ComplementaryState)
         for _ in range(1200):
-            note_strength(state, (20.0, 0.0, 40.0), math.hypot(20.0, 40.0), 0.05)
-        variance, iron = compass_variance(state, GAINS)
-        assert math.sqrt(variance) == pytest.approx(GAINS.heading_noise_rad, rel=1e-6)
-        assert iron == 0.0
+            note_field(state, (20.0, 0.0, 40.0), math.hypot(20.0, 40.0), 0.05)
+        std = math.sqrt(compass_variance(state, GAINS))
+        assert std == pytest.approx(GAINS.heading_noise_rad, rel=1e-6)
 
     def test_a_field_counts_by_its_unlikeness_to_the_usual_one(self) -> None:
         state = new_record(ComplementaryState)

@@ -13,19 +13,15 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_S
 from gateway.estimation.columns import GPS_H_ACC
 from gateway.estimation.complementary.complementary_state import (
-    ComplementaryGains,
-    ComplementaryState,
-)
-from gateway.estimation.complementary.drift import (
     HEADING,
     PLACE,
     SPEED,
     TILT,
-    begin_state,
-    carry_drift,
-    cleared_row,
-    push_state,
+    ComplementaryGains,
+    ComplementaryState,
 )
+from gateway.estimation.complementary.errors.drift import begin_state, carry_drift
+from gateway.estimation.complementary.errors.drift_update import cleared_row, push_state
 from gateway.estimation.complementary.manoeuvre import (
     JITTER_S,
     unbiased_force,

@@ -11,7 +11,6 @@ from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
 from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
 from gateway.estimation.complementary.accuracy import watch_accuracy, write_attitude_std
-from gateway.estimation.complementary.bias import update_bias
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
     write_output,
@@ -20,7 +19,8 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import (
+from gateway.estimation.complementary.errors.bias import update_bias
+from gateway.estimation.complementary.errors.drift import (
     DOUBT,
     begin_drift,
     doubt_sensors,

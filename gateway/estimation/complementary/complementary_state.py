@@ -2,6 +2,7 @@
 
 from typing import Annotated, Final
 
+from gateway.compiled import compiled
 from gateway.estimation.filtering.filter_state import FilterGains, FilterState, filter_gains
 from gateway.estimation.kernel_record import FloatArray, filled_record
 from gateway.estimation.magfield import CompassSettings
@@ -10,8 +11,22 @@ from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
-STATES: Final = 17
-"""Of the Kalman filter in `drift`."""
+HEADING: Final = 3
+"""Turn about down from the level frame to NED; the three before are the bias."""
+COMPASS: Final = 4
+IRON: Final = 5
+"""Three from here, along the body's axes."""
+TILT: Final = 8
+"""Turn of the level frame about its own first two axes."""
+FORCE: Final = 10
+"""The accelerometer's bias."""
+SCALE: Final = 13
+"""The gyroscope's; the last that is estimated, so that it can be left out."""
+SPEED: Final = 16
+PLACE: Final = 18
+"""Along the level frame's first two axes; never estimated."""
+STATES: Final = 20
+"""Of the Kalman filter in `drift`; the three before the heading are the gyroscope's bias."""
 
 
 class ComplementarySettings(Settings, frozen=True):
@@ -189,9 +204,10 @@ class ComplementaryState(FilterState):
     """Time behind the means that follow, see `compass_error`."""
     field_direction_b: Annotated[FloatArray, (3,)]
     strength_ut: float
-    strength_lp_ut: float
-    strength_var_ut2: float
-    """Mean square by which the strength is off its mean."""
+    iron_b: Annotated[FloatArray, (3,)]
+    """Iron that is carried along, in body FRD, uT."""
+    iron_var: float
+    """Variance along an axis that the iron is expected within, uT2."""
     level_dip_rad: float
     """Mean dip that the compass shows while the level is known."""
     level_dip_s: float
@@ -275,3 +291,9 @@ def make_gains(
     values["heading_noise_rad"] = noise_rad
     values |= filter_gains(reference, rest, compass)
     return filled_record(ComplementaryGains, values)
+
+
+@compiled
+def states_in_use(s: ComplementaryState) -> int:
+    """Return how many states there are: without GPS, none from the tilt on."""
+    return STATES if s.level_by_gps == 1 else TILT

@@ -10,21 +10,23 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.complementary.compass_error import note_dip, note_strength
 from gateway.estimation.complementary.complementary_state import (
+    COMPASS,
+    HEADING,
+    IRON,
+    SCALE,
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import (
-    COMPASS,
-    HEADING,
-    SCALE,
+from gateway.estimation.complementary.errors.carried_iron import look_for_iron, tells_heading
+from gateway.estimation.complementary.errors.compass_error import note_dip, note_field
+from gateway.estimation.complementary.errors.drift import carry_drift, heading_variance
+from gateway.estimation.complementary.errors.drift_update import (
     UNCLIPPED,
-    carry_drift,
     cleared_row,
     correct_drift,
-    heading_variance,
 )
+from gateway.estimation.filtering.iron_evidence import heading_by_iron
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, steepness, take_field
 from gateway.geometry.angle import wrap_pi
@@ -62,22 +64,23 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if s.lost == 1:
         return
     dt = min(s.time_s - s.mag_s, STALE_MAG_S)
-    north, east, down = rotate(as_quat(s.q_eb), mag_b)
+    iron = s.iron_b
+    own_b = (mag_b[0] - iron[0], mag_b[1] - iron[1], mag_b[2] - iron[2])
+    field = rotate(as_quat(s.q_eb), own_b)
+    north, east, down = field
     norm = math.sqrt(north * north + east * east + down * down)
     if norm > MIN_FIELD_UT and dt > 0.0:
-        note_strength(s, mag_b, norm, dt)
+        note_field(s, own_b, norm, dt)
+        look_for_iron(s, p, mag_b, field, dt)
     weight = take_field(s, p, norm, down)
-    if weight <= 0.0:
+    if weight <= 0.0 or not tells_heading(field):
         return
-    usual = s.mag_norm_ref > 0.0 and s.mag_disturbed == 0
-    if usual and max(s.told_std[0], s.told_std[1]) < LEVEL_RAD:
+    if s.mag_disturbed == 0 and max(s.told_std[0], s.told_std[1]) < LEVEL_RAD:
         note_dip(s, math.asin(down / norm), dt)
-    declination = s.declination_rad
-    if s.heading_known == 0 or math.isfinite(declination):
-        s.heading_true = 1 if math.isfinite(declination) else s.heading_true
     measured = -math.atan2(east, north)
-    if math.isfinite(declination):
-        measured += declination
+    if math.isfinite(s.declination_rad):
+        measured += s.declination_rad
+        s.heading_true = 1
     carry_drift(s, p)
     if s.heading_known == 0:
         s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
@@ -90,4 +93,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
+    turned = heading_by_iron(as_quat(s.q_eb), field)
+    for k in range(3):
+        row[IRON + k] = turned[k]
     correct_drift(s, p, innovation, density / (dt * weight), UNCLIPPED, SCALE)

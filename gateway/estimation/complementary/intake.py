@@ -14,7 +14,6 @@ from gateway.estimation.alignment.gps_velocity import (
 from gateway.estimation.alignment.review import BROUGHT_BACK_RAD, GAP_LOST_RAD, GAP_TILT_RATE
 from gateway.estimation.columns import GPS_SPEED_ACC
 from gateway.estimation.complementary.accuracy import doubt_place, settle_place
-from gateway.estimation.complementary.bias import update_bias_at_rest
 from gateway.estimation.complementary.complementary_output import (
     DEAD_RECKONING_MAX_S,
 )
@@ -22,7 +21,8 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import doubt_sensors, raise_attitude_variance
+from gateway.estimation.complementary.errors.bias import update_bias_at_rest
+from gateway.estimation.complementary.errors.drift import doubt_sensors, raise_attitude_variance
 from gateway.estimation.complementary.manoeuvre import take_fix_velocity
 from gateway.estimation.complementary.navigation import (
     blend_fix,

@@ -13,19 +13,15 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.wahba import PAIR_WINDOW_S
 from gateway.estimation.complementary.complementary_state import (
-    ComplementaryGains,
-    ComplementaryState,
-)
-from gateway.estimation.complementary.drift import (
     FORCE,
     HEADING,
     SPEED,
     TILT,
-    carry_drift,
-    cleared_row,
-    correct_drift,
-    start_level,
+    ComplementaryGains,
+    ComplementaryState,
 )
+from gateway.estimation.complementary.errors.drift import carry_drift, start_level
+from gateway.estimation.complementary.errors.drift_update import cleared_row, correct_drift
 from gateway.estimation.complementary.heading import is_heading_good
 from gateway.estimation.complementary.tilt import LEVEL_STD_RAD
 from gateway.estimation.complementary.unaided import unaided_level_std

@@ -15,7 +15,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import (
+from gateway.estimation.complementary.errors.drift import (
     doubt_sensors,
     end_level,
     forget_heading,

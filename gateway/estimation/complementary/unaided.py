@@ -12,12 +12,12 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.alignment.wahba import TURN_S
 from gateway.estimation.complementary.complementary_state import (
+    FORCE,
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import (
+from gateway.estimation.complementary.errors.drift import (
     ATTITUDE_WALK_RAD2PS,
-    FORCE,
     SCALE_SHARE,
     TURN_WALK_RAD,
     bias_std,

@@ -80,16 +80,6 @@ class EskfState(FilterState):
     """1 once the iron that the calibration left is looked for."""
     aided_before: int
     """1 once GPS has told the velocity: it tells the accelerometer's bias from tilt."""
-    iron_norm: float
-    """Mean strength of the field in flight, its iron in, uT."""
-    iron_along: Annotated[FloatArray, (3,)]
-    """Mean of how each axis of the iron adds to that."""
-    iron_s: float
-    """Over which time."""
-    iron_misfit: float
-    """Mean square by which the strength differs from what the known iron explains, uT2."""
-    iron_doubted: int
-    """1 once that was more than noise."""
     pseudo_s: float
     """Last time of a measurement that stands in for a sensor: no motion, or little."""
     hand_sq: float

@@ -1,13 +1,6 @@
-"""Iron that a compass carries along: the field's strength tells it, whatever the attitude is.
-
-A field that grows and shrinks as the aircraft turns has a part that turns along. With `B` the
-Earth's strength and `b` that part, `|m|^2 - |m - b|^2 = b . (2 m - b)` makes the strength of the
-raw field `|m| = B + b . d` with `d = (2 m - b) / (|m| + |m - b|)`. `B` goes out with the means of
-both sides. What of it points up or down, or along the field's level part, also bends the dip.
-"""
+"""Iron that a compass carries along, as three states: by what `iron_evidence` shows of it."""
 
 import math
-from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.covariance import (
@@ -22,13 +15,16 @@ from gateway.estimation.eskf.covariance import (
 )
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_SCALE, MAG_BIAS, STATES, TILT, EskfState
-from gateway.estimation.eskf.measure import (
-    MISFIT_S,
-    STRENGTH_NOISE,
-    compass_correlation_s,
-    compass_row,
-)
+from gateway.estimation.eskf.measure import compass_correlation_s, compass_row
 from gateway.estimation.filtering.covariance_scale import limit_variance
+from gateway.estimation.filtering.iron_evidence import (
+    MISFIT_S,
+    compare_strength,
+    dip_by_iron,
+    mean_strengthening,
+    strength_noise_sq,
+    unexplained_iron_sq,
+)
 from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.magfield import (
     DIP_ERROR_RAD,
@@ -40,9 +36,6 @@ from gateway.estimation.magfield import (
 )
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
-
-MEAN_S: Final = 60.0
-"""The strength of the field itself stays the same over this time."""
 
 
 @compiled
@@ -67,32 +60,21 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
         return
     if s.aided == 0 and s.mag_disturbed == 1:
         return
-    b = s.mag_bias_b
-    c0, c1, c2 = raw[0] - b[0], raw[1] - b[1], raw[2] - b[2]
-    norm = math.sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2])
-    total = norm + math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
-    along = ((raw[0] + c0) / total, (raw[1] + c1) / total, (raw[2] + c2) / total)
     dt = min(dt, STALE_MAG_S)
-    s.iron_s += dt
-    share = dt / min(s.iron_s, MEAN_S)
-    s.iron_norm += share * (norm - s.iron_norm)
-    off = norm - s.iron_norm
-    for k in range(3):
-        s.iron_along[k] += share * (along[k] - s.iron_along[k])
-        off -= (along[k] - s.iron_along[k]) * b[k]
-    noise = (STRENGTH_NOISE * s.iron_norm) ** 2
-    s.iron_misfit += dt / MISFIT_S * (off * off - s.iron_misfit)
-    if s.aided == 1 and s.iron_misfit > noise:
+    off, along = compare_strength(s, raw, as_vec(s.mag_bias_b), dt)
+    unexplained_sq = unexplained_iron_sq(s)
+    if s.aided == 1 and unexplained_sq > 0.0:
         s.iron_doubted = 1
-        doubt_iron(s, (s.iron_misfit - noise) * dt / MISFIT_S)
+        doubt_iron(s, unexplained_sq * dt / MISFIT_S)
     if s.aided == 0 or s.iron_doubted == 1:
         propagate(s, p)
         clear(s)
         if s.aided == 0:
             consider(s, GYRO_SCALE, 3)
         for k in range(3):
-            s.h[MAG_BIAS + k] = along[k] - s.iron_along[k]
-        update_scalar(s, off, noise * max(1.0, compass_correlation_s(s) / dt), p.gate_sq)
+            s.h[MAG_BIAS + k] = along[k]
+        repeated = max(1.0, compass_correlation_s(s) / dt)
+        update_scalar(s, off, strength_noise_sq(s) * repeated, p.gate_sq)
         inject(s)
 
 
@@ -117,7 +99,9 @@ def update_by_dip(s: EskfState, p: EskfGains, field_n: Vec3, dt: float) -> None:
     if s.aided == 0 or s.iron_search_started == 0 or not math.isfinite(s.earth_dip_rad):
         return
     clear(s)
-    dip_by_iron(s, field_n)
+    bent = dip_by_iron(as_quat(s.q_nb), field_n)
+    for k in range(3):
+        s.h[MAG_BIAS + k] = bent[k]
     if innovation_variance(s, 0.0) < DIP_ERROR_RAD * DIP_ERROR_RAD:
         return
     propagate(s, p)
@@ -156,19 +140,6 @@ def spread_heading(s: EskfState, field_n: Vec3, more: float) -> None:
 
 
 @compiled
-def dip_by_iron(s: EskfState, field_n: Vec3) -> None:
-    """Write into the row how the iron changes the field's dip, rad/uT."""
-    north, east, down = field_n
-    level = math.hypot(north, east)
-    norm_sq = level * level + down * down
-    q = as_quat(s.q_nb)
-    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
-    for k in range(3):
-        along = (north * axes[k][0] + east * axes[k][1]) / level
-        s.h[MAG_BIAS + k] = (down * along - level * axes[k][2]) / norm_sq
-
-
-@compiled
 def dip_by_tilt(s: EskfState, field_n: Vec3) -> None:
     """Write into the row how the tilt changes the field's dip."""
     level = math.hypot(field_n[0], field_n[1])
@@ -181,9 +152,7 @@ def follow_field(s: EskfState, dip: float, dt: float) -> None:
     """Take for the usual field what is left of it without the iron that is just being found."""
     if s.iron_doubted == 0 or s.mag_norm_ref == 0.0:
         return
-    b = s.mag_bias_b
-    turned = s.iron_along[0] * b[0] + s.iron_along[1] * b[1] + s.iron_along[2] * b[2]
-    s.mag_norm_ref = s.iron_norm - turned
+    s.mag_norm_ref = s.iron_norm - mean_strengthening(s, as_vec(s.mag_bias_b))
     s.mag_dip_ref += min(dt, STALE_MAG_S) / FIELD_TAU_S * (dip - s.mag_dip_ref)
 
 

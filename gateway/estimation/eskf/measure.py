@@ -27,26 +27,23 @@ from gateway.estimation.eskf.eskf_state import (
     VEL,
     EskfState,
 )
+from gateway.estimation.filtering.iron_evidence import (
+    COMPASS_CORRELATION_S,
+    MISFIT_S,
+    heading_by_iron,
+    unexplained_iron_sq,
+)
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import steepness
 from gateway.geometry.angle import wrap_pi
-from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
 REST_VELOCITY_VAR: Final = 0.2**2
 REST_RATE_VAR: Final = 0.002**2
 UNAIDED_CORRELATION_S: Final = 1.0
 """The true speed that is taken for noise changes in about this time."""
-COMPASS_CORRELATION_S: Final = 1.0
-"""The errors of soft iron and current change with the attitude, so in about this time: recorded
-compasses were 3 to 5 deg off, for half a second to two."""
 UNAIDED_COMPASS_S: Final = 5.0
 """Without GPS the tilt is off for as long as this, and the field's dip turns the compass by it."""
-STRENGTH_NOISE: Final = 0.03
-"""Share by which the field's strength varies with no iron to find: soft iron, scale, currents."""
-MISFIT_S: Final = 20.0
-"""A strength that has varied for so long beyond its noise is that of unknown iron; the heading's
-error by it lasts as long, for it changes with the attitude alone."""
 FAR_SQ: Final = 1e12
 
 
@@ -59,10 +56,9 @@ def compass_row(s: EskfState, field_n: Vec3) -> None:
     s.h[TILT] = -down * north / level_sq
     s.h[TILT + 1] = -down * east / level_sq
     s.h[TILT + 2] = 1.0
-    q = as_quat(s.q_nb)
-    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
+    turned = heading_by_iron(as_quat(s.q_nb), field_n)
     for k in range(3):
-        s.h[MAG_BIAS + k] = (east * axes[k][0] - north * axes[k][1]) / level_sq
+        s.h[MAG_BIAS + k] = turned[k]
 
 
 @compiled
@@ -70,12 +66,6 @@ def compass_correlation_s(s: EskfState) -> float:
     """Return for how long the errors of the compass are alike, s."""
     unaided = s.aided == 0 and s.iron_search_started == 1
     return UNAIDED_COMPASS_S if unaided else COMPASS_CORRELATION_S
-
-
-@compiled
-def unexplained_iron_sq(s: EskfState) -> float:
-    """Return the variance, per axis, of what bends the field beyond the iron that is known, uT2."""
-    return max(s.iron_misfit - (STRENGTH_NOISE * s.iron_norm) ** 2, 0.0)
 
 
 @compiled

@@ -7,6 +7,7 @@ from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
+from gateway.estimation.filtering.iron_evidence import IronState
 from gateway.estimation.filtering.roughness import RoughnessState
 from gateway.estimation.flagbits import (
     AT_REST,
@@ -58,6 +59,7 @@ class FilterState(
     RoughnessState,
     RestState,
     FieldState,
+    IronState,
     LagState,
     LatencyState,
     ReviewState,

@@ -9,14 +9,13 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.complementary.complementary_state import (
+    SCALE,
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.drift import (
-    BIAS_WALK_RAD2PS3,
-    SCALE,
+from gateway.estimation.complementary.errors.drift import BIAS_WALK_RAD2PS3, carry_drift
+from gateway.estimation.complementary.errors.drift_update import (
     UNCLIPPED,
-    carry_drift,
     cleared_row,
     correct_drift,
 )

@@ -1,10 +1,10 @@
-"""Errors of attitude and sensors: a Kalman filter of thirteen states, and of four that follow.
+"""Errors of attitude and sensors: a Kalman filter of sixteen states, and of four that follow.
 
-The gyroscope bias in body FRD, the heading, the slow error of the compass (iron, and the place),
-the tilt of the level frame, the accelerometer bias in body FRD, and the scale of each axis of the
-gyroscope. The compass is wrong by some degrees, but that error changes slowly: a heading that
-drifts away from the compass reveals the gyroscope bias long before the compass corrects the
-heading, and a heading from GPS reveals the error of the compass.
+The gyroscope bias in body FRD, the heading, the slow error of the compass (soft iron, and the
+place), the iron that it carries along, the tilt of the level frame, the accelerometer bias in body
+FRD, and the scale of each axis of the gyroscope. The compass is wrong by some degrees, but that
+error changes slowly: a heading that drifts away from the compass reveals the gyroscope bias long
+before the compass corrects the heading, and a heading from GPS reveals the error of the compass.
 
 Only GPS reveals the scale: iron turns the compass in step with each turn, as a wrong scale would.
 To all other measurements it is only considered, the Schmidt-Kalman update: its gain is zero, its
@@ -13,45 +13,38 @@ uncertainty still counts.
 Speed and place are blended by `navigation`, not estimated here; their errors follow from the
 others, which push them, and are only considered.
 
-While the low-pass of gravity levels the attitude, neither the tilt nor the accelerometer bias nor
-the scale is estimated; `bias` then corrects the gyroscope bias by what the low-pass corrects.
+While the low-pass of gravity levels the attitude, neither the iron nor the tilt nor the
+accelerometer bias nor the scale is estimated; `bias` then corrects the gyroscope bias by what the
+low-pass corrects.
 """
 
 import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.complementary.compass_error import compass_variance
 from gateway.estimation.complementary.complementary_state import (
+    COMPASS,
+    FORCE,
+    HEADING,
+    IRON,
+    SCALE,
     STATES,
+    TILT,
     ComplementaryGains,
     ComplementaryState,
+    states_in_use,
 )
+from gateway.estimation.complementary.errors.compass_error import compass_variance
+from gateway.estimation.complementary.errors.drift_update import widen_prior
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
-from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
+from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
-    from_rotation_vector,
-    multiply,
-    normalise,
     rotate_inverse,
 )
 from gateway.units import RAD_PER_DEG
-
-HEADING: Final = 3
-"""Turn about down from the level frame to NED; the three before are the bias."""
-COMPASS: Final = 4
-TILT: Final = 5
-"""Turn of the level frame about its own first two axes."""
-FORCE: Final = 7
-"""The accelerometer's bias."""
-SCALE: Final = 10
-"""The gyroscope's; the last that is estimated, so that it can be left out."""
-SPEED: Final = 13
-PLACE: Final = 15
-"""Along the level frame's first two axes; never estimated."""
 
 BIAS_WALK_RAD2PS3: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
 """A drift of 0.1 deg/s in 100 s."""
@@ -60,21 +53,18 @@ ATTITUDE_WALK_RAD2PS: Final = (0.1 * RAD_PER_DEG) ** 2
 TURN_WALK_RAD: Final = 1e-5
 """Variance of the attitude after a turn of 1 rad, by the axes of the gyroscope."""
 SCALE_SHARE: Final = 0.01
-SCALE_LIMIT: Final = 0.1
-"""The scale of a gyroscope is off by this to begin with, a third of an MPU6050's tolerance, and at
-most."""
+"""The scale of a gyroscope is off by this to begin with, a third of an MPU6050's tolerance."""
 FORCE_BIAS_MPS2: Final = 0.1
-FORCE_BIAS_LIMIT_MPS2: Final = 0.5
 FORCE_WALK_M2PS5: Final = 0.002**2
-"""Bias of the accelerometer at the start, at most, and its random walk."""
+"""Bias of the accelerometer at the start, and its random walk."""
 ROUGH_SHARE: Final = 0.5
 """Of what is uneven in the angular rate: an engine's shaking to and fro adds up less than noise."""
+IRON_UT: Final = 0.05
+"""Iron along an axis that a calibration leaves."""
 DOUBT: Final = 2.0
 """A bias that may have changed is believed so much less: what follows it is slower than it."""
 UNKNOWN_VAR: Final = 10.0
 """Variance of a heading of which nothing is known, rad2."""
-UNCLIPPED: Final = 1e9
-"""An innovation of so many standard deviations counts whole."""
 
 
 @compiled
@@ -84,6 +74,7 @@ def begin_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         s.drift_cov[k, k] = p.bias_initial_radps**2
         s.drift_cov[FORCE + k, FORCE + k] = FORCE_BIAS_MPS2**2
     forget_scale(s)
+    forget_iron(s)
     forget_heading(s, p)
     forget_compass(s, p)
 
@@ -119,11 +110,21 @@ def forget_scale(s: ComplementaryState) -> None:
 
 
 @compiled
+def forget_iron(s: ComplementaryState) -> None:
+    """Know nothing of the iron that the compass carries along."""
+    for k in range(3):
+        s.iron_b[k] = 0.0
+        begin_state(s, IRON + k, IRON_UT**2)
+    s.iron_var = IRON_UT**2
+
+
+@compiled
 def doubt_sensors(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Doubt what gyroscope and compass have shown by an attitude that was wrong."""
     carry_drift(s, p)
     raise_bias_variance(s, DOUBT * BIAS_CHANGE_RADPS)
     forget_scale(s)
+    forget_iron(s)
     forget_compass(s, p)
 
 
@@ -153,12 +154,6 @@ def end_level(s: ComplementaryState, p: ComplementaryGains) -> None:
     s.level_by_gps = 0
     for k in range(TILT, STATES):
         begin_state(s, k, s.drift_cov[k, k] if k >= FORCE else 0.0)
-
-
-@compiled
-def states_in_use(s: ComplementaryState) -> int:
-    """Return how many states there are: without GPS, none from the tilt on."""
-    return STATES if s.level_by_gps == 1 else TILT
 
 
 @compiled
@@ -225,12 +220,10 @@ def note_roughness(s: ComplementaryState) -> None:
 
 @compiled
 def carry_compass(s: ComplementaryState, p: ComplementaryGains) -> None:
-    """Carry the compass's error on: it fades with time, and that of iron as the aircraft turns."""
-    variance, iron = compass_variance(s, p)
+    """Carry the compass's slow error on: it fades with time."""
+    variance = compass_variance(s, p)
     widen_compass(s, variance)
-    still = variance - iron
-    faded = (s.carried_s / p.tau_heading_s * still + s.carried_rad * iron) / variance
-    kept = math.exp(-faded)
+    kept = math.exp(-s.carried_s / p.tau_heading_s)
     scale_state(s.drift_cov, COMPASS, kept)
     s.drift_cov[COMPASS, COMPASS] += (1.0 - kept * kept) * variance
     s.compass_rad *= kept
@@ -244,118 +237,8 @@ def widen_compass(s: ComplementaryState, variance: float) -> None:
     gave to the heading, but none that GPS has given.
     """
     if variance > s.compass_var:
-        cleared_row(s)[COMPASS] = 1.0
-        expected_variance(s)
-        excess = s.drift_cov[COMPASS, COMPASS] - 1.0 / (1.0 / s.compass_var - 1.0 / variance)
-        if excess < 0.0:
-            reduce_covariance(s, excess, SCALE)
+        widen_prior(s, COMPASS, s.compass_var, variance)
     s.compass_var = variance
-
-
-@compiled
-def cleared_row(s: ComplementaryState) -> FloatArray:
-    """Return the row of a measurement, all zero, to be filled."""
-    for k in range(STATES):
-        s.drift_row[k] = 0.0
-    return s.drift_row
-
-
-@compiled
-def correct_drift(
-    s: ComplementaryState,
-    p: ComplementaryGains,
-    innovation: float,
-    variance: float,
-    clip: float,
-    count: int,
-) -> None:
-    """Update the states by one scalar measurement.
-
-    Parameters
-    ----------
-    s : ComplementaryState
-        Changed in place; its covariance has been carried on, `drift_row` holds the measurement's
-        derivatives by the states.
-    p : ComplementaryGains
-        Constants.
-    innovation : float
-        Measured less expected value.
-    variance : float
-        Of the measurement.
-    clip : float
-        An innovation counts up to so many of its standard deviations.
-    count : int
-        The first so many states are corrected, `SCALE` or `SPEED`; what follows is considered.
-    """
-    if not math.isfinite(innovation):
-        return
-    spread = variance + expected_variance(s)
-    reduce_covariance(s, spread, count)
-    most = clip * math.sqrt(spread)
-    apply_gain(s, p, max(-most, min(most, innovation)) / spread, count)
-
-
-@compiled
-def expected_variance(s: ComplementaryState) -> float:
-    """Return the variance of the expected measurement; fills `drift_gain` with `P h`."""
-    P, gain, row, n = s.drift_cov, s.drift_gain, s.drift_row, states_in_use(s)
-    for k in range(n):
-        gain[k] = 0.0
-    for j in range(n):
-        if row[j] != 0.0:
-            for k in range(n):
-                gain[k] += P[j, k] * row[j]
-    spread = 0.0
-    for k in range(n):
-        spread += row[k] * gain[k]
-    return spread
-
-
-@compiled
-def push_state(s: ComplementaryState, k: int, dt: float) -> None:
-    """Let state `k` change for `dt` seconds at the rate whose derivatives stand in `drift_row`."""
-    P, gain = s.drift_cov, s.drift_gain
-    pushed_sq = dt * dt * expected_variance(s)
-    for j in range(STATES):
-        P[k, j] += dt * gain[j]
-    for j in range(STATES):
-        P[j, k] = P[k, j]
-    P[k, k] += dt * gain[k] + pushed_sq
-
-
-@compiled
-def reduce_covariance(s: ComplementaryState, spread: float, count: int) -> None:
-    """Reduce the covariance after a measurement whose innovation has the variance `spread`.
-
-    That of the states from `count` on with one another stays.
-    """
-    P, gain, n = s.drift_cov, s.drift_gain, states_in_use(s)
-    for k in range(n):
-        share = gain[k] / spread
-        for j in range(min(k + 1, count)):
-            P[k, j] -= share * gain[j]
-            P[j, k] = P[k, j]
-        P[k, k] = max(P[k, k], 0.0)
-
-
-@compiled
-def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float, count: int) -> None:
-    """Correct the first `count` states by a multiple of `drift_gain`."""
-    gain, limit = s.drift_gain, p.bias_limit_radps
-    for k in range(3):
-        s.bias_b[k] = max(-limit, min(limit, s.bias_b[k] + gain[k] * share))
-    s.heading_rad = wrap_pi(s.heading_rad + gain[HEADING] * share)
-    s.compass_rad += gain[COMPASS] * share
-    if s.level_by_gps == 0:
-        return
-    for k in range(3):
-        force = s.accel_bias_b[k] + gain[FORCE + k] * share
-        s.accel_bias_b[k] = max(-FORCE_BIAS_LIMIT_MPS2, min(FORCE_BIAS_LIMIT_MPS2, force))
-        if count == SPEED:
-            scale = s.scale_b[k] + gain[SCALE + k] * share
-            s.scale_b[k] = max(-SCALE_LIMIT, min(SCALE_LIMIT, scale))
-    turn = from_rotation_vector((gain[TILT] * share, gain[TILT + 1] * share, 0.0))
-    write_quat(s.q_ei, normalise(multiply(turn, as_quat(s.q_ei))))
 
 
 @compiled

@@ -1,0 +1,1 @@
+"""Errors of attitude and sensors: a Kalman filter, and what tells it of them."""
