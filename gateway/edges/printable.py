@@ -7,6 +7,8 @@ _CONTROLS: Final = {
     code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
 }
 """A terminal obeys them: they move its cursor, rename its window, type for its user."""
+LONGEST: Final = 2000
+"""Letters of a log line; an address that a page is asked for may have 60,000."""
 
 
 def printable(text: str) -> str:
@@ -18,5 +20,8 @@ class PrintableFormatter(logging.Formatter):
     """Formats log lines whose texts may come from others."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
-        return printable(super().format(record))
+        """Return the line of a record; what others fill it with is cut off."""
+        line = super().format(record)
+        if len(line) > LONGEST and not record.exc_info:
+            line = f"{line[:LONGEST]}…"
+        return printable(line)

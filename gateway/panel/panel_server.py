@@ -99,6 +99,7 @@ def run_panel(
     lock = PageLock(settings.password, settings.viewer_password)
     config = uvicorn.Config(
         PageGuard(app, settings, lock),
+        log_config=None,  # the log is the one of every command
         log_level="warning",
         access_log=False,
         server_header=False,

@@ -94,7 +94,11 @@ class PanelProcess:
     async def _read(self, child: asyncio.subprocess.Process) -> None:
         if child.stdout is None:
             return
-        async for line in child.stdout:
+        while not child.stdout.at_eof():
+            try:
+                line = await child.stdout.readline()
+            except ValueError:
+                continue  # too long a line, which is gone
             text = line.decode(errors="replace").rstrip()
             if text.startswith(LINK):
                 self.link = text.removeprefix(LINK)

@@ -32,6 +32,17 @@ async def test_it_has_ended_when_it_is_closed(
     assert panel._child.returncode == code
 
 
+@pytest.mark.io
+async def test_a_line_of_any_length_leaves_the_next_to_be_read() -> None:
+    panel = PanelProcess(None)
+    panel._arguments = ["-c", "print('x' * 200_000); " + SAYING]
+    panel.start(control_socket)
+    async with asyncio.timeout(60.0):
+        while not panel.link:
+            await asyncio.sleep(0.01)
+    await panel.close()
+
+
 async def test_it_is_closed_while_it_waits_for_the_gateway() -> None:
     panel = PanelProcess(None)
     panel.start(asyncio.get_running_loop().create_future)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
-from gateway.edges.printable import PrintableFormatter
+from gateway.edges.printable import LONGEST, PrintableFormatter
 from gateway.flightlog.table.row import COLUMNS
 from gateway.flightlog.table.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
@@ -289,3 +289,8 @@ def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> No
 def test_a_log_line_holds_no_control_characters() -> None:
     record = logging.makeLogRecord({"msg": "from %s", "args": ("\x1b[2J\r",)})
     assert PrintableFormatter("%(message)s").format(record) == r"from \x1b[2J\x0d"
+
+
+def test_a_log_line_is_not_as_long_as_somebody_wants() -> None:
+    record = logging.makeLogRecord({"msg": "%s not found", "args": ("/" * 60_000,)})
+    assert len(PrintableFormatter("%(message)s").format(record)) == LONGEST + 1
