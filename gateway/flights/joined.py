@@ -27,20 +27,23 @@ Limits = tuple[Moment | None, Moment | None]
 NOTHING_WITHIN: Final = (
     "there is nothing between that begin and end; `mavgate info` shows the length"
 )
-OLDER: Final = "a recording is older than the first; give the oldest first"
+OLDER: Final = "a recording is older than the one before it; give the oldest first"
 OVERLAP: Final = "left out {} that overlap with the recording before"
+LATE_US: Final = 1_000_000
+"""Rows of one clock that are older by less than this came late, and are in their place."""
 
 
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     """Put tables of one aircraft behind one another on the clock of the first.
 
-    Parts of one recording share a clock; other recordings are put in their place by civil time,
-    and where two overlap, the later one is taken from the end of the earlier one on.
+    Parts of one recording share a clock; other recordings are put in their place by civil time.
+    Where two overlap, the later one is taken from the end of the earlier one on.
 
     Raises
     ------
     FlightError
-        If they are of several aircraft; while the rows are read, if one is older than the first.
+        If they are of several aircraft; while the rows are read, if one begins before the one
+        that it is given behind.
     """
     vehicles = sorted({table.header.vehicle_id for table in tables})
     if len(vehicles) > 1:
@@ -50,25 +53,25 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     remarks: list[str] = []
 
     def blocks() -> Iterator[TableBlock]:
-        known, first_us, newest_us = first, math.inf, -math.inf
+        known, begun_us, newest_us = first, -math.inf, -math.inf
         for table in tables:
             header, left_out = table.header, 0
             if (header.settings, header.calibration) != (known.settings, known.calibration):
                 yield TableBlock(NO_ROWS, ((0, header),))
             shift_us = _shift_us(header, first)
-            is_behind = shift_us is None or table is tables[0]
+            is_behind = None
             for block in table.blocks:
                 for _, comment in block.comments:
                     known = comment if isinstance(comment, TableHeader) else known
                 placed = shifted(block, shift_us or 0)
                 times_us = placed.cells[:, 0]
+                if len(block) and is_behind is None:
+                    is_behind = _is_behind(times_us[0], shift_us, begun_us, newest_us)
+                    begun_us = times_us[0]
                 if len(block) and not is_behind:
-                    if times_us[0] < first_us:
-                        raise FlightError(OLDER)
                     overlap = _first(times_us >= newest_us)
                     placed, is_behind = _without(placed, overlap), overlap < len(block)
                     left_out += overlap
-                first_us = times_us[:1].min(initial=first_us)
                 newest_us = times_us.max(initial=newest_us)
                 yield placed
             remarks.extend(table.remarks)
@@ -78,14 +81,27 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     return RecordedTable(first, blocks(), remarks)
 
 
-def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
-    """Return how far two clocks are apart by civil time.
+def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us: float) -> bool:
+    """Return whether a recording begins at the end of the one before, as far as that is known.
 
-    None where that does not tell: the parts of a recording have one clock, by whatever name.
+    Raises
+    ------
+    FlightError
+        If it begins before that one has begun.
     """
+    if shift_us is None:
+        return True
+    if begin_us < begun_us:
+        raise FlightError(OLDER)
+    return shift_us == 0 and begin_us > newest_us - LATE_US
+
+
+def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
+    """Return how far two clocks are apart by civil time; None where that does not tell."""
     zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
-    is_part = header.session != "" and header.session == first.session
-    if is_part or zero_us is None or first_zero_us is None:
+    if header.session != "" and header.session == first.session:
+        return 0  # parts of a recording, whose time GPS may have corrected in between
+    if zero_us is None or first_zero_us is None:
         return None
     shift_us = zero_us - first_zero_us
     return 0 if abs(shift_us) <= JUMP_US else shift_us

@@ -73,7 +73,7 @@ class FlightToWrite:
         self.is_mavlink = kinds == {FileKind.TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
-        self._fusions: list[RecordedFusion] = []
+        self._sources: list[RecordedFusion | RecordedTable] = []
         self._remarks: list[str] = []
 
     def frames(self) -> Iterator[TlogRecord]:
@@ -90,6 +90,7 @@ class FlightToWrite:
         """Return the rows: as recorded, or fused again from the start and then cut."""
         if self._as_recorded:
             table = joined_tables([open_rows(file, self.options) for file in self.files])
+            self._sources.append(table)
         else:
             table = self.fused().table()
         return trimmed(table, self._limits)
@@ -112,8 +113,7 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user, complete once all is written."""
-        fused = (remark for fusion in self._fusions for remark in fusion.remarks)
-        return [*self._remarks, *fused]
+        return [*self._remarks, *(remark for source in self._sources for remark in source.remarks)]
 
     def remark(self, text: str) -> None:
         """Add a remark for the user."""
@@ -121,8 +121,9 @@ class FlightToWrite:
 
     def fused(self) -> RecordedFusion:
         """Return these files fused again."""
-        self._fusions.append(RecordedFusion(self.files, self.options, smooth=self._smooth))
-        return self._fusions[-1]
+        fusion = RecordedFusion(self.files, self.options, smooth=self._smooth)
+        self._sources.append(fusion)
+        return fusion
 
     def _sent(self) -> Iterator[TlogRecord]:
         """Yield the frames that the gateway would send for all aircraft, stamped as in one file."""

@@ -14,15 +14,19 @@ EPOCH_US = 1_780_000_000 * SECOND_US
 
 
 def table(begin_s: int, end_s: int, zero_us: int | None, session: str = "") -> RecordedTable:
-    """Return a row a second on a clock of its own, which begins at 0; each tenth is remarked."""
+    """Return a row a second; each tenth is remarked.
+
+    They are on a clock of their own, which begins at 0, unless they are part of a session.
+    """
     seconds = np.arange(begin_s, end_s)
+    zero_s = 0 if session else begin_s
     cells = np.full((len(seconds), len(COLUMNS)), np.nan)
-    cells[:, 0] = (seconds - begin_s) * SECOND_US
+    cells[:, 0] = (seconds - zero_s) * SECOND_US
     if zero_us is not None:
-        zero_us += begin_s * SECOND_US
+        zero_us += zero_s * SECOND_US
     head = TableHeader(vehicle_id=1, unix_us_at_zero=zero_us, session=session)
     marks = [
-        (k, TableMark(k * SECOND_US, f"{second}"))
+        (k, TableMark((second - zero_s) * SECOND_US, f"{second}"))
         for k, second in enumerate(seconds.tolist())
         if second % 10 == 0
     ]
@@ -49,6 +53,7 @@ def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int
     assert joined.remarks == []
 
 
+@pytest.mark.parametrize("session", ["", "20260611-142530"])
 @pytest.mark.parametrize(
     ("spans", "kept", "left_out"),
     [
@@ -58,9 +63,9 @@ def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int
     ],
 )
 def test_what_two_recordings_hold_is_taken_once(
-    spans: tuple[tuple[int, int], ...], kept: range, left_out: int
+    spans: tuple[tuple[int, int], ...], kept: range, left_out: int, session: str
 ) -> None:
-    joined = joined_tables([table(*span, EPOCH_US) for span in spans])
+    joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
     times, marks = seconds_of(joined)
     # The last second of a recording may hold more than one row.
     assert sorted(set(times)) == [*kept]
@@ -70,16 +75,25 @@ def test_what_two_recordings_hold_is_taken_once(
     assert remark.startswith(f"left out {left_out} rows")
 
 
-def test_an_older_recording_behind_a_newer_one_is_refused() -> None:
-    joined = joined_tables([table(50, 90, EPOCH_US), table(0, 40, EPOCH_US)])
+@pytest.mark.parametrize("session", ["", "20260611-142530"])
+@pytest.mark.parametrize("spans", [((50, 90), (0, 40)), ((0, 40), (80, 90), (40, 80))])
+def test_an_older_recording_behind_a_newer_one_is_refused(
+    spans: tuple[tuple[int, int], ...], session: str
+) -> None:
+    joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
     with pytest.raises(FlightError, match="give the oldest first"):
         list(joined.blocks)
 
 
-@pytest.mark.parametrize(("zero_us", "session"), [(None, ""), (EPOCH_US, "20260611-142530")])
-def test_parts_and_recordings_without_a_civil_time_stay_on_their_clock(
-    zero_us: int | None, session: str
-) -> None:
-    joined = joined_tables([table(0, 9, zero_us, session), table(20, 29, zero_us, session)])
+def test_recordings_without_a_civil_time_stay_on_their_clock() -> None:
+    joined = joined_tables([table(0, 9, None), table(20, 29, None)])
     times = np.concatenate([block.cells[:, 0] for block in joined.blocks]) / SECOND_US
     assert times.tolist() == [*range(9), *range(9)]
+
+
+def test_parts_of_a_recording_stay_on_their_clock() -> None:
+    """GPS has corrected the time between them; a row that came late is in its place."""
+    first, second = table(0, 10, EPOCH_US, "flight"), table(9, 20, EPOCH_US + 10**9, "flight")
+    times, marks = seconds_of(joined := joined_tables([first, second]))
+    assert times == [*range(10), *range(9, 20)]
+    assert (marks, joined.remarks) == ([0, 10], [])

@@ -266,6 +266,20 @@ def test_an_end_before_the_beginning_is_refused(tlog: Path, range_: tuple[str, .
     assert "nothing between that begin and end" in " ".join(text.split())
 
 
+def test_a_part_that_is_given_twice_is_taken_once_and_that_is_told(
+    table: Path, tmp_path: Path
+) -> None:
+    written = table.read_text()
+    assert '"session":""' in written
+    table.write_text(written.replace('"session":""', '"session":"flight"'))
+    text = run("convert", table, table, "-o", tmp_path / "x.csv")
+    times, recorded = (
+        [row.time_us for row in read_table(path)[1]] for path in (tmp_path / "x.csv", table)
+    )
+    assert f"left out {len(recorded) - 1} rows that overlap" in " ".join(text.split())
+    assert times == [*recorded, recorded[-1]]
+
+
 def test_info_for_programs(tlog: Path, table: Path) -> None:
     info = json.loads(run("info", tlog, "--json"))
     assert (info["kind"], info["records"]) == ("tlog", 500)
