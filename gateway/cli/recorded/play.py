@@ -289,7 +289,7 @@ def _speed(text: str) -> float:
     try:
         return check_speed(float(text))
     except ValueError as error:
-        raise FlightError(f"--speed {text}: 0.1 to 100, or {FASTEST}") from error
+        raise FlightError(f"speed {text!r}: write 0.1 to 100, or {FASTEST}") from error
 
 
 def _place(status: PlayerStatus) -> str:

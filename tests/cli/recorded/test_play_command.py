@@ -1,4 +1,4 @@
-"""`mavgate play` asks before recorded commands leave this machine."""
+"""What `mavgate play` and `player` ask and refuse before they do anything."""
 
 from pathlib import Path
 
@@ -22,3 +22,11 @@ def test_without_a_yes_no_command_leaves_this_machine(tmp_path: Path) -> None:
         assert (done.exit_code, "No such file" in done.output) == (2, True)
     plain = CliRunner().invoke(app, ["play", file, *away])
     assert (plain.exit_code, "No such file" in plain.output) == (2, True)
+
+
+@pytest.mark.parametrize("speed", ["0", "nan", "101", "fast", ""])
+@pytest.mark.parametrize("words", [["play", "x.tlog", "--speed"], ["player", "speed"]])
+def test_a_speed_out_of_range_is_refused(words: list[str], speed: str) -> None:
+    done = CliRunner().invoke(app, [*words, speed])
+    assert done.exit_code == 2
+    assert f"speed {speed!r}: write 0.1 to 100, or max" in done.output
