@@ -1,6 +1,7 @@
 """What a calibration leaves in a compass: iron that turns along, found by turning."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from tests.estimation.test_without_compass import (
     heading_off,
 )
 from tools.flights import simulated_flight
-from tools.score_estimators import OWN, attitude_scores
+from tools.score_estimators import OWN, attitude_scores, run_complementary
 from tools.score_honesty import share, two_sigma
 
 IRON_UT = 4.0
@@ -72,6 +73,36 @@ def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure(
     errors, std = errors_beside_iron(name, IRON_UT, fixes=True)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < most_deg
     assert np.mean(errors < 2.0 * std) > least_share
+
+
+def flown_with(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[float, float]:
+    """Fly `complementary` on a compass that tells otherwise than the field.
+
+    Returns how far its heading is off, rms in deg, and for which share it is within two sigma.
+    """
+    flown = simulated_flight(11, calibrated=True)
+    imu, time_s = flown.log.imu.copy(), flown.log.imu_time_us * 1e-6
+    imu[:, MAG : MAG + 3] = change(imu[:, MAG : MAG + 3], time_s)
+    changed = replace(flown, log=replace(flown.log, imu=imu))
+    out = run_complementary(changed)
+    return attitude_scores(changed, out[:, :4])["heading"], share(
+        two_sigma(changed, out)["heading"]
+    )
+
+
+def test_a_reversed_compass_is_not_believed_where_the_dip_of_the_earths_field_is_known() -> None:
+    off_deg, within = flown_with(lambda field, _: -field)
+    assert off_deg < 2.0
+    assert within > 0.9
+
+
+def test_iron_that_comes_and_goes_is_not_learned_as_if_it_stayed() -> None:
+    iron = np.array([12.0, -9.0, 13.0])
+    off_deg, within = flown_with(
+        lambda field, time_s: field + iron * ((time_s // 7.0) % 2.0)[:, None]
+    )
+    assert off_deg < 2.0
+    assert within > 0.9
 
 
 def test_iron_is_found_by_turning_without_gps() -> None:

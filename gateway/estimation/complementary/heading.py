@@ -19,14 +19,18 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.carried_iron import look_for_iron, tells_heading
-from gateway.estimation.complementary.errors.compass_error import note_dip, note_field
+from gateway.estimation.complementary.errors.compass_error import is_likely, note_dip, note_field
 from gateway.estimation.complementary.errors.drift import carry_drift, heading_variance
 from gateway.estimation.complementary.errors.drift_update import (
     UNCLIPPED,
     cleared_row,
     correct_drift,
 )
-from gateway.estimation.filtering.iron_evidence import heading_by_iron
+from gateway.estimation.filtering.iron_evidence import (
+    MISFIT_S,
+    heading_by_iron,
+    unexplained_iron_sq,
+)
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, steepness, take_field
 from gateway.geometry.angle import wrap_pi
@@ -71,11 +75,13 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     norm = math.sqrt(north * north + east * east + down * down)
     if norm > MIN_FIELD_UT and dt > 0.0:
         note_field(s, own_b, norm, dt)
-        look_for_iron(s, p, mag_b, field, dt)
+        if is_likely(s, norm):
+            look_for_iron(s, p, mag_b, field, dt)
     weight = take_field(s, p, norm, down)
     if weight <= 0.0 or not tells_heading(field):
         return
-    if s.mag_disturbed == 0 and max(s.told_std[0], s.told_std[1]) < LEVEL_RAD:
+    level = max(s.told_std[0], s.told_std[1]) < LEVEL_RAD
+    if level and s.mag_disturbed == 0 and is_likely(s, norm):
         note_dip(s, math.asin(down / norm), dt)
     measured = -math.atan2(east, north)
     if math.isfinite(s.declination_rad):
@@ -91,6 +97,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         # A level that is off turns the field for as long, the more the steeper it is.
         steep = math.tan(s.mag_dip_ref)
         density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
+    density += MISFIT_S * unexplained_iron_sq(s) / (north * north + east * east)
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
     turned = heading_by_iron(as_quat(s.q_eb), field)

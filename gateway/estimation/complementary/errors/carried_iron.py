@@ -18,6 +18,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
+from gateway.estimation.complementary.errors.compass_error import is_dip_turned
 from gateway.estimation.complementary.errors.drift import carry_drift
 from gateway.estimation.complementary.errors.drift_update import (
     UNCLIPPED,
@@ -46,8 +47,8 @@ AIDED_IRON_UT: Final = 0.5
 """Iron along an axis that is to be expected with GPS, where nothing shows more."""
 MIN_LEVEL_SHARE: Final = 0.05
 """A field that stands more upright tells no heading."""
-UNLIKELY_TIMES: Final = 2.0
-"""No iron makes the Earth's field so many times as strong or as weak as it usually is."""
+OUTLIER_SQ: Final = 9.0
+"""Beyond so many times its variance, a number tells nothing of the iron."""
 
 
 @compiled
@@ -69,7 +70,7 @@ def look_for_iron(
     dt : float
         Time since the field before, s.
     """
-    if not (tells_heading(field_e) and is_likely(s, field_e)):
+    if is_dip_turned(s) or not tells_heading(field_e):
         return
     carry_drift(s, p)
     if s.level_dip_s > 0.0:
@@ -92,13 +93,6 @@ def tells_heading(field_e: Vec3) -> bool:
 
 
 @compiled
-def is_likely(s: ComplementaryState, field_e: Vec3) -> bool:
-    """Return whether a field may be the Earth's and that of iron, and no odd number."""
-    norm = math.hypot(math.hypot(field_e[0], field_e[1]), field_e[2])
-    return bool(norm < UNLIKELY_TIMES * s.strength_ut and s.strength_ut < UNLIKELY_TIMES * norm)
-
-
-@compiled
 def expect_iron(s: ComplementaryState, p: ComplementaryGains, variance: float) -> None:
     """Take back what the iron was thought to be known by, where more of it is to be expected."""
     if variance <= s.iron_var:
@@ -111,20 +105,29 @@ def expect_iron(s: ComplementaryState, p: ComplementaryGains, variance: float) -
 
 
 @compiled
+def doubt_iron(s: ComplementaryState, p: ComplementaryGains, variance: float) -> None:
+    """Doubt iron that does not explain the field: there was more of it, or it has changed."""
+    expect_iron(s, p, s.iron_var + variance)
+    for k in range(IRON, IRON + 3):
+        s.drift_cov[k, k] += variance
+    s.iron_var += variance
+
+
+@compiled
 def update_by_strength(s: ComplementaryState, p: ComplementaryGains, raw: Vec3, dt: float) -> None:
     """Correct the iron by how the strength of the field varies, once it does so beyond noise."""
     off, along = compare_strength(s, raw, as_vec(s.iron_b), dt)
     unexplained_sq = unexplained_iron_sq(s)
     if unexplained_sq > 0.0:
         s.iron_doubted = 1
-        expect_iron(s, p, s.iron_var + unexplained_sq * dt / MISFIT_S)
+        doubt_iron(s, p, unexplained_sq * dt / MISFIT_S)
     if s.iron_doubted == 0:
         return
     row = cleared_row(s)
     for k in range(3):
         row[IRON + k] = along[k]
     repeated = max(1.0, COMPASS_CORRELATION_S / dt)
-    correct_drift(s, p, off, strength_noise_sq(s) * repeated, UNCLIPPED, SCALE)
+    correct_by(s, p, off, strength_noise_sq(s) * repeated)
 
 
 @compiled
@@ -140,7 +143,14 @@ def update_by_dip(s: ComplementaryState, p: ComplementaryGains, field_e: Vec3, d
         return
     off = s.earth_dip_rad - math.atan2(field_e[2], math.hypot(field_e[0], field_e[1]))
     repeated = max(1.0, COMPASS_CORRELATION_S / dt)
-    correct_drift(s, p, off, noise * repeated, UNCLIPPED, SCALE)
+    correct_by(s, p, off, noise * repeated)
+
+
+@compiled
+def correct_by(s: ComplementaryState, p: ComplementaryGains, off: float, noise: float) -> None:
+    """Correct by a number whose row stands, the less the more it is off than is likely."""
+    likely = off * off / OUTLIER_SQ
+    correct_drift(s, p, off, max(noise, likely - expected_variance(s)), UNCLIPPED, SCALE)
 
 
 @compiled

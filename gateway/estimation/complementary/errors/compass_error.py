@@ -17,6 +17,12 @@ from gateway.records import Vec3
 
 IRON_TAU_S: Final = 60.0
 """The mean of the field is taken over this time: it holds turns in all directions."""
+UNLIKELY_TIMES: Final = 2.0
+"""No iron makes the Earth's field so many times as strong or as weak as it usually is."""
+TURNED_COS: Final = 0.5
+"""Iron that bends the dip by more than 60 deg would be nearly as strong as the Earth's field."""
+UNTOLD_VAR: Final = 1.0
+"""What a compass with such a dip tells of the heading, rad2: nothing."""
 EXPECTED_SHARE: Final = 1.0 / 3.0
 """The iron to be expected counts as much as what one axis of three has shown."""
 
@@ -29,6 +35,12 @@ def note_field(s: ComplementaryState, mag_b: Vec3, norm: float, dt: float) -> No
     s.strength_ut += share * (norm - s.strength_ut)
     for k in range(3):
         s.field_direction_b[k] += share * (mag_b[k] / norm - s.field_direction_b[k])
+
+
+@compiled
+def is_likely(s: ComplementaryState, norm: float) -> bool:
+    """Return whether a strength may be that of the Earth and of iron, and is no odd number."""
+    return bool(norm < UNLIKELY_TIMES * s.strength_ut and s.strength_ut < UNLIKELY_TIMES * norm)
 
 
 @compiled
@@ -47,7 +59,16 @@ def compass_variance(s: ComplementaryState, p: ComplementaryGains) -> float:
         turned = max(1.0 - x * x - y * y - z * z, 0.0)
         place = min(PLACE_RAD * PLACE_RAD, variance)
         variance = place + (variance - place) * EXPECTED_SHARE / (EXPECTED_SHARE + turned)
+    if is_dip_turned(s):
+        variance += UNTOLD_VAR
     return variance
+
+
+@compiled
+def is_dip_turned(s: ComplementaryState) -> bool:
+    """Return whether the dip is off by more than iron bends it: the compass is reversed."""
+    bent = math.cos(s.level_dip_rad - s.earth_dip_rad)
+    return bool(s.level_dip_s > 0.0 and bent < TURNED_COS)
 
 
 @compiled
