@@ -139,6 +139,13 @@ def test_iron_that_is_expected_later_counts_as_if_it_had_been_from_the_start() -
     assert np.linalg.norm(wide.iron_b) > 0.5
 
 
+def test_an_expectation_may_grow_by_the_least_that_a_number_can() -> None:
+    s = begun(90.5)
+    before = s.drift_cov.copy()
+    expect_iron(s, GAINS, math.nextafter(90.5**2, math.inf))
+    np.testing.assert_allclose(s.drift_cov, before, rtol=1e-9, atol=1e-12)
+
+
 def test_iron_that_a_wrong_attitude_has_shown_is_forgotten_whole() -> None:
     """Left in, it would count as found with certainty, and grow with each new expectation."""
     s = begun(AIDED_IRON_UT)

@@ -161,7 +161,7 @@ def widen_prior(s: ComplementaryState, k: int, expected: float, variance: float)
     """
     cleared_row(s)[k] = 1.0
     expected_variance(s)
-    excess = float(s.drift_cov[k, k] - 1.0 / (1.0 / expected - 1.0 / variance))
+    excess = float(s.drift_cov[k, k] - expected * (variance / (variance - expected)))
     if excess >= 0.0:
         return 0.0
     reduce_covariance(s, excess, SCALE)
