@@ -19,7 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.carried_iron import look_for_iron, tells_heading
-from gateway.estimation.complementary.errors.compass_error import is_likely, note_dip, note_field
+from gateway.estimation.complementary.errors.compass_error import note_dip, note_field
 from gateway.estimation.complementary.errors.drift import carry_drift, heading_variance
 from gateway.estimation.complementary.errors.drift_update import (
     UNCLIPPED,
@@ -29,6 +29,7 @@ from gateway.estimation.complementary.errors.drift_update import (
 from gateway.estimation.filtering.iron_evidence import (
     MISFIT_S,
     heading_by_iron,
+    is_likely,
     unexplained_iron_sq,
 )
 from gateway.estimation.kernel_record import as_quat
@@ -75,13 +76,13 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     norm = math.sqrt(north * north + east * east + down * down)
     if norm > MIN_FIELD_UT and dt > 0.0:
         note_field(s, own_b, norm, dt)
-        if is_likely(s, norm):
+        if is_likely(norm, s.strength_ut):
             look_for_iron(s, p, mag_b, field, dt)
     weight = take_field(s, p, norm, down)
     if weight <= 0.0 or not tells_heading(field):
         return
     level = max(s.told_std[0], s.told_std[1]) < LEVEL_RAD
-    if level and s.mag_disturbed == 0 and is_likely(s, norm):
+    if level and s.mag_disturbed == 0 and is_likely(norm, s.strength_ut):
         note_dip(s, math.asin(down / norm), dt)
     measured = -math.atan2(east, north)
     if math.isfinite(s.declination_rad):

@@ -21,6 +21,7 @@ from gateway.estimation.filtering.iron_evidence import (
     MISFIT_S,
     compare_strength,
     dip_by_iron,
+    is_likely,
     mean_strengthening,
     strength_noise_sq,
     unexplained_iron_sq,
@@ -31,6 +32,7 @@ from gateway.estimation.magfield import (
     FIELD_TAU_S,
     FIRST_FIELD_S,
     PLACE_RAD,
+    SETTLE_S,
     STALE_MAG_S,
     bent_share_sq,
 )
@@ -59,6 +61,10 @@ def look_for_iron(s: EskfState, p: EskfGains, raw: Vec3, dt: float) -> None:
     if s.iron_search_started == 0 or s.at_rest == 1:
         return
     if s.aided == 0 and s.mag_disturbed == 1:
+        return
+    norm = math.sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2])
+    usual = s.mag_norm_ref if s.mag_norm_ref > 0.0 else s.iron_norm
+    if s.iron_s > SETTLE_S and not is_likely(norm, usual):
         return
     dt = min(dt, STALE_MAG_S)
     off, along = compare_strength(s, raw, as_vec(s.mag_bias_b), dt)

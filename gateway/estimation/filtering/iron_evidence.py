@@ -22,6 +22,8 @@ STRENGTH_NOISE: Final = 0.03
 MISFIT_S: Final = 20.0
 """A strength that has varied for so long beyond its noise is that of unknown iron; the heading's
 error by it lasts as long, for it changes with the attitude alone."""
+UNLIKELY_TIMES: Final = 2.0
+"""No iron makes the Earth's field so many times as strong or as weak as it usually is."""
 COMPASS_CORRELATION_S: Final = 1.0
 """The errors of soft iron and current change with the attitude, so in about this time: recorded
 compasses were 3 to 5 deg off, for half a second to two."""
@@ -40,6 +42,12 @@ class IronState:
     """Mean square by which the strength differs from what the known iron explains, uT2."""
     iron_doubted: int
     """1 once that was more than noise, with GPS."""
+
+
+@compiled
+def is_likely(norm: float, usual: float) -> bool:
+    """Return whether a strength may be that of the Earth and of iron, and is no odd number."""
+    return norm < UNLIKELY_TIMES * usual and usual < UNLIKELY_TIMES * norm
 
 
 @compiled

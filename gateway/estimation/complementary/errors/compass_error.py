@@ -17,8 +17,6 @@ from gateway.records import Vec3
 
 IRON_TAU_S: Final = 60.0
 """The mean of the field is taken over this time: it holds turns in all directions."""
-UNLIKELY_TIMES: Final = 2.0
-"""No iron makes the Earth's field so many times as strong or as weak as it usually is."""
 TURNED_COS: Final = 0.5
 """Iron that bends the dip by more than 60 deg would be nearly as strong as the Earth's field."""
 UNTOLD_VAR: Final = 1.0
@@ -35,12 +33,6 @@ def note_field(s: ComplementaryState, mag_b: Vec3, norm: float, dt: float) -> No
     s.strength_ut += share * (norm - s.strength_ut)
     for k in range(3):
         s.field_direction_b[k] += share * (mag_b[k] / norm - s.field_direction_b[k])
-
-
-@compiled
-def is_likely(s: ComplementaryState, norm: float) -> bool:
-    """Return whether a strength may be that of the Earth and of iron, and is no odd number."""
-    return bool(norm < UNLIKELY_TIMES * s.strength_ut and s.strength_ut < UNLIKELY_TIMES * norm)
 
 
 @compiled
