@@ -41,9 +41,7 @@ from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS
 from gateway.geometry.angle import wrap_pi
-from gateway.geometry.quaternion import (
-    rotate_inverse,
-)
+from gateway.geometry.quaternion import rotate_inverse
 from gateway.units import RAD_PER_DEG
 
 BIAS_WALK_RAD2PS3: Final = (0.1 * RAD_PER_DEG) ** 2 / 100.0
