@@ -83,6 +83,12 @@ def rotate_inverse(q: Quat, v: Vec3) -> Vec3:
 
 
 @compiled
+def body_axes(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
+    """Return the body's three axes in the navigation frame, the columns of `R_nb`."""
+    return rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+
+
+@compiled
 def from_rotation_vector(v: Vec3) -> Quat:
     """Turn a rotation vector into a quaternion: eq. 9 to 12, the standard axis-angle form.
 

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.geometry.quaternion import from_euler, rotate
+from gateway.geometry.quaternion import body_axes, from_euler
 from gateway.geometry.rotation import Matrix3
 from gateway.records import Vec3
 from gateway.sensing.calibration import NodeCalibration
@@ -32,9 +32,7 @@ def remove_mag_error(calibration: NodeCalibration, error_b: Vec3) -> NodeCalibra
 
 def remove_tilt(calibration: NodeCalibration, roll_pitch_yaw_rad: Vec3) -> NodeCalibration:
     """Turn both mountings so that an aircraft that seemed tilted by these angles is level."""
-    q = from_euler(*roll_pitch_yaw_rad)
-    axes = [rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
-    turn = np.array(axes).T
+    turn = np.array(body_axes(from_euler(*roll_pitch_yaw_rad))).T
     return msgspec.structs.replace(
         calibration,
         mounting=_matrix(turn @ np.array(calibration.mounting)),

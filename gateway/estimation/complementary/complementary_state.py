@@ -12,7 +12,7 @@ from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
 
 HEADING: Final = 3
-"""Turn about down from the level frame to NED; the three before are the bias."""
+"""Turn about down from the level frame to NED; the three before are the gyroscope's bias."""
 COMPASS: Final = 4
 IRON: Final = 5
 """Three from here, along the body's axes."""
@@ -26,7 +26,7 @@ SPEED: Final = 16
 PLACE: Final = 18
 """Along the level frame's first two axes; never estimated."""
 STATES: Final = 20
-"""Of the Kalman filter in `drift`; the three before the heading are the gyroscope's bias."""
+"""Of the Kalman filter in `drift`."""
 
 
 class ComplementarySettings(Settings, frozen=True):

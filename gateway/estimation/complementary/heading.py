@@ -74,12 +74,13 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     field = rotate(as_quat(s.q_eb), own_b)
     north, east, down = field
     norm = math.sqrt(north * north + east * east + down * down)
+    upright = not tells_heading(field)
     if norm > MIN_FIELD_UT and dt > 0.0:
         note_field(s, own_b, norm, dt)
-        if is_likely(norm, s.strength_ut):
+        if is_likely(norm, s.strength_ut) and not upright:
             look_for_iron(s, p, mag_b, field, dt)
     weight = take_field(s, p, norm, down)
-    if weight <= 0.0 or not tells_heading(field):
+    if weight <= 0.0 or upright:
         return
     level = max(s.told_std[0], s.told_std[1]) < LEVEL_RAD
     if level and s.mag_disturbed == 0 and is_likely(norm, s.strength_ut):

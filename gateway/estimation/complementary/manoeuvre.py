@@ -21,7 +21,11 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.drift import carry_drift, start_level
-from gateway.estimation.complementary.errors.drift_update import cleared_row, correct_drift
+from gateway.estimation.complementary.errors.drift_update import (
+    OUTLIER_SIGMA,
+    cleared_row,
+    correct_drift,
+)
 from gateway.estimation.complementary.heading import is_heading_good
 from gateway.estimation.complementary.tilt import LEVEL_STD_RAD
 from gateway.estimation.complementary.unaided import unaided_level_std
@@ -38,7 +42,6 @@ JITTER_S: Final = 0.03
 """How much the latency of a fix varies."""
 FORCE_NOISE_MPS2: Final = 0.1
 """Error of the accelerometer beside its bias, with a correlation time of a second."""
-OUTLIER_SIGMA: Final = 3.0
 
 
 @compiled

@@ -80,6 +80,7 @@ from gateway.estimation.sensor_faults import (
     rate_instead,
 )
 from gateway.geometry.quaternion import (
+    body_axes,
     from_rotation_vector,
     multiply,
     normalise,
@@ -240,7 +241,7 @@ def integrate(s: EskfState, gyro: Vec3, accel: Vec3, dt: float) -> None:
     half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
     q = multiply(as_quat(s.q_nb), half)
     write_quat(s.q_nb, normalise(multiply(q, half)))
-    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    x, y, z = body_axes(q)
     f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
     s.pending_s += dt
     s.pending_rad += dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)

@@ -43,7 +43,7 @@ from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_quat, as_vec
 from gateway.estimation.magfield import STALE_MAG_S
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import body_axes
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -75,8 +75,7 @@ def set_turned(s: EskfState, k: int, w: Vec3) -> None:
 @compiled
 def set_bias_row(s: EskfState, k: int, share: float) -> None:
     """Put `share` times row `k` of `R_nb` at the accelerometer bias."""
-    q = as_quat(s.q_nb)
-    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    x, y, z = body_axes(as_quat(s.q_nb))
     s.h[ACCEL_BIAS] = share * x[k]
     s.h[ACCEL_BIAS + 1] = share * y[k]
     s.h[ACCEL_BIAS + 2] = share * z[k]

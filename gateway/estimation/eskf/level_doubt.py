@@ -11,7 +11,7 @@ from gateway.estimation.eskf.covariance import renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
 from gateway.estimation.kernel_record import as_quat
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import body_axes
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 LEFT_BIAS_MPS2: Final = 0.04
@@ -30,8 +30,7 @@ def standing_level_var(s: EskfState) -> float:
 def doubt_level(s: EskfState, p: EskfGains) -> None:
     """Look for the bias from here on, and for what it has tilted."""
     variance = max(LEFT_BIAS_MPS2**2, p.accel_bias_var)
-    q = as_quat(s.q_nb)
-    axes = (rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0)))
+    axes = body_axes(as_quat(s.q_nb))
     for k in range(3):
         renew(s, ACCEL_BIAS + k, variance)
         share = variance / STANDARD_GRAVITY_MPS2

@@ -12,7 +12,7 @@ from typing import Annotated, Final
 
 from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray, as_vec
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import body_axes
 from gateway.records import Quat, Vec3
 
 MEAN_S: Final = 60.0
@@ -123,12 +123,8 @@ def heading_by_iron(q_eb: Quat, field_e: Vec3) -> Vec3:
     tuple of 3 floats
         Derivatives.
     """
-    x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-    return (
-        turned_heading(rotate(q_eb, x), field_e),
-        turned_heading(rotate(q_eb, y), field_e),
-        turned_heading(rotate(q_eb, z), field_e),
-    )
+    x, y, z = body_axes(q_eb)
+    return turned_heading(x, field_e), turned_heading(y, field_e), turned_heading(z, field_e)
 
 
 @compiled
@@ -144,12 +140,8 @@ def dip_by_iron(q_eb: Quat, field_e: Vec3) -> Vec3:
 
     Parameters and shape as those of `heading_by_iron`.
     """
-    x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-    return (
-        bent_dip(rotate(q_eb, x), field_e),
-        bent_dip(rotate(q_eb, y), field_e),
-        bent_dip(rotate(q_eb, z), field_e),
-    )
+    x, y, z = body_axes(q_eb)
+    return bent_dip(x, field_e), bent_dip(y, field_e), bent_dip(z, field_e)
 
 
 @compiled

@@ -21,7 +21,7 @@ from gateway.estimation.complementary.errors.drift_update import (
 )
 from gateway.estimation.complementary.tilt import cutoff_radps, low_pass
 from gateway.estimation.kernel_record import as_quat, write_vec
-from gateway.geometry.quaternion import rotate
+from gateway.geometry.quaternion import body_axes
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 
@@ -79,8 +79,7 @@ def noise_for(accuracy: float, growth: float) -> float:
 @compiled
 def watch_turn(s: ComplementaryState, tau_s: float, dt: float) -> None:
     """Low-pass the level rows of `R_eb`, and the level rates that the bias makes up."""
-    q = as_quat(s.q_eb)
-    x, y, z = rotate(q, (1.0, 0.0, 0.0)), rotate(q, (0.0, 1.0, 0.0)), rotate(q, (0.0, 0.0, 1.0))
+    x, y, z = body_axes(as_quat(s.q_eb))
     cutoff = cutoff_radps(tau_s)
     for k in range(2):
         row = (x[k], y[k], z[k])

@@ -21,6 +21,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.errors.compass_error import is_dip_turned
 from gateway.estimation.complementary.errors.drift import carry_drift
 from gateway.estimation.complementary.errors.drift_update import (
+    OUTLIER_SIGMA,
     UNCLIPPED,
     apply_gain,
     cleared_row,
@@ -47,8 +48,6 @@ AIDED_IRON_UT: Final = 0.5
 """Iron along an axis that is to be expected with GPS, where nothing shows more."""
 MIN_LEVEL_SHARE: Final = 0.05
 """A field that stands more upright tells no heading."""
-OUTLIER_SQ: Final = 9.0
-"""Beyond so many times its variance, a number tells nothing of the iron."""
 
 
 @compiled
@@ -66,11 +65,11 @@ def look_for_iron(
     raw : tuple of 3 floats
         Field in body FRD with the iron still in, uT.
     field_e : tuple of 3 floats
-        Field in the level frame, the known iron out of it, uT.
+        Field in the level frame, the known iron out of it, uT; it tells a heading.
     dt : float
         Time since the field before, s.
     """
-    if is_dip_turned(s) or not tells_heading(field_e):
+    if is_dip_turned(s):
         return
     carry_drift(s, p)
     if s.level_dip_s > 0.0:
@@ -149,7 +148,7 @@ def update_by_dip(s: ComplementaryState, p: ComplementaryGains, field_e: Vec3, d
 @compiled
 def correct_by(s: ComplementaryState, p: ComplementaryGains, off: float, noise: float) -> None:
     """Correct by a number whose row stands, the less the more it is off than is likely."""
-    likely = off * off / OUTLIER_SQ
+    likely = off * off / OUTLIER_SIGMA**2
     correct_drift(s, p, off, max(noise, likely - expected_variance(s)), UNCLIPPED, SCALE)
 
 

@@ -26,6 +26,8 @@ FORCE_BIAS_LIMIT_MPS2: Final = 0.5
 """The scale of a gyroscope and the bias of an accelerometer are at most this."""
 UNCLIPPED: Final = 1e9
 """An innovation of so many standard deviations counts whole."""
+OUTLIER_SIGMA: Final = 3.0
+"""What is further off than so many of them counts for less than it tells."""
 
 
 @compiled
