@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,6 +91,33 @@ async def test_the_event_loop_takes_the_machine_code(points: dict[str, EntryPoin
     async with asyncio.timeout(START_LIMIT_S):
         while any(quotient(point, 1.0, 0.0) == 1.0 for point in points.values()):
             await asyncio.sleep(0.01)
+
+
+async def test_the_event_loop_does_not_wait_for_what_comes_slowly(
+    points: dict[str, EntryPoint[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    monkeypatch.setattr(warm_up, "begin_copy", lambda *_: receiver)
+    compiling = make_ready("paper")
+    assert compiling is not None
+    messages = [("paper", 0, points["paper"].code())]
+    sender.send("the begin of one")
+    loop_goes_on = threading.Event()
+
+    def receive() -> tuple[str, int, machine_code.MachineCode]:
+        if not messages or not loop_goes_on.wait(timeout=5.0):
+            raise EOFError
+        return messages.pop()
+
+    monkeypatch.setattr(receiver, "recv", receive)
+    compiling.watch()
+    for _ in range(3):
+        await asyncio.sleep(0.0)
+    loop_goes_on.set()
+    async with asyncio.timeout(START_LIMIT_S):
+        while not receiver.closed:
+            await asyncio.sleep(0.01)
+    assert quotient(points["paper"], 1.0, 0.0) == math.inf
 
 
 def test_without_a_compiler_it_goes_on_as_python(

@@ -5,8 +5,10 @@ import gc
 import logging
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -98,30 +100,45 @@ class Compilation:
         """Take the machine code as it comes; needs a running event loop."""
         loop = asyncio.get_running_loop()
 
-        def take() -> None:
-            if not self.take_one():
-                loop.remove_reader(self._receiver)
+        def receive() -> None:
+            # A closed loop takes nothing more.
+            with suppress(RuntimeError):
+                while self._receive():
+                    loop.call_soon_threadsafe(self._load)
                 self._receiver.close()
+                loop.call_soon_threadsafe(self._finish)
 
         def load_again() -> None:
             self._load()
             if self._received or not self._receiver.closed:
                 loop.call_later(LOAD_AGAIN_S, load_again)
 
-        loop.add_reader(self._receiver, take)
+        # The loop would wait: a function is longer than a pipe holds, and the rest of it is long in
+        # coming from the least urgent of all processes.
+        threading.Thread(target=receive, daemon=True).start()
         load_again()
 
     def take_one(self) -> bool:
         """Wait for the next function, and load it if it can be; return whether there was one."""
+        if self._receive():
+            self._load()
+            return True
+        self._finish()
+        return False
+
+    def _receive(self) -> bool:
+        """Wait for the next function; return whether there was one."""
         try:
             self._received.append(self._receiver.recv())
         except EOFError:
-            self._load()
-            if len(self._missing) > len(self._received):
-                log.warning("the compiler has failed: estimates go on costing more computing")
             return False
-        self._load()
         return True
+
+    def _finish(self) -> None:
+        """Load what is left, and tell if something has never come."""
+        self._load()
+        if len(self._missing) > len(self._received):
+            log.warning("the compiler has failed: estimates go on costing more computing")
 
     def _load(self) -> None:
         """Load what has been received, as far as that is possible now."""
