@@ -11,6 +11,7 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
+from gateway.cli.support.errors import refuse
 from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
@@ -109,7 +110,11 @@ def recover(
     console = console_of()
     left_out: list[str] = []
     with progress_of([file]) as advance, refusing():
-        sound = _sound_records if kind_of(file) is FileKind.TLOG else _sound_lines
+        is_tlog = kind_of(file) is FileKind.TLOG
+        kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
+        if out is not None and out.suffix == other:
+            refuse(f"{out}: {file} is repaired as a {kept}; first that, then `mavgate convert` it")
+        sound = _sound_records if is_tlog else _sound_lines
         size = write_new(
             target, sound(file, advance, left_out.append), overwrite=force, inputs=[file]
         )

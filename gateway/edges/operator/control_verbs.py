@@ -135,6 +135,8 @@ class RecorderVerbs:
         return await asyncio.to_thread(list_recordings, self._recorder.folder)
 
     def _note(self, params: Text) -> RecorderStatus:
+        if not params.text.strip():
+            raise ControlError("a remark of no words: say what happens now")
         self._recorder.mark(params.text)
         return self._recorder.status()
 

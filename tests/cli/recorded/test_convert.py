@@ -346,6 +346,16 @@ def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
     run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
 
 
+def test_recover_does_not_convert(tlog: Path, table: Path, tmp_path: Path) -> None:
+    for file, out, kept in (
+        (table, tmp_path / "x.tlog", ".csv"),
+        (tlog, tmp_path / "x.csv", ".tlog"),
+    ):
+        text = " ".join(run("recover", file, "-o", out, code=2).split())
+        assert f"is repaired as a {kept}; first that, then `mavgate convert` it" in text
+        assert not out.exists()
+
+
 def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> None:
     plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
     run("convert", table, "-o", plain, "--from", "5", "--to", "10")
