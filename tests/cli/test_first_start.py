@@ -101,7 +101,7 @@ async def test_the_event_loop_does_not_wait_for_what_comes_slowly(
     compiling = make_ready("paper")
     assert compiling is not None
     messages = [("paper", 0, points["paper"].code())]
-    sender.send("the begin of one")
+    sender.send("the beginning of one")
     loop_goes_on = threading.Event()
 
     def receive() -> tuple[str, int, machine_code.MachineCode]:
@@ -117,6 +117,7 @@ async def test_the_event_loop_does_not_wait_for_what_comes_slowly(
     async with asyncio.timeout(START_LIMIT_S):
         while not receiver.closed:
             await asyncio.sleep(0.01)
+    await asyncio.sleep(0.0)  # What the thread has handed over before comes first.
     assert quotient(points["paper"], 1.0, 0.0) == math.inf
 
 
