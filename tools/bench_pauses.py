@@ -7,10 +7,16 @@ by stations by UDP, TCP and WebSocket that ask for all there is. Printed are the
 its loop by the program's own doing, apart from what the machine takes: first until all aircraft are
 heard, then while telemetry flows. The baseline, beside it the whole time, is a loop whose turns are
 all alike.
+
+With an empty cache it is a first start: machine code comes while telemetry runs, and is told beside
+the turns.
+
+    NUMBA_CACHE_DIR=$(mktemp -d) python tools/bench_pauses.py --minutes 3
 """
 
 import argparse
 import asyncio
+import logging
 import os
 import socket
 import subprocess
@@ -28,7 +34,7 @@ from gateway.analysis.processes import begin_copy
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.live.run import loop_comes_first
 from gateway.cli.support.made_ahead import made_ahead
-from gateway.cli.support.warm_up import make_ready
+from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.config import GatewaySettings
 from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
@@ -73,17 +79,33 @@ def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySetting
     )
 
 
-async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> None:
+class Marks(logging.Handler):
+    """Notes what a logger tells beside the turns of a loop."""
+
+    def __init__(self, watch: TurnWatch) -> None:
+        super().__init__()
+        self._watch = watch
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Note it."""
+        self._watch.mark(record.getMessage())
+
+
+async def fly(
+    settings: GatewaySettings, watch: TurnWatch, seconds: float, compiling: Compilation | None
+) -> None:
     """Run the daemon as `mavgate demo` does."""
     line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
     daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
     watch.install()
+    if compiling is not None:
+        compiling.watch()
     with loop_comes_first(daemon.start):
         watch.restart()
         try:
             while len(daemon.snapshot().aircraft) < settings.simulator.vehicles:
                 await asyncio.sleep(LOOK_S)
-            print(f"longest turn of the start: {watch.longest_us() / 1e3:.2f} ms")
+            print(f"longest turn of the start: {watch.longest().own_us / 1e3:.2f} ms")
             watch.restart()
             await asyncio.sleep(seconds)
             watch.stop()
@@ -96,16 +118,17 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
     ports = free_ports(4)
     settings = settings_in(folder, options.vehicles, ports)
     compiling = make_ready(settings.estimation.estimator)
-    while compiling is not None and compiling.take_one():
-        pass
     watch = TurnWatch()
+    warm_up = logging.getLogger(make_ready.__module__)
+    warm_up.setLevel(logging.DEBUG)
+    warm_up.addHandler(Marks(watch))
     visitors = subprocess.Popen(
         [sys.executable, Path(__file__).with_name("visitors.py"), *map(str, ports)],
         stderr=subprocess.DEVNULL,
     )
     try:
         with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
-            runner.run(fly(settings, watch, 60.0 * options.minutes))
+            runner.run(fly(settings, watch, 60.0 * options.minutes, compiling))
         if visitors.poll() is not None:
             raise SystemExit("the stations have died")
     finally:
@@ -132,11 +155,14 @@ def main() -> None:
         begin_s = time.monotonic()
         watch = run(options, Path(name))
         print(f"{(time.monotonic() - begin_s) / 60:.1f} min, {options.vehicles} aircraft")
-        longest_ms = watch.longest_us() / 1e3
+        longest_ms = watch.longest().own_us / 1e3
         print(f"longest pause by the program: {longest_ms:.2f} ms (goal {GOAL_MS:.0f} ms)")
         print(watch.report())
-        own_us, wall_us, long_turns, turns = baseline.recv()
-        print(f"baseline, a loop of even turns: {own_us / 1e3:.2f} of {wall_us / 1e3:.2f} ms")
+        longest, wall_us, long_turns, turns = baseline.recv()
+        print(
+            f"baseline, a loop of even turns: {longest.own_us / 1e3:.2f} of {wall_us / 1e3:.2f} ms "
+            f"at {watch.seconds_at(longest.end_ns):.1f} s"
+        )
         print(f"  {long_turns} of {turns} turns took more than {GOAL_MS:.0f} ms")
 
 

@@ -32,8 +32,8 @@ class Turn(NamedTuple):
 
     own_us: float
     wall_us: float
-    at_s: float
-    """Since the watch began."""
+    end_ns: int
+    """Of `time.perf_counter_ns`, which all programs of a machine share."""
     longest: str
     """The callback that took longest."""
 
@@ -49,6 +49,8 @@ class TurnWatch(selectors.EpollSelector):
         self.longest_wall_us = 0.0
         self.longest_collection_us = [0.0, 0.0, 0.0]
         """Of the garbage collector, by generation."""
+        self.marks: list[tuple[float, str]] = []
+        """What was noted beside the turns, and when."""
         self._run = asyncio.Handle._run  # noqa: SLF001
         self._schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         self._waited_ns = self._waits = self._computed_ns = 0
@@ -63,6 +65,7 @@ class TurnWatch(selectors.EpollSelector):
         self.turns = self.long_turns = 0
         self.longest_wall_us = 0.0
         self.longest_collection_us[:] = 0.0, 0.0, 0.0
+        self.marks.clear()
         self._began_ns = time.perf_counter_ns()
         self._begin_ns: int | None = None
 
@@ -70,9 +73,17 @@ class TurnWatch(selectors.EpollSelector):
         """See no more."""
         self._is_on = False
 
-    def longest_us(self) -> float:
+    def mark(self, what: str) -> None:
+        """Note what happens now, to be read beside the longest turns."""
+        self.marks.append((self.seconds_at(time.perf_counter_ns()), what))
+
+    def seconds_at(self, time_ns: int) -> float:
+        """Return when a time of `time.perf_counter_ns` was, since the watch began."""
+        return (time_ns - self._began_ns) / 1e9
+
+    def longest(self) -> Turn:
         """Return the longest turn by the program's own doing."""
-        return max(turn.own_us for turn in self.worst)
+        return max(self.worst)
 
     def install(self) -> None:
         """See single callbacks and collections too."""
@@ -109,7 +120,7 @@ class TurnWatch(selectors.EpollSelector):
         self.turns += 1
         self.long_turns += own_us > LONG_US
         if len(self.worst) < WORST or own_us > self.worst[0].own_us:
-            turn = Turn(own_us, wall_us, (now_ns - self._began_ns) / 1e9, _name(self._longest[1]))
+            turn = Turn(own_us, wall_us, now_ns, _name(self._longest[1]))
             (heapq.heappush if len(self.worst) < WORST else heapq.heapreplace)(self.worst, turn)
 
     def _ready_ns(self) -> int:
@@ -132,9 +143,10 @@ class TurnWatch(selectors.EpollSelector):
         ]
         lines += [
             f"  own {turn.own_us / 1e3:6.2f} ms of {turn.wall_us / 1e3:6.2f} ms at "
-            f"{turn.at_s:7.1f} s, mostly {turn.longest}"
+            f"{self.seconds_at(turn.end_ns):7.1f} s, mostly {turn.longest}"
             for turn in sorted(self.worst, reverse=True)
         ]
+        lines += [f"  at {at_s:7.1f} s {what}" for at_s, what in self.marks]
         collected = ", ".join(f"{us / 1e3:.2f}" for us in self.longest_collection_us)
         return "\n".join([*lines, f"  longest collections by generation: {collected} ms"])
 
@@ -157,13 +169,15 @@ async def _add_up(parent: int) -> None:
         sum(range(COUNT))
 
 
-def even_turns(seconds: float) -> tuple[float, float, int, int]:
+def even_turns(seconds: float) -> tuple[Turn, float, int, int]:
     """Watch a loop that does the same computing in every turn, or until its parent process ends.
 
     Returns
     -------
-    own_us, wall_us : float
-        Its longest turns: by its own doing, and all.
+    longest : Turn
+        By its own doing.
+    wall_us : float
+        The longest of all.
     long_turns, turns : int
         How many took more than `LONG_US`, and how many there were.
     """
@@ -173,4 +187,4 @@ def even_turns(seconds: float) -> tuple[float, float, int, int]:
         asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner,
     ):
         runner.run(asyncio.wait_for(_add_up(os.getppid()), seconds))
-    return watch.longest_us(), watch.longest_wall_us, watch.long_turns, watch.turns
+    return watch.longest(), watch.longest_wall_us, watch.long_turns, watch.turns

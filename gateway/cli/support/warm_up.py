@@ -151,6 +151,7 @@ class Compilation:
                     log.warning("machine code is loaded later: %s", error)
                 self._has_failed = True
                 return
+            log.debug("machine code loaded: %s, function %d", name, place + 1)
             self._received.popleft()
             self._missing.discard((name, place))
             if not self._missing:
