@@ -28,6 +28,8 @@ class PairSums:
     """How many pairs the sums are made of."""
     gathered_s: float
     """Over which time, what has faded left out."""
+    lasted_s: float
+    """The same, what has faded counted in."""
     weight_sums: Annotated[FloatArray, (3,)]
     """Of the weight alone, by the time, and by its square."""
     reference_sums: Annotated[FloatArray, (4,)]
@@ -49,7 +51,7 @@ def clear_pairs(s: PairSums) -> None:
     for i in range(3):
         for j in range(3):
             s.outer[i, j] = s.information[i, j] = s.force_squares[i, j] = 0.0
-    s.squares = s.pairs = s.gathered_s = s.pair_turned_var = 0.0
+    s.squares = s.pairs = s.gathered_s = s.lasted_s = s.pair_turned_var = 0.0
     fill(s.weight_sums, 0.0)
     fill(s.reference_sums, 0.0)
     fill(s.force_sums, 0.0)
@@ -106,6 +108,7 @@ def take_pair(s: PairSums, force: Vec3, reference: Vec3, weight: float, dt: floa
     s.squares += 0.5 * weight * (r_sq + f_sq)
     s.pairs += 1.0
     s.gathered_s += dt
+    s.lasted_s += dt
     W[0] += weight
     for i in range(2):
         R[i] += weight * reference[i]

@@ -189,7 +189,9 @@ def align_by_gravity(
     if s.by_gps == 1 or dt < period_s:
         return 0.0
     force = mean_force(s, force_i, dt)
-    share = min(1.0, dt / (SWING_TAU_S if swings else PULL_TAU_S))
+    # A plain mean at first: one pair would count for as long as the low-pass remembers.
+    tau = SWING_TAU_S if swings else PULL_TAU_S
+    share = min(1.0, dt / min(tau, s.lasted_s + dt))
     for k in range(3):
         s.force_first_i[k] += share * (force[k] - s.force_first_i[k])
         newest = s.force_first_i[k] if swings else force[k]
@@ -284,6 +286,9 @@ def alignment_level_std(s: AlignmentState, excess: float) -> float:
     if s.by_gps == 0:
         # However it is shaken: over the time, the mean force is gravity but for the speed gained.
         variance = min(variance, (HAND_MPS / (STANDARD_GRAVITY_MPS2 * s.gathered_s)) ** 2)
+        # What flies a turn pulls one way for a part of the time, harder than any hand.
+        lean = s.pull_mps2 / STANDARD_GRAVITY_MPS2 * min(1.0, TURN_S / s.gathered_s)
+        variance = max(variance, lean * lean)
     return math.sqrt(min(variance + drift_variance(s), UNKNOWN_RAD * UNKNOWN_RAD))
 
 

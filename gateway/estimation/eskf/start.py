@@ -52,7 +52,6 @@ from gateway.geometry.quaternion import (
     rotate,
 )
 from gateway.records import NAN, Vec3
-from gateway.units import STANDARD_GRAVITY_MPS2
 
 FIRST_VELOCITY_VAR: Final = 0.5**2
 NO_VELOCITY_VAR: Final = 5.0**2
@@ -106,11 +105,7 @@ def begin(s: EskfState, p: EskfGains, time_us: int, gyro: Vec3, accel: Vec3) -> 
     pitch = math.atan2(accel[0], math.hypot(accel[1], accel[2]))
     write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
     write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
-    # One sample may be anything: taken to be of gravity's strength, it pulls nowhere, and the
-    # alignment finds the level within the first seconds.
-    share = STANDARD_GRAVITY_MPS2 / math.hypot(accel[0], math.hypot(accel[1], accel[2]))
-    for k in range(3):
-        s.force_first_i[k] = s.force_mean_i[k] = share * accel[k]
+    # One sample may be anything: the alignment finds the level within the first seconds.
     lose_attitude(s, p)
 
 
