@@ -13,13 +13,16 @@ from gateway.estimation.columns import (
     GPS_COLUMNS,
     GPS_LAT,
     GPS_LON,
+    GPS_USABLE,
     GPS_VEL,
     GYRO,
+    IMU_COLUMNS,
     MAG,
     NAV_ALT,
     NAV_FLAGS,
     NAV_LAT,
     NAV_LON,
+    NAV_POS_STD,
     NAV_QUAT,
     NAV_VEL,
 )
@@ -29,6 +32,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
+from gateway.units import STANDARD_GRAVITY_MPS2
 from tools.flights import Flight, north_east_m, simulated_flight
 from tools.score_estimators import attitude_scores
 
@@ -57,6 +61,23 @@ def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
         log.gps_time_us[gps].copy(),
         log.gps[gps].copy(),
     )
+
+
+def at_rest(length_s: float, speed_mps: float) -> SampleLog:
+    """Lie still below a receiver that tells the same over and over."""
+    imu_us = np.arange(0, round(length_s * 1e6), 10_000)
+    gps_us = np.arange(0, round(length_s * 1e6), 200_000)
+    imu, gps = (
+        np.full((len(imu_us), IMU_COLUMNS), np.nan),
+        np.full((len(gps_us), GPS_COLUMNS), np.nan),
+    )
+    imu[:, ACCEL : ACCEL + 6] = np.random.default_rng(5).normal(0.0, 1e-3, (len(imu), 6))
+    imu[:, ACCEL + 2] -= STANDARD_GRAVITY_MPS2
+    imu[:, MAG : MAG + 3] = 21.0, 0.0, 43.0
+    imu[:, CLIPPED] = 0.0
+    gps[:, [GPS_USABLE, GPS_LAT, GPS_LON, GPS_ALT]] = 1.0, 47.0, 8.0, 500.0
+    gps[:, GPS_VEL : GPS_VEL + 3] = speed_mps
+    return SampleLog(imu_us, imu, imu_us[:0], np.empty(0), gps_us, gps)
 
 
 def run(flight: Flight, name: str, log: SampleLog) -> np.ndarray:
@@ -221,6 +242,41 @@ def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: s
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
     check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("has_velocity", [True, False])
+def test_a_fix_that_is_told_again_and_again_counts_once(
+    flight: Flight, name: str, has_velocity: bool
+) -> None:
+    """As in a log that holds each fix until the next one."""
+    log = part(flight, 30.0, 60.0)
+    if not has_velocity:
+        log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
+    newest = np.arange(len(log.gps)) // 5 * 5
+    once = replace(log, gps_time_us=log.gps_time_us[::5], gps=log.gps[::5])
+    out = run(flight, name, replace(log, gps=log.gps[newest]))
+    np.testing.assert_array_equal(out, run(flight, name, once))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_receiver_that_is_stuck_in_flight_is_none(flight: Flight, name: str) -> None:
+    """Its last words, over and over, move the place no more than if it told nothing."""
+    log = part(flight, 30.0, 60.0)
+    stuck = (log.gps_time_us > 60e6) & (log.gps_time_us < 66e6)
+    none = replace(log, gps_time_us=log.gps_time_us[~stuck], gps=log.gps[~stuck])
+    log.gps[stuck] = log.gps[~stuck][np.sum(log.gps_time_us < 60e6) - 1]
+    np.testing.assert_array_equal(run(flight, name, log), run(flight, name, none))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("speed_mps", [0.0, np.nan])
+def test_a_receiver_that_repeats_itself_at_rest_is_believed(name: str, speed_mps: float) -> None:
+    """Some hold their place while they stand."""
+    log = at_rest(20.0, speed_mps)
+    out = make_estimator(EstimationSettings(estimator=name)).run(log)
+    assert (out[-1000:, NAV_FLAGS].astype(int) & NavFlags.POSITION_VALID != 0).all()
+    assert (out[-1000:, NAV_POS_STD] < 10.0).all()
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

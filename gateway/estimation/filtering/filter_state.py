@@ -102,6 +102,10 @@ class FilterState(
     """1 once a fix has told the height above the sea."""
     fix_s: float
     """Arrival of the last accepted fix."""
+    fix_told: Annotated[FloatArray, (5,)]
+    """Latitude, longitude and velocity of the newest fix: it may come again."""
+    fix_told_s: float
+    """Arrival of the first that told them."""
 
 
 @compiled

@@ -1,6 +1,7 @@
 """A GPS fix as it arrives: whether it is one, where it lies, what it says to the alignment."""
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import watch_latency
@@ -16,12 +17,40 @@ from gateway.estimation.local_position import NEVER_S, fix_position, fix_velocit
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
 
+STANDING_MPS: Final = 0.1
+"""A receiver that stands tells up to this speed."""
+SLOWEST_FIXES_S: Final = 1.1
+"""From one fix to the next, of the slowest usual receivers."""
+
 
 @compiled
 def is_fix_told(s: FilterState, row: FloatArray) -> bool:
     """Return whether a row holds a fix that may be fused, and the filter runs."""
     known = math.isfinite(row[GPS_LAT]) and math.isfinite(row[GPS_LON])
-    return bool(s.started == 1 and row[GPS_USABLE] != 0.0 and known)
+    usable = s.started == 1 and row[GPS_USABLE] != 0.0 and known
+    return bool(usable and not is_fix_repeated(s, row))
+
+
+@compiled
+def is_fix_repeated(s: FilterState, row: FloatArray) -> bool:
+    """Return whether a row tells the last fix again; to be asked of each.
+
+    A log may hold a fix until the next one, and a receiver may be stuck. What moves is nowhere
+    twice; what stands may tell the same again and again, and be right.
+    """
+    lat_deg, lon_deg, vel = row[GPS_LAT], row[GPS_LON], fix_velocity(row)
+    last, is_velocity_told = s.fix_told, is_sound(vel, FASTEST_MPS)
+    repeated = lat_deg == last[0] and lon_deg == last[1]
+    for k in range(3):
+        repeated = repeated and (vel[k] == last[2 + k] or not is_velocity_told)
+    if not repeated:
+        last[0], last[1], s.fix_told_s = lat_deg, lon_deg, s.time_s
+        for k in range(3):
+            last[2 + k] = vel[k]
+        return False
+    if is_velocity_told:
+        return math.hypot(vel[2], math.hypot(vel[0], vel[1])) > STANDING_MPS
+    return s.time_s - s.fix_told_s < SLOWEST_FIXES_S
 
 
 @compiled
