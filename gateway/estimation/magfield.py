@@ -8,7 +8,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, write_vec
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
@@ -30,7 +30,7 @@ PLACE_RAD: Final = 1.0 * RAD_PER_DEG
 """What the declination is off, and the compass on its board."""
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
 """How far the dip is off the Earth model's without iron: by the place, by the sensor's scale."""
-STUCK_TURN_RAD: Final = 0.2
+STUCK_TURN_RAD: Final = 0.05
 """A field that is the same to the last digit after so much of a turn is none: a sensor hangs."""
 TURN_SHARE: Final = 0.2
 """A turn that changes the field by this share of its strength is compared with the gyroscope's."""
@@ -82,6 +82,7 @@ class FieldState:
     time_s: float
     rate_b: Annotated[FloatArray, (3,)]
     """Angular rate, bias removed, rad/s."""
+    at_rest: int
     mag_s: float
     """Time of the last sample that told a field."""
     mag_norm_ref: float
@@ -94,7 +95,7 @@ class FieldState:
     mag_disturbed: int
     mag_last: Annotated[FloatArray, (3,)]
     mag_turned: Annotated[FloatArray, (3,)]
-    """Turn in body FRD since the field was another, rad."""
+    """Turn in body FRD since the field was another, rad; up to where it counts as hanging."""
     mag_begin: Annotated[FloatArray, (3,)]
     """Where a turn began, uT; zeros before the first."""
     mag_carried: Annotated[FloatArray, (3,)]
@@ -126,20 +127,26 @@ def is_field_told(s: FieldState, mag_b: Vec3, dt: float) -> bool:
         than the aircraft.
     """
     carry_field(s, dt)
-    turned = s.mag_turned
-    for k in range(3):
-        turned[k] += s.rate_b[k] * dt
+    if s.at_rest == 0 and not has_turned(s):
+        for k in range(3):
+            s.mag_turned[k] += s.rate_b[k] * dt
     blank = not (mag_b[0] or mag_b[1] or mag_b[2])
     if blank or not math.isfinite(mag_b[0] + mag_b[1] + mag_b[2]):
         return False
     last = s.mag_last
     if mag_b[0] == last[0] and mag_b[1] == last[1] and mag_b[2] == last[2]:
-        turned_sq = turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]
-        return bool(s.mag_misplaced == 0 and turned_sq < STUCK_TURN_RAD * STUCK_TURN_RAD)
+        return bool(s.mag_misplaced == 0 and not has_turned(s))
     write_vec(last, mag_b)
-    write_vec(turned, (0.0, 0.0, 0.0))
+    write_vec(s.mag_turned, (0.0, 0.0, 0.0))
     compare_turn(s, mag_b)
     return s.mag_misplaced == 0
+
+
+@compiled
+def has_turned(s: FieldState) -> bool:
+    """Return whether the aircraft has turned since the field was another, if only for a while."""
+    x, y, z = as_vec(s.mag_turned)
+    return bool(x * x + y * y + z * z > STUCK_TURN_RAD * STUCK_TURN_RAD)
 
 
 @compiled

@@ -340,10 +340,23 @@ class TestFieldThatIsTold:
         assert told.index(False) == pytest.approx(STUCK_TURN_RAD / 0.5 / 0.01, abs=2)
         assert is_field_told(state, (20.1, -3.0, 41.0), 0.01)
 
+    def test_one_that_stands_still_over_a_turn_to_and_fro_is_not_believed_again(self) -> None:
+        state, told = new_record(ComplementaryState), []
+        for rate in (0.5, -0.5):
+            state.rate_b[2] = rate
+            told += [is_field_told(state, self.FIELD, 0.01) for _ in range(100)]
+        assert told[0]
+        assert not any(told[100:])
+
+    def test_what_the_bias_turns_at_rest_shows_no_hanging_compass(self) -> None:
+        state = new_record(ComplementaryState)
+        state.at_rest, state.rate_b[2] = 1, 0.01
+        assert all(is_field_told(state, self.FIELD, 0.01) for _ in range(1000))
+
     def test_one_that_stands_still_at_rest_or_between_its_own_samples_is(self) -> None:
         state = new_record(ComplementaryState)
         assert all(is_field_told(state, self.FIELD, 0.01) for _ in range(1000))
-        state.rate_b[2] = 3.0
+        state.rate_b[2] = 0.9
         for k in range(20):
             field = (20.0, -3.0 - k, 41.0)
             assert all(is_field_told(state, field, 0.01) for _ in range(5))
