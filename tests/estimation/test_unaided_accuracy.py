@@ -21,6 +21,7 @@ from gateway.estimation.columns import (
     MAG,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
+    NAV_FLAGS,
 )
 from gateway.estimation.eskf.covariance import GYRO_BY_FORCE, propagate
 from gateway.estimation.eskf.eskf_output import write_output
@@ -34,6 +35,7 @@ from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import NO_DECLINATION_RAD, ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geomagnetism import magnetic_field
+from gateway.records import NavFlags
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of, flight, part
 
@@ -80,6 +82,18 @@ def test_what_stands_is_as_level_and_as_well_headed_as_told(name: str, fixes: bo
     assert (ratios > 0.3).all()
     assert (ratios < 1.2).all()
     assert (np.mean(np.abs(off) < 2.0 * np.array(told), axis=(0, 1)) >= 0.9).all()
+
+
+@pytest.mark.parametrize("offset_mps2", [(0.0, 0.0, -0.8), (0.5, 0.5, -0.5)])
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_force_beyond_gravity_at_rest_is_the_accelerometers_and_no_turn(
+    name: str, offset_mps2: tuple[float, float, float]
+) -> None:
+    """An MPU6050 that nobody has calibrated may be off by so much."""
+    log = standing(0, fixes=False)
+    log.imu[:, ACCEL : ACCEL + 3] += offset_mps2
+    flags = estimator_of(name).run(log)[2 * RATE_HZ :, NAV_FLAGS].astype(int)
+    assert (flags & int(NavFlags.ATTITUDE_VALID) != 0).all()
 
 
 def test_doubt_of_the_level_leaves_what_gravity_showed(rng: np.random.Generator) -> None:

@@ -57,7 +57,6 @@ class ReviewState(AlignmentState):
     """For how long."""
     doubt_s: float
     """For how long the alignment has contradicted the attitude."""
-    at_rest: int
     heading_known: int
     found_q_nb: Annotated[FloatArray, (4,)]
     level_std: float

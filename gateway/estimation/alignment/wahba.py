@@ -74,6 +74,8 @@ class AlignmentState(PairSums):
     """Low-pass of the specific force in the gyroscope's frame, and a second one of that."""
     turning_mps2: float
     """Mean of what gives itself away: of a hand little, of a flight in turns much."""
+    at_rest: int
+    """1 while it stands: a force beyond gravity is an accelerometer's error then, and no pull."""
     flown_mps: float
     """Fastest speed that GPS has shown; it fades while GPS shows less."""
     pull_mps2: float
@@ -196,7 +198,7 @@ def align_by_gravity(
         s.force_first_i[k] += share * (force[k] - s.force_first_i[k])
         newest = s.force_first_i[k] if swings else force[k]
         s.force_mean_i[k] += share * (newest - s.force_mean_i[k])
-    s.pull_mps2 = unseen_acceleration(s)
+    s.pull_mps2 = 0.0 if s.at_rest == 1 else unseen_acceleration(s)
     s.turning_mps2 += min(1.0, dt / TURNING_TAU_S) * (s.pull_mps2 - s.turning_mps2)
     weight = 1.0 / (GRAVITY_NOISE_MPS2 * GRAVITY_NOISE_MPS2)
     take_pair(s, force, (0.0, 0.0, -STANDARD_GRAVITY_MPS2), weight, dt)
