@@ -18,6 +18,9 @@ REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
 SHAKEN: Final = 5.0
 """An engine that idles shakes the gyroscope by so many times more than rest without one."""
+SLOW_TURN_RADPS: Final = 0.5 * RAD_PER_DEG
+"""A steady turn of less passes for a change of the bias, and turns little before it ends."""
+TURN_SIGMA: Final = 4.0
 STEADY: Final = 0.15
 """Its average stays this much closer to itself then: noise and vibration average out."""
 
@@ -74,6 +77,8 @@ class RestState:
 
     rest_s: float
     at_rest: int
+    bias_shown: int
+    """1 once a rest has shown the bias: before, it may be any."""
     gyro_lp: Annotated[FloatArray, (3,)]
     gyro_rest: Annotated[FloatArray, (3,)]
     """Behind `gyro_lp`: still the bias when a slow start of motion is noticed."""
@@ -139,6 +144,19 @@ def watch_rest(
     )
     s.rest_s = s.rest_s + dt if quiet else 0.0
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
+    if s.at_rest == 1:
+        s.bias_shown = 1
+
+
+@compiled
+def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float) -> bool:
+    """Return whether the mean rate is that of a turn, since the bias is known not to be so large.
+
+    What turns slowly on a smooth road, on water or in calm air is as quiet as rest, and would teach
+    the bias its own rate.
+    """
+    most = SLOW_TURN_RADPS + TURN_SIGMA * bias_std
+    return s.bias_shown == 1 and largest_difference(as_vec(s.gyro_lp), bias_b) > most
 
 
 @compiled

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     ACCEL,
@@ -20,6 +21,7 @@ from gateway.estimation.columns import (
     NAV_VEL,
 )
 from gateway.estimation.kernel import SampleLog
+from gateway.geometry.angle import wrap_pi
 from gateway.geometry.geodesy import radii_m
 from gateway.records import NavFlags
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
@@ -27,6 +29,7 @@ from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_o
 
 FIELD_N_UT = (21.0, 0.0, 43.0)
 SPEED_MPS = 8.0
+TURN_RADPS = math.radians(3.0)
 STARTS_S, LOST_S, STOPS_S, ENDS_S = 30.0, 70.0, 80.0, 95.0
 LASTS_S = 20.0
 """Later the speed may be none, for all that dead reckoning knows."""
@@ -81,3 +84,34 @@ def test_what_stops_in_an_outage_rests(name: str, seed: int) -> None:
     assert not rests[(time_s > LOST_S) & (time_s < STOPS_S)].any()
     assert rests[time_s > STOPS_S + PACE_S + 4.0].all()
     assert np.abs(out[-1, NAV_VEL : NAV_VEL + 2]).max() < 0.2
+
+
+def circle(seed: int) -> tuple[SampleLog, np.ndarray]:
+    """Stand, then roll round a wide circle on a smooth road without GPS; also tell the heading."""
+    rng, n = np.random.default_rng(seed), round(ENDS_S * RATE_HZ)
+    time_s = np.arange(n) / RATE_HZ
+    rolls = np.clip((time_s - STARTS_S) / PACE_S, 0.0, 1.0)
+    heading_rad = np.cumsum(rolls) * TURN_RADPS / RATE_HZ
+    imu = np.full((n, IMU_COLUMNS), 0.0)
+    imu[:, ACCEL : ACCEL + 3] = rng.normal(0.0, 0.06, (n, 3))
+    imu[:, ACCEL + 1] += rolls * SPEED_MPS * TURN_RADPS
+    imu[:, ACCEL + 2] -= G
+    imu[:, GYRO : GYRO + 3] = rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
+    imu[:, GYRO + 2] += rolls * TURN_RADPS
+    back = Rotation.from_rotvec(np.outer(-heading_rad, [0.0, 0.0, 1.0]))
+    imu[:, MAG : MAG + 3] = back.apply(np.tile(FIELD_N_UT, (n, 1))) + rng.normal(0.0, 0.4, (n, 3))
+    us = np.round(time_s * 1e6).astype(np.int64)
+    no_fixes = np.empty((0, GPS_COLUMNS))
+    return SampleLog(us, imu, us[:0], np.empty(0), us[:0], no_fixes), heading_rad
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_slow_turn_is_no_rest_and_its_rate_no_bias(name: str, seed: int) -> None:
+    """The gyroscope is as quiet as at rest, but a rest has shown that its bias is another."""
+    log, heading_rad = circle(seed)
+    out = estimator_of(name).run(log)
+    turning = log.imu_time_us > (STARTS_S + PACE_S) * 1e6
+    assert not (out[turning, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
+    found = Rotation.from_quat(out[turning, :4], scalar_first=True).as_euler("ZYX")[:, 0]
+    assert np.degrees(np.abs(wrap_pi(found - heading_rad[turning]))).max() < 4.0

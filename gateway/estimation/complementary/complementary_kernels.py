@@ -23,6 +23,7 @@ from gateway.estimation.complementary.errors.bias import update_bias
 from gateway.estimation.complementary.errors.drift import (
     DOUBT,
     begin_drift,
+    bias_std,
     doubt_sensors,
     end_level,
     note_turn,
@@ -68,7 +69,7 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
-from gateway.estimation.rest import doubt_rest_bias, outruns, watch_rest
+from gateway.estimation.rest import doubt_rest_bias, outruns, turns_steadily, watch_rest
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -213,7 +214,8 @@ def advance(
     since_fix = s.time_s - s.fix_s
     if sound_gyro and sound_accel:
         rested, moving = s.at_rest == 1, is_moving(s, p)
-        watch_rest(s, p, gyro, accel, moving, dt)
+        turning = since_fix > FRESH_GPS_S and turns_steadily(s, as_vec(s.bias_b), bias_std(s))
+        watch_rest(s, p, gyro, accel, moving or turning, dt)
         raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
         watch_gravity(s, p)
     coasting = since_fix < p.coast_s and s.at_rest == 0 and is_under_way(s)

@@ -12,7 +12,7 @@ from gateway.estimation.compass_lag import follow_rate, present_field
 from gateway.estimation.eskf.covariance import level_variance, propagate
 from gateway.estimation.eskf.eskf_output import write_output
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, VEL, EskfState
+from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, GYRO_BIAS, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.iron import (
     doubt_standing_field,
@@ -72,7 +72,13 @@ from gateway.estimation.magfield import (
     steepness,
     take_field,
 )
-from gateway.estimation.rest import BIAS_CHANGE_RADPS, doubt_rest_bias, outruns, watch_rest
+from gateway.estimation.rest import (
+    BIAS_CHANGE_RADPS,
+    doubt_rest_bias,
+    outruns,
+    turns_steadily,
+    watch_rest,
+)
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -134,7 +140,7 @@ def take_imu(
         check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
         rested = s.at_rest == 1
-        watch_rest(s, p, gyro, accel, is_pushed(s, dt) or moving, dt)
+        watch_rest(s, p, gyro, accel, is_pushed(s, dt) or moving or is_turning(s), dt)
         raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
@@ -204,6 +210,15 @@ def is_moving(s: EskfState, p: EskfGains) -> bool:
         return fresh and math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
     unsure_sq = 0.0 if fresh else s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
     return outruns(math.hypot(s.vel_n[0], s.vel_n[1]), unsure_sq, p)
+
+
+@compiled
+def is_turning(s: EskfState) -> bool:
+    """Return whether it turns steadily, where GPS does not tell that it stands."""
+    variance = max(s.P[GYRO_BIAS, GYRO_BIAS], s.P[GYRO_BIAS + 1, GYRO_BIAS + 1])
+    std = math.sqrt(max(variance, s.P[GYRO_BIAS + 2, GYRO_BIAS + 2]))
+    stale = s.time_s - s.fix_s > FRESH_GPS_S
+    return stale and turns_steadily(s, as_vec(s.gyro_bias_b), std)
 
 
 @compiled
