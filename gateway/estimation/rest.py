@@ -21,6 +21,11 @@ SHAKEN: Final = 5.0
 SLOW_TURN_RADPS: Final = 0.5 * RAD_PER_DEG
 """A steady turn of less passes for a change of the bias, and turns little before it ends."""
 TURN_SIGMA: Final = 4.0
+PUSH_MPS2: Final = 0.3
+PUSH_SIGMA_SQ: Final = 9.0
+"""A steady level force beyond both, three standard deviations of tilt, is no rest."""
+PUSHED_MPS: Final = 40.0
+"""No steady force pushes to more than this without a turn or a gust."""
 STEADY: Final = 0.15
 """Its average stays this much closer to itself then: noise and vibration average out."""
 
@@ -77,6 +82,8 @@ class RestState:
 
     rest_s: float
     at_rest: int
+    pushed_mps: float
+    """Speed to which a steady force would have pushed by now, were it no tilt."""
     bias_shown: int
     """1 once a rest has shown the bias: before, it may be any."""
     gyro_lp: Annotated[FloatArray, (3,)]
@@ -146,6 +153,29 @@ def watch_rest(
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
     if s.at_rest == 1:
         s.bias_shown = 1
+
+
+@compiled
+def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> bool:
+    """Return whether a steady force is not gravity alone: a take-off run is as smooth as rest.
+
+    What would have pushed to a speed that nothing here flies is a tilt that is wrong.
+
+    Parameters
+    ----------
+    s : RestState
+        Changed in place.
+    force_level : tuple of 3 floats
+        Mean specific force in a level frame, m/s2.
+    unsure_sq : float
+        Variance of what tilt and accelerometer make up of it in the level, m2/s4.
+    dt : float
+        Time step, s.
+    """
+    level_sq = force_level[0] * force_level[0] + force_level[1] * force_level[1]
+    pushed = level_sq > PUSH_SIGMA_SQ * unsure_sq + PUSH_MPS2 * PUSH_MPS2
+    s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
+    return bool(pushed and s.pushed_mps < PUSHED_MPS)
 
 
 @compiled

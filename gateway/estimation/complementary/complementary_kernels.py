@@ -69,7 +69,7 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
-from gateway.estimation.rest import doubt_rest_bias, outruns, turns_steadily, watch_rest
+from gateway.estimation.rest import doubt_rest_bias, is_pushed, outruns, turns_steadily, watch_rest
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -215,7 +215,7 @@ def advance(
     if sound_gyro and sound_accel:
         rested, moving = s.at_rest == 1, is_moving(s, p)
         turning = since_fix > FRESH_GPS_S and turns_steadily(s, as_vec(s.bias_b), bias_std(s))
-        watch_rest(s, p, gyro, accel, moving or turning, dt)
+        watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), dt)
         raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
         watch_gravity(s, p)
     coasting = since_fix < p.coast_s and s.at_rest == 0 and is_under_way(s)
@@ -235,6 +235,14 @@ def advance(
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
     watch_accuracy(s, p)
+
+
+@compiled
+def is_pushed_on(s: ComplementaryState, dt: float) -> bool:
+    """Return whether a steady force pushes, as far as the level is known."""
+    std = STANDARD_GRAVITY_MPS2 * max(s.told_std[0], s.told_std[1])
+    unsure = math.inf if s.lost == 1 else 2.0 * std * std
+    return is_pushed(s, rotate(as_quat(s.q_eb), as_vec(s.accel_lp)), unsure, dt)
 
 
 @compiled

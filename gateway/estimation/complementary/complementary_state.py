@@ -191,6 +191,10 @@ class ComplementaryState(FilterState):
     """What pulls across the level beside gravity, m/s2."""
     unaided_pull_sq: float
     """Mean square of it, m2/s4."""
+    unaided_pulled: int
+    """1 once something has pulled harder than a hand does, until the next rest."""
+    unaided_hand_s: float
+    """Until then, for how long it has moved since the last rest."""
     unaided_level_sq: float
     """Variance of the level by it, about one axis, rad2."""
 

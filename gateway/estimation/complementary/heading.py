@@ -80,7 +80,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
         if is_likely(norm, s.strength_ut) and not upright:
             look_for_iron(s, p, mag_b, field, dt)
     weight = take_field(s, p, norm, down)
-    if weight <= 0.0 or upright:
+    if weight <= 0.0 or upright or not is_likely(norm, s.strength_ut):
         return
     level = max(s.told_std[0], s.told_std[1]) < LEVEL_RAD
     if level and s.mag_disturbed == 0 and is_likely(norm, s.strength_ut):
@@ -97,7 +97,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 * steepness(dip)
     if s.level_by_gps == 0:
         # A level that is off turns the field for as long, the more the steeper it is.
-        steep = math.tan(s.mag_dip_ref)
+        steep = math.tan(dip)
         density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
     density += MISFIT_S * unexplained_iron_sq(s) / (north * north + east * east)
     row = cleared_row(s)

@@ -24,6 +24,7 @@ from gateway.estimation.complementary.errors.drift import (
 )
 from gateway.estimation.complementary.tilt import begin_pull
 from gateway.estimation.kernel_record import as_quat, as_vec
+from gateway.estimation.rest import REST_TAU_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -31,6 +32,14 @@ PULL_MEMORY_S: Final = 20.0
 """What has pulled in this time is to be expected."""
 PULL_TAU_S: Final = 1.5
 """What a hand does averages out in this time."""
+HAND_MPS2: Final = 0.2
+"""A hand pulls less over it: recorded ones up to 0.15, a hovering quadrotor up to 0.7."""
+HAND_S: Final = 4.0
+"""What has moved for a few times this long and pulled no harder is in a hand."""
+TILTED_SQ: Final = 8.0
+"""Up to two standard deviations about both axes, what seems to pull is a level that is off."""
+EXPECTED_MPS2: Final = 0.3
+"""All else has to be expected to pull by this, however long it has not."""
 
 
 @compiled
@@ -54,13 +63,36 @@ def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None
     pull_sq = unaided_pull_sq(s, drift_sq, dt)
     s.unaided_pull_sq += share * (pull_sq - s.unaided_pull_sq)
     drift = math.sqrt(drift_sq) / tau
+    expected_sq = expected_pull_sq(s, pull_sq, dt)
     # Here the sum of both errors is least.
-    best = (4.0 * TURN_S**2 * math.sqrt(s.unaided_pull_sq) / (g * drift)) ** (1.0 / 3.0)
+    best = (4.0 * TURN_S**2 * math.sqrt(expected_sq) / (g * drift)) ** (1.0 / 3.0)
     s.gravity_tau_s = tau = max(p.tau_accel_s, best)
     passed = min(1.0, 2.0 * (TURN_S / tau) ** 2) / g
-    tilted = passed * passed * max(pull_sq, s.unaided_pull_sq)
+    tilted = 0.0 if s.at_rest == 1 else passed * passed * max(pull_sq, s.unaided_pull_sq)
     faded = math.exp(-2.0 * dt / tau)
+    if s.at_rest == 1 and s.force_lp_s < s.rest_s + REST_TAU_S:
+        # The average is of this rest alone.
+        faded = 0.0
     s.unaided_level_sq = tilted + faded * max(s.unaided_level_sq - tilted, 0.0)
+
+
+@compiled
+def expected_pull_sq(s: ComplementaryState, pull_sq: float, dt: float) -> float:
+    """Return the square of what is to be expected to pull: at rest nothing, m2/s4.
+
+    A flight pulls hardest where it begins. Were the average still short then, it would take the
+    take-off run for gravity.
+    """
+    if s.at_rest == 1:
+        s.unaided_hand_s, s.unaided_pulled = 0.0, 0
+        return 0.0
+    tilted_sq = TILTED_SQ * STANDARD_GRAVITY_MPS2**2 * s.unaided_level_sq
+    if pull_sq > HAND_MPS2**2 + tilted_sq:
+        s.unaided_pulled = 1
+    if s.unaided_pulled == 0:
+        s.unaided_hand_s += dt
+    share = 1.0 if s.unaided_pulled == 1 else math.exp(-s.unaided_hand_s / HAND_S)
+    return float(max(s.unaided_pull_sq, (share * EXPECTED_MPS2) ** 2))
 
 
 @compiled
@@ -90,7 +122,7 @@ def unaided_pull_sq(s: ComplementaryState, drift_sq: float, dt: float) -> float:
     """Return the square of what pulls beside gravity, less what drift explains, m2/s4."""
     if s.by_gps == 1:
         begin_pull(s)
-        return s.pull_mps2 * s.pull_mps2
+        return 0.0 if s.at_rest == 1 else s.pull_mps2 * s.pull_mps2
     mean = rotate(as_quat(s.q_ei), as_vec(s.force_mean_i))
     pull_sq = 0.0
     for k in range(2):

@@ -43,7 +43,7 @@ from gateway.estimation.eskf.start import (
     start,
     start_heading_by_compass,
 )
-from gateway.estimation.eskf.unaided_velocity import PUSHED_SQ, unaided_density, watch_way
+from gateway.estimation.eskf.unaided_velocity import unaided_density, watch_way
 from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.filtering.sample_clock import (
@@ -74,7 +74,9 @@ from gateway.estimation.magfield import (
 )
 from gateway.estimation.rest import (
     BIAS_CHANGE_RADPS,
+    PUSHED_MPS,
     doubt_rest_bias,
+    is_pushed,
     outruns,
     turns_steadily,
     watch_rest,
@@ -102,10 +104,6 @@ PSEUDO_S: Final = 0.1
 """Between measurements that stand in for a sensor."""
 COMPASS_S: Final = 0.045
 """Between compass measurements; its slow error makes more of them useless."""
-PUSH_MPS2: Final = 0.3
-"""A steady level force beyond this, and beyond three standard deviations of tilt, is no rest."""
-PUSHED_MPS: Final = 40.0
-"""No steady force pushes to more than this without a turn or a gust."""
 
 
 @compiled
@@ -140,7 +138,7 @@ def take_imu(
         check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
         rested = s.at_rest == 1
-        watch_rest(s, p, gyro, accel, is_pushed(s, dt) or moving or is_turning(s), dt)
+        watch_rest(s, p, gyro, accel, is_pushed_on(s, dt) or moving or is_turning(s), dt)
         raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
@@ -222,17 +220,12 @@ def is_turning(s: EskfState) -> bool:
 
 
 @compiled
-def is_pushed(s: EskfState, dt: float) -> bool:
-    """Return whether a steady force is not gravity alone: braking is as smooth as rest.
-
-    What would have pushed to a speed that nothing here flies is a tilt that is wrong.
-    """
-    f = rotate(as_quat(s.q_nb), as_vec(s.accel_lp))
+def is_pushed_on(s: EskfState, dt: float) -> bool:
+    """Return whether a steady force pushes, as far as the level is known."""
     unsure = STANDARD_GRAVITY_MPS2**2 * level_variance(s) + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
-    level_sq = f[0] * f[0] + f[1] * f[1]
-    pushed = s.lost == 0 and level_sq > PUSHED_SQ * unsure + PUSH_MPS2 * PUSH_MPS2
-    s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
-    return bool(pushed and s.pushed_mps < PUSHED_MPS)
+    if s.lost == 1:
+        unsure = math.inf
+    return is_pushed(s, rotate(as_quat(s.q_nb), as_vec(s.accel_lp)), unsure, dt)
 
 
 @compiled

@@ -92,8 +92,6 @@ class EskfState(FilterState):
     """The same of the gyroscope's bias, rad/s."""
     assumed_scale: Annotated[FloatArray, (3,)]
     """And of its scale."""
-    pushed_mps: float
-    """Speed to which a steady force would have pushed by now, were it no tilt."""
     flies: int
     """1 while the way without GPS is that of a flight."""
     rest_unsure: int

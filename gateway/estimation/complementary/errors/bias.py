@@ -53,6 +53,8 @@ def update_bias(s: ComplementaryState, p: ComplementaryGains, tau_s: float, dt: 
         update_bias_at_rest(s, p, dt)
     elif settled:
         variance = noise_for(p.bias_motion_radps, BIAS_WALK_RAD2PS3 * dt)
+        # A level that was off comes back at a rate of its own, which is none of the bias.
+        variance += 2.0 * s.unaided_level_sq / (tau_s * dt)
         for k in range(2):
             row = (s.turn_lp[3 * k], s.turn_lp[3 * k + 1], s.turn_lp[3 * k + 2])
             # The low-passed frame falls behind by the bias error, and gravity pulls it back.
