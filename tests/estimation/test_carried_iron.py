@@ -5,8 +5,22 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from gateway.estimation.columns import (
+    ACCEL,
+    GPS_ALT,
+    GPS_COLUMNS,
+    GPS_DECLINATION,
+    GPS_LAT,
+    GPS_USABLE,
+    GPS_VEL,
+    GYRO,
+    IMU_COLUMNS,
+    MAG,
+    NAV_ATTITUDE_STD,
+)
 from gateway.estimation.complementary.complementary_state import (
     COMPASS,
     HEADING,
@@ -37,15 +51,27 @@ from gateway.estimation.filtering.iron_evidence import (
     mean_strengthening,
     unexplained_iron_sq,
 )
+from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
+from gateway.geometry.geodesy import radii_m
 from gateway.records import Quat, Vec3
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.test_without_compass import (
+    FIXES_HZ,
+    RATE_HZ,
+    correlated,
+    estimator_of,
+    heading_off,
+)
 
 GAINS = make_gains(ComplementarySettings(), ReferenceSettings(), RestSettings(), CompassSettings())
 EARTH_N_UT = np.array([20.0, 6.0, 40.0])
 IRON_UT = np.array([8.0, -6.0, 3.0])
+CAR_IRON_UT = (5.0, 12.0, 5.0)
+STANDS_S, LEARNED_S, DRIVES_S = 15.0, 25.0, 160.0
 
 
 def heading_of(field: np.ndarray) -> float:
@@ -182,3 +208,48 @@ def test_a_field_that_proves_less_level_is_no_evidence_of_iron_across_it() -> No
     row[HEADING] = row[COMPASS] = 1.0
     row[IRON : IRON + 3] = heading_by_iron(tuple(s.q_eb), tuple(field - lost))
     assert expected_variance(s) < 1e-9
+
+
+def driven(seed: int) -> tuple[SampleLog, np.ndarray]:
+    """Stand, then drive through a town with iron at the compass; also tell the heading, rad."""
+    rng, n = np.random.default_rng(seed), round(DRIVES_S * RATE_HZ)
+    time_s = np.arange(n) / RATE_HZ
+    drives = np.clip((time_s - STANDS_S) / 3.0, 0.0, 1.0)
+    speed = np.abs(8.0 + correlated(rng, n, RATE_HZ, 3.0, 6.0)[:, 0]) * drives
+    speed = gaussian_filter1d(speed, RATE_HZ)
+    rate = gaussian_filter1d(correlated(rng, n, RATE_HZ, 0.25, 2.0)[:, 0] * drives, RATE_HZ)
+    heading = rng.uniform(-math.pi, math.pi) + np.cumsum(rate) / RATE_HZ
+    imu = np.zeros((n, IMU_COLUMNS))
+    shaken = 0.05 + 0.4 * drives[:, None]
+    imu[:, ACCEL : ACCEL + 3] = rng.normal(0.0, 1.0, (n, 3)) * shaken - (0.0, 0.0, G)
+    imu[:, ACCEL] += np.gradient(speed, time_s)
+    imu[:, ACCEL + 1] += speed * rate
+    imu[:, GYRO : GYRO + 3] = rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
+    imu[:, GYRO + 2] += rate
+    back = Rotation.from_rotvec(np.outer(-heading, [0.0, 0.0, 1.0]))
+    earth = np.tile([math.hypot(*EARTH_N_UT[:2]), 0.0, EARTH_N_UT[2]], (n, 1))
+    imu[:, MAG : MAG + 3] = back.apply(earth) + CAR_IRON_UT + rng.normal(0.0, 0.4, (n, 3))
+    at = np.arange(RATE_HZ, n, RATE_HZ // FIXES_HZ)
+    vel_n = np.column_stack([speed * np.cos(heading), speed * np.sin(heading), 0.0 * speed])
+    place = np.cumsum(vel_n, axis=0)[at] / RATE_HZ
+    gps = np.full((len(at), GPS_COLUMNS), math.nan)
+    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
+    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
+    gps[:, GPS_LAT : GPS_LAT + 2] += np.degrees(place[:, :2] / radii_m(LAT_DEG, ALT_M))
+    gps[:, GPS_ALT] = ALT_M
+    gps[:, GPS_VEL : GPS_VEL + 3] = vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3))
+    us = np.round(time_s * 1e6).astype(np.int64)
+    return SampleLog(us, imu, us[:0], np.empty(0), us[at], gps), heading
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_compass_that_nobody_has_calibrated_is_found_out_by_driving(name: str) -> None:
+    """Iron that turns it by 30 deg; the velocities of GPS tell the heading, and so the iron."""
+    off, told = [], []
+    for seed in range(6):
+        log, heading = driven(seed)
+        out = estimator_of(name).run(log)[round(LEARNED_S * RATE_HZ) :]
+        off.append(heading_off(out, heading[-len(out) :]))
+        told.append(out[:, NAV_ATTITUDE_STD + 2])
+    assert np.degrees(np.sqrt(np.mean(np.square(off)))) < 6.5
+    assert np.mean(np.array(off) < 2.0 * np.array(told)) > 0.8

@@ -44,7 +44,7 @@ from gateway.estimation.magfield import DIP_ERROR_RAD, bent_share_sq
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
-AIDED_IRON_UT: Final = 0.5
+AIDED_IRON_UT: Final = 1.0
 """Iron along an axis that is to be expected with GPS, where nothing shows more."""
 MIN_LEVEL_SHARE: Final = 0.05
 """A field that stands more upright tells no heading."""
