@@ -18,6 +18,8 @@ REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
 SHAKEN: Final = 5.0
 """An engine that idles shakes the gyroscope by so many times more than rest without one."""
+STEADY: Final = 0.15
+"""Its average stays this much closer to itself then: noise and vibration average out."""
 SLOW_TURN_RADPS: Final = 0.5 * RAD_PER_DEG
 """A steady turn of less passes for a change of the bias, and turns little before it ends."""
 TURN_SIGMA: Final = 4.0
@@ -26,8 +28,6 @@ PUSH_SIGMA_SQ: Final = 9.0
 """A steady level force beyond both, three standard deviations of tilt, is no rest."""
 PUSHED_MPS: Final = 40.0
 """No steady force pushes to more than this without a turn or a gust."""
-STEADY: Final = 0.15
-"""Its average stays this much closer to itself then: noise and vibration average out."""
 
 
 class RestSettings(Settings, frozen=True):

@@ -3,7 +3,8 @@
 What pulls beside gravity tilts the average, and a drift of the gyroscope lets it fall behind. What
 flies cannot pull one way for long: an acceleration `a` that turns about in the time `T` tilts the
 low-pass of the time constant `tau` by `2 a / g (T / tau)**2`, a drift `b` by `b tau`. So nothing
-that pulls makes the average short; the harder it pulls, the longer the gyroscope is trusted.
+that pulls makes the average short; the harder it pulls, the longer the gyroscope is trusted. At
+rest nothing pulls, and what has just left it may, until it moves as a hand does.
 """
 
 import math

@@ -222,9 +222,8 @@ def is_turning(s: EskfState) -> bool:
 @compiled
 def is_pushed_on(s: EskfState, dt: float) -> bool:
     """Return whether a steady force pushes, as far as the level is known."""
-    unsure = STANDARD_GRAVITY_MPS2**2 * level_variance(s) + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
-    if s.lost == 1:
-        unsure = math.inf
+    known = STANDARD_GRAVITY_MPS2**2 * level_variance(s) + 2.0 * s.P[ACCEL_BIAS, ACCEL_BIAS]
+    unsure = math.inf if s.lost == 1 else known
     return is_pushed(s, rotate(as_quat(s.q_nb), as_vec(s.accel_lp)), unsure, dt)
 
 
