@@ -34,6 +34,8 @@ STUCK_TURN_RAD: Final = 0.05
 """A field that is the same to the last digit after so much of a turn is none: a sensor hangs."""
 TURN_SHARE: Final = 0.2
 """A turn that changes the field by this share of its strength is compared with the gyroscope's."""
+STILL_SHARE: Final = 0.1
+"""A field that changes by less of what it should, squared, stands still."""
 TURNS_KEPT: Final = 0.99
 """What was compared is forgotten after so many hundred turns more."""
 WRONG_SHARE: Final = 0.75
@@ -83,6 +85,9 @@ class FieldState:
     rate_b: Annotated[FloatArray, (3,)]
     """Angular rate, bias removed, rad/s."""
     at_rest: int
+    bias_shown: int
+    turn_s: float
+    """See `RestState`."""
     mag_s: float
     """Time of the last sample that told a field."""
     mag_norm_ref: float
@@ -181,6 +186,11 @@ def compare_turn(s: FieldState, mag_b: Vec3) -> None:
     begin_turn(s, mag_b)
     if norm_sq == 0.0:
         return
+    if changed_sq > STILL_SHARE * expected_sq:
+        s.turn_s = 0.0
+    else:
+        # The gyroscope alone says that it turns: its bias may be any by now.
+        s.bias_shown = 0
     if s.mag_changed_ut2 == 0.0:
         # Until turns of a radian or so have shown otherwise, it is a compass.
         s.mag_changed_ut2 = norm_sq

@@ -23,6 +23,10 @@ STEADY: Final = 0.15
 SLOW_TURN_RADPS: Final = 0.5 * RAD_PER_DEG
 """A steady turn of less passes for a change of the bias, and turns little before it ends."""
 TURN_SIGMA: Final = 4.0
+LEAN_SQ: Final = 0.1
+"""Square of how far, as a share, the axis of such a turn leans from the mean force."""
+LONGEST_TURN_S: Final = 40.0
+"""What seems to turn for longer is a bias that has changed, unless the compass turns too."""
 PUSH_MPS2: Final = 0.3
 PUSH_SIGMA_SQ: Final = 9.0
 """A steady level force beyond both, three standard deviations of tilt, is no rest."""
@@ -84,6 +88,8 @@ class RestState:
     at_rest: int
     pushed_mps: float
     """Speed to which a steady force would have pushed by now, were it no tilt."""
+    turn_s: float
+    """For how long the mean rate has been that of a turn, since the compass last turned too."""
     bias_shown: int
     """1 once a rest has shown the bias: before, it may be any."""
     gyro_lp: Annotated[FloatArray, (3,)]
@@ -179,14 +185,35 @@ def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> b
 
 
 @compiled
-def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float) -> bool:
+def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float, dt: float) -> bool:
     """Return whether the mean rate is that of a turn, since the bias is known not to be so large.
 
     What turns slowly on a smooth road, on water or in calm air is as quiet as rest, and would teach
-    the bias its own rate.
+    the bias its own rate. But it turns about the vertical: about a level axis gravity would turn in
+    the body, so a rate about that is a bias that has changed.
+
+    Parameters
+    ----------
+    s : RestState
+        Changed in place.
+    bias_b : tuple of 3 floats
+        The estimator's, rad/s.
+    bias_std : float
+        Its standard deviation along an axis, rad/s.
+    dt : float
+        Time step, s.
     """
-    most = SLOW_TURN_RADPS + TURN_SIGMA * bias_std
-    return s.bias_shown == 1 and largest_difference(as_vec(s.gyro_lp), bias_b) > most
+    rate, force = as_vec(s.gyro_lp), as_vec(s.accel_lp)
+    off = (rate[0] - bias_b[0], rate[1] - bias_b[1], rate[2] - bias_b[2])
+    off_sq = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
+    force_sq = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
+    along = off[0] * force[0] + off[1] * force[1] + off[2] * force[2]
+    upright_sq = along * along / force_sq if force_sq > 0.0 else 0.0
+    most_sq = (SLOW_TURN_RADPS + TURN_SIGMA * bias_std) ** 2
+    leans = off_sq - upright_sq > max(most_sq, LEAN_SQ * upright_sq)
+    turns = s.bias_shown == 1 and upright_sq > most_sq and not leans
+    s.turn_s = s.turn_s + dt if turns else 0.0
+    return bool(turns and s.turn_s < LONGEST_TURN_S)
 
 
 @compiled

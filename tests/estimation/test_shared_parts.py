@@ -28,7 +28,7 @@ from gateway.estimation.magfield import (
     is_field_told,
 )
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestSettings, watch_rest
+from gateway.estimation.rest import RestSettings, turns_steadily, watch_rest
 from gateway.estimation.sensor_faults import (
     HOLD_S,
     UNKNOWN_HOLD_S,
@@ -96,6 +96,40 @@ class TestRest:
 
     def test_never_in_flight(self) -> None:
         assert self.watch(lambda t: (0.0, 0.0, 0.0), moving=True) == 0
+
+    @pytest.mark.parametrize(
+        ("rate_radps", "shown", "turns"),
+        [
+            ((0.0, 0.0, 0.05), 1, True),
+            ((0.0, 0.0, 0.05), 0, False),
+            ((0.0, 0.0, 0.01), 1, False),
+            ((0.05, 0.0, 0.0), 1, False),
+            ((0.04, 0.0, 0.05), 1, False),
+        ],
+        ids=["about down", "bias not known", "within the bias", "about level", "leaning"],
+    )
+    def test_a_steady_rate_is_a_turn_where_gravity_and_a_known_bias_allow_it(
+        self, rate_radps: tuple[float, float, float], shown: int, turns: bool
+    ) -> None:
+        state = new_record(ComplementaryState)
+        state.bias_shown, state.accel_lp[:], state.gyro_lp[:] = shown, LEVEL, rate_radps
+        assert turns_steadily(state, (0.0, 0.0, 0.0), 0.001, 0.01) == turns
+
+    @pytest.mark.parametrize("field_turns", [True, False])
+    def test_what_turns_for_long_is_a_bias_unless_the_compass_turns_too(
+        self, field_turns: bool
+    ) -> None:
+        state, still = new_record(ComplementaryState), (0.0, 0.0, 0.0)
+        state.bias_shown, state.accel_lp[:], state.gyro_lp[2] = 1, LEVEL, 0.05
+        state.rate_b[2] = 0.05
+        told = []
+        for k in range(6000):
+            angle = -0.05 * 0.01 * k * field_turns
+            field = (20.0 * math.cos(angle), 20.0 * math.sin(angle), 40.0 + 0.01 * (k % 2))
+            is_field_told(state, field, 0.01)
+            told.append(turns_steadily(state, still, 0.001, 0.01))
+        assert told[0]
+        assert told[-1] == field_turns
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def advance(
     since_fix = s.time_s - s.fix_s
     if sound_gyro and sound_accel:
         rested, moving = s.at_rest == 1, is_moving(s, p)
-        turning = since_fix > FRESH_GPS_S and turns_steadily(s, as_vec(s.bias_b), bias_std(s))
+        turning = turns_steadily(s, as_vec(s.bias_b), bias_std(s), dt) and since_fix > FRESH_GPS_S
         watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), dt)
         raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
         watch_gravity(s, p)

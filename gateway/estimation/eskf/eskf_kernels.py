@@ -138,7 +138,7 @@ def take_imu(
         check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
         rested = s.at_rest == 1
-        watch_rest(s, p, gyro, accel, is_pushed_on(s, dt) or moving or is_turning(s), dt)
+        watch_rest(s, p, gyro, accel, is_pushed_on(s, dt) or moving or is_turning(s, dt), dt)
         raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
@@ -211,12 +211,12 @@ def is_moving(s: EskfState, p: EskfGains) -> bool:
 
 
 @compiled
-def is_turning(s: EskfState) -> bool:
+def is_turning(s: EskfState, dt: float) -> bool:
     """Return whether it turns steadily, where GPS does not tell that it stands."""
     variance = max(s.P[GYRO_BIAS, GYRO_BIAS], s.P[GYRO_BIAS + 1, GYRO_BIAS + 1])
     std = math.sqrt(max(variance, s.P[GYRO_BIAS + 2, GYRO_BIAS + 2]))
-    stale = s.time_s - s.fix_s > FRESH_GPS_S
-    return stale and turns_steadily(s, as_vec(s.gyro_bias_b), std)
+    turning = turns_steadily(s, as_vec(s.gyro_bias_b), std, dt)
+    return turning and s.time_s - s.fix_s > FRESH_GPS_S
 
 
 @compiled
