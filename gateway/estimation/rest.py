@@ -28,7 +28,7 @@ LEAN_SQ: Final = 0.1
 LONGEST_TURN_S: Final = 40.0
 """What seems to turn for longer is a bias that has changed, unless the compass turns too."""
 PUSH_MPS2: Final = 0.3
-PUSH_SIGMA_SQ: Final = 9.0
+PUSHED_SQ: Final = 9.0
 """A steady level force beyond both, three standard deviations of tilt, is no rest."""
 PUSHED_MPS: Final = 40.0
 """No steady force pushes to more than this without a turn or a gust."""
@@ -179,7 +179,7 @@ def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> b
         Time step, s.
     """
     level_sq = force_level[0] * force_level[0] + force_level[1] * force_level[1]
-    pushed = level_sq > PUSH_SIGMA_SQ * unsure_sq + PUSH_MPS2 * PUSH_MPS2
+    pushed = level_sq > PUSHED_SQ * unsure_sq + PUSH_MPS2 * PUSH_MPS2
     s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
     return bool(pushed and s.pushed_mps < PUSHED_MPS)
 

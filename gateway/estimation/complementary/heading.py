@@ -83,7 +83,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if weight <= 0.0 or upright or not is_likely(norm, s.strength_ut):
         return
     level = max(s.told_std[0], s.told_std[1]) < LEVEL_RAD
-    if level and s.mag_disturbed == 0 and is_likely(norm, s.strength_ut):
+    if level and s.mag_disturbed == 0:
         note_dip(s, math.asin(down / norm), dt)
     measured = -math.atan2(east, north)
     if math.isfinite(s.declination_rad):

@@ -12,6 +12,7 @@ from gateway.estimation.eskf.late_fix import lag_integrals
 from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, take_back
 from gateway.estimation.filtering.fix_intake import look_back
 from gateway.estimation.local_position import past_state
+from gateway.estimation.rest import PUSHED_SQ
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 WAY_S: Final = 2.0
@@ -25,8 +26,6 @@ LEG_S: Final = 10.0
 """A flight that hardly turns is on the same leg for about this time."""
 ASSUMED_S: Final = 5.0
 """Corrections that are older are not taken back."""
-PUSHED_SQ: Final = 9.0
-"""Beyond three standard deviations nothing is explained by them."""
 
 
 @compiled
