@@ -22,7 +22,7 @@ UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
 
 class ImuFlags(IntFlag):
-    """State of an IMU node, one bit each; the same bits as in the radio payload."""
+    """State of an IMU node, one bit each; the first eight are those of the radio payload."""
 
     ACCEL_FILTERED = 1 << 0
     """The node has low-passed the acceleration; the gateway must not do it again."""
@@ -35,6 +35,8 @@ class ImuFlags(IntFlag):
     SELF_TEST_FAILED = 1 << 5
     ACCEL_CLIPPED = 1 << 6
     GYRO_CLIPPED = 1 << 7
+    MAG_UNCALIBRATED = 1 << 8
+    """The gateway's own: the compass was never calibrated, the aircraft's iron is still in it."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """Returns a plain int to test a bit: building a flag would cost six times as much."""

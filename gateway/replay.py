@@ -153,7 +153,7 @@ def calibrated_of(
     si = cells[:, SI].copy()
     has_counts = has_group(cells, RAW)
     if has_counts.any():
-        accel, gyro, mag, temperature_degc = chain.calibrated(
+        accel, gyro, mag, temperature_degc, flags[has_counts] = chain.calibrated(
             cells[has_counts, RAW], flags[has_counts]
         )
         si[has_counts] = np.column_stack([accel, gyro, mag, temperature_degc])

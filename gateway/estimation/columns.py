@@ -24,7 +24,7 @@ from gateway.records import (
 )
 from gateway.units import DEG_PER_DEGE7
 
-ImuRow = tuple[float, float, float, float, float, float, float, float, float, float]
+ImuRow = tuple[float, ...]
 GpsRow = tuple[float, ...]
 
 ACCEL: Final = 0
@@ -35,7 +35,9 @@ MAG: Final = 6
 """Magnetic field in body FRD, uT: three columns, NaN unless new."""
 CLIPPED: Final = 9
 """1 where a sensor touched the end of its range, else 0."""
-IMU_COLUMNS: Final = 10
+UNCALIBRATED: Final = 10
+"""1 where the compass was never calibrated, else 0."""
+IMU_COLUMNS: Final = 11
 
 GPS_USABLE: Final = 0
 """1 for a fix that may be fused, else 0."""
@@ -75,8 +77,9 @@ _flags_of = cache(NavFlags)
 def imu_row(sample: ImuSample) -> ImuRow:
     """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
     clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
+    uncalibrated = 1.0 if sample.flags & ImuFlags.MAG_UNCALIBRATED else 0.0
     mag = sample.mag_b_ut or UNKNOWN_VEC3
-    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped)
+    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped, uncalibrated)
 
 
 def imu_rows(
@@ -96,8 +99,8 @@ def imu_rows(
     ndarray, shape (n, IMU_COLUMNS)
         What `imu_row` gives for each.
     """
-    clipped = (flags & int(CLIP_FLAGS)) != 0
-    return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, clipped.astype(np.float64)])
+    shown = [(flags & int(bits)) != 0 for bits in (CLIP_FLAGS, ImuFlags.MAG_UNCALIBRATED)]
+    return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
 
 @compiled

@@ -26,6 +26,8 @@ FIRST_FIELD_S: Final = 5.0
 TURNING_RADPS: Final = 0.35
 STALE_MAG_S: Final = 1.0
 MIN_FIELD_UT: Final = 1.0
+UNCALIBRATED_IRON_UT: Final = 15.0
+"""Iron along an axis that is to be expected in a compass which nobody has calibrated."""
 PLACE_RAD: Final = 1.0 * RAD_PER_DEG
 """What the declination is off, and the compass on its board."""
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
@@ -108,6 +110,8 @@ class FieldState:
     mag_changed_ut2: float
     mag_unexplained_ut2: float
     """By how much it was another after the last turns, and other than it should be: squares."""
+    mag_uncalibrated: int
+    """1 where nobody has calibrated the compass."""
     mag_misplaced: int
     """1 while the field turns otherwise than the aircraft: axes are swapped or reversed."""
 

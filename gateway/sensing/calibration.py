@@ -102,6 +102,11 @@ class NodeCalibration(Settings, frozen=True):
         ),
     ] = 0.0
 
+    @property
+    def knows_iron(self) -> bool:
+        """Whether the compass was ever calibrated; every one has some hard iron."""
+        return self.mag_hard_iron_ut != _NO_OFFSET
+
     def __post_init__(self) -> None:
         """Refuse matrices that are no rotations, or have no inverse."""
         for name in ("mounting", "mag_mounting"):

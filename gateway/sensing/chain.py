@@ -1,6 +1,7 @@
 """The sensing stage of one aircraft: raw records in, calibrated and filtered samples out."""
 
 import math
+from functools import cache
 from typing import Annotated, Final
 
 import msgspec
@@ -99,6 +100,7 @@ class SensorChain:
         self._accel = Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2)
         self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
         self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
+        self._shown = ImuFlags(0) if cal.knows_iron else ImuFlags.MAG_UNCALIBRATED
         self.reset()
 
     def reset(self) -> None:
@@ -156,7 +158,7 @@ class SensorChain:
             gyro,
             mag,
             temperature_from_counts(raw.temperature_raw),
-            raw.flags,
+            _joined_flags(raw.flags, self._shown),
         )
 
     def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
@@ -219,7 +221,7 @@ class SensorChain:
 
     def calibrated(
         self, counts: FloatArray, flags: IntArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
         """Calibrate many IMU payloads without filtering them.
 
         Parameters
@@ -236,6 +238,8 @@ class SensorChain:
             In m/s2, rad/s and uT, body FRD; the field NaN unless it is new, the others NaN where
             the node could not read them.
         temperature_degc : ndarray, shape (n,)
+        flags : ndarray of int, shape (n,)
+            Those given, and what the calibration adds.
         """
         accel = vectors_from_counts(accel_from_counts, counts[:, 0:3], counts[:, 10])
         gyro = vectors_from_counts(gyro_from_counts, counts[:, 3:6], counts[:, 11])
@@ -246,6 +250,7 @@ class SensorChain:
             self._gyro.apply_all(gyro),
             self._mag.apply_all(new_field_ut(counts, flags)),
             temperature_from_counts(counts[:, 9]),
+            flags | int(self._shown),
         )
 
     def imu_si_log(
@@ -370,6 +375,12 @@ class SensorChain:
             return measured_hz if changed else None
         self._window = (count, total_us)
         return None
+
+
+@cache
+def _joined_flags(flags: ImuFlags, more: ImuFlags) -> ImuFlags:
+    """Join two sets of flags; they are the same for many samples, and a lookup costs a tenth."""
+    return flags | more
 
 
 def _filtered(vector_filter: VectorFilter, v: Vec3) -> Vec3:

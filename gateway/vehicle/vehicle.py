@@ -193,6 +193,7 @@ class Vehicle:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
         told = self.telemetry.on_state(state, sample)
+        told += self._announcements.on_sample(sample, now_us)
         told += self._announcements.on_flags(state.flags, now_us)
         found = self._replies(told)
         found += self._intervals.on_state(state.time_us)

@@ -20,6 +20,7 @@ from gateway.estimation.columns import (
     IMU_COLUMNS,
     MAG,
     NAV_ATTITUDE_STD,
+    UNCALIBRATED,
 )
 from gateway.estimation.complementary.complementary_state import (
     COMPASS,
@@ -253,3 +254,26 @@ def test_a_compass_that_nobody_has_calibrated_is_found_out_by_driving(name: str)
         told.append(out[:, NAV_ATTITUDE_STD + 2])
     assert np.degrees(np.sqrt(np.mean(np.square(off)))) < 6.5
     assert np.mean(np.array(off) < 2.0 * np.array(told)) > 0.8
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_where_it_is_known_that_nobody_has_calibrated_it_it_is_found_at_once(name: str) -> None:
+    off, told = [], []
+    for seed in range(6):
+        log, heading = driven(seed)
+        log.imu[:, UNCALIBRATED] = 1.0
+        out = estimator_of(name).run(log)[round(LEARNED_S * RATE_HZ) :]
+        off.append(heading_off(out, heading[-len(out) :]))
+        told.append(out[:, NAV_ATTITUDE_STD + 2])
+    assert np.degrees(np.sqrt(np.mean(np.square(off)))) < 2.5
+    assert np.mean(np.array(off) < 2.0 * np.array(told)) > 0.93
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_iron_that_was_found_is_forgotten_once_the_compass_is_calibrated(name: str) -> None:
+    log, heading = driven(0)
+    calibrated = np.arange(len(heading)) >= round(DRIVES_S / 2 * RATE_HZ)
+    log.imu[:, UNCALIBRATED] = ~calibrated
+    log.imu[calibrated, MAG : MAG + 3] -= CAR_IRON_UT
+    out = estimator_of(name).run(log)[calibrated]
+    assert np.degrees(heading_off(out, heading[calibrated]).max()) < 5.0

@@ -61,6 +61,6 @@ def test_the_same_bits(seed: int) -> None:
     for part in (slice(0, 7), slice(7, 8), slice(8, 8), slice(8, None)):
         time_us = np.array([raw.time_us for raw in raws[part]], np.int64)
         values = many.calibrated(counts[part], flags[part])
-        found += many.imu_si_log(time_us, *values, flags[part]).samples()
+        found += many.imu_si_log(time_us, *values).samples()
     assert repr(found) == repr(expected)
     assert many.snapshot() == one.snapshot()

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import Incoming, NavFlags, Outgoing
+from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
 from gateway.vehicle.home import Place
 from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.events import INFO
@@ -243,6 +243,16 @@ def test_a_compass_with_wrong_axes_is_reported_once_with_what_to_do() -> None:
         "Compass axes wrong, not used: check CAL_MAG_MNT",
         "Magnetic field disturbed",
     ]
+
+
+def test_a_compass_that_was_never_calibrated_is_reported_until_it_is() -> None:
+    vehicle, told = make(), []
+    for time_us in range(0, 20 * ONE_S, ONE_S // 10):
+        flags = ImuFlags.MAG_UNCALIBRATED if time_us < 10 * ONE_S else ImuFlags(0)
+        field = None if time_us % ONE_S else (20.0, 0.0, 43.0)
+        sample = replace(sample_at(time_us), flags=flags, mag_b_ut=field)
+        told += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
+    assert told == ["Compass not calibrated", "Compass calibrated"]
 
 
 def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:

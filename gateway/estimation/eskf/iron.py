@@ -21,6 +21,7 @@ from gateway.estimation.filtering.iron_evidence import (
     MISFIT_S,
     compare_strength,
     dip_by_iron,
+    forget_strength,
     is_likely,
     mean_strengthening,
     strength_noise_sq,
@@ -34,6 +35,7 @@ from gateway.estimation.magfield import (
     PLACE_RAD,
     SETTLE_S,
     STALE_MAG_S,
+    UNCALIBRATED_IRON_UT,
     bent_share_sq,
 )
 from gateway.geometry.quaternion import rotate
@@ -184,6 +186,18 @@ def doubt_iron(s: EskfState, variance: float) -> None:
 
 
 @compiled
+def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
+    """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
+    if s.mag_uncalibrated == 1 and not uncalibrated and s.iron_search_started == 1:
+        propagate(s, p)
+        for k in range(3):
+            s.mag_bias_b[k] = 0.0
+            renew(s, MAG_BIAS + k, p.mag_bias_var)
+        forget_strength(s)
+    s.mag_uncalibrated = 1 if uncalibrated else 0
+
+
+@compiled
 def start_iron_search(s: EskfState, p: EskfGains) -> None:
     """Look for iron: without GPS for what a calibration leaves, from the first fix on for any.
 
@@ -197,6 +211,8 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
     left = s.left_iron_ut * s.left_iron_ut
     variance = left if s.aided == 1 else min(left, p.mag_bias_var)
     s.left_iron_ut = math.sqrt(left - variance)
+    if s.aided == 1 and s.mag_uncalibrated == 1:
+        variance = max(variance, UNCALIBRATED_IRON_UT**2 - s.P[MAG_BIAS, MAG_BIAS])
     if s.aided == 1 and has_followed_compass(s):
         north, east, down = as_vec(s.field_n)
         level_sq = north * north + east * east

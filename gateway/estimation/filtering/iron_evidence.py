@@ -11,7 +11,7 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, as_vec
+from gateway.estimation.kernel_record import FloatArray, as_vec, fill
 from gateway.geometry.quaternion import body_axes
 from gateway.records import Quat, Vec3
 
@@ -42,6 +42,14 @@ class IronState:
     """Mean square by which the strength differs from what the known iron explains, uT2."""
     iron_doubted: int
     """1 once that was more than noise, with GPS."""
+
+
+@compiled
+def forget_strength(s: IronState) -> None:
+    """Know nothing of how the strength of the field has varied."""
+    s.iron_norm = s.iron_s = s.iron_misfit = 0.0
+    s.iron_doubted = 0
+    fill(s.iron_along, 0.0)
 
 
 @compiled

@@ -222,7 +222,7 @@ def _calibrated(fused: FusedSample) -> ImuCalibrated:
         sample.gyro_b_radps,
         sample.mag_b_ut,
         sample.temperature_degc,
-        sample.flags,
+        fused.imu.flags if fused.imu else sample.flags,
     )
 
 

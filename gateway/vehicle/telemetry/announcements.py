@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any, Final
 
-from gateway.records import LinkReport, NavFlags
+from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags
 from gateway.vehicle.telemetry.events import (
     CRITICAL,
     INFO,
@@ -73,6 +73,7 @@ class Announcements:
         self._health = health
         self._announcer = Announcer()
         self._flags = NavFlags(0)
+        self._uncalibrated = 0
         self._restarts: dict[int, deque[int]] = {}
         """How often each node had restarted in the last reports."""
         self._latency_s: float | None = None
@@ -90,6 +91,17 @@ class Announcements:
                     str(flag.name), bool(flags & flag), text, now_us, initially=False
                 )
         return found
+
+    def on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
+        """Announce a compass that was never calibrated."""
+        shown = sample.flags & ImuFlags.MAG_UNCALIBRATED
+        if shown == self._uncalibrated or sample.mag_b_ut is None:
+            return []
+        self._uncalibrated = shown
+        text = StatusText(INFO, "Compass calibrated")
+        if shown:
+            text = StatusText(WARNING, "Compass not calibrated")
+        return self._announcer.track("compass", shown, text, now_us, initially=0)
 
     def on_fix(self, now_us: int) -> list[Any]:
         """Announce whether GPS fixes arrive."""

@@ -19,7 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.compass_error import is_dip_turned
-from gateway.estimation.complementary.errors.drift import carry_drift
+from gateway.estimation.complementary.errors.drift import carry_drift, forget_iron
 from gateway.estimation.complementary.errors.drift_update import (
     OUTLIER_SIGMA,
     UNCLIPPED,
@@ -34,18 +34,19 @@ from gateway.estimation.filtering.iron_evidence import (
     MISFIT_S,
     compare_strength,
     dip_by_iron,
+    forget_strength,
     heading_by_iron,
     mean_strengthening,
     strength_noise_sq,
     unexplained_iron_sq,
 )
 from gateway.estimation.kernel_record import as_quat, as_vec
-from gateway.estimation.magfield import DIP_ERROR_RAD, bent_share_sq
+from gateway.estimation.magfield import DIP_ERROR_RAD, UNCALIBRATED_IRON_UT, bent_share_sq
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
 
 AIDED_IRON_UT: Final = 1.0
-"""Iron along an axis that is to be expected with GPS, where nothing shows more."""
+"""Iron along an axis that a calibration leaves: expected with GPS where nothing shows more."""
 MIN_LEVEL_SHARE: Final = 0.05
 """A field that stands more upright tells no heading."""
 
@@ -76,12 +77,22 @@ def look_for_iron(
         expect_iron(s, p, s.strength_ut**2 * bent_share_sq(s.level_dip_rad, s.earth_dip_rad))
     if s.level_by_gps == 0:
         return
-    expect_iron(s, p, AIDED_IRON_UT**2)
+    expect_iron(s, p, (UNCALIBRATED_IRON_UT if s.mag_uncalibrated == 1 else AIDED_IRON_UT) ** 2)
     before = mean_strengthening(s, as_vec(s.iron_b))
     if s.at_rest == 0:
         update_by_strength(s, p, raw, dt)
     update_by_dip(s, p, field_e, dt)
     follow_iron(s, raw, field_e, before)
+
+
+@compiled
+def note_calibration(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
+    """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
+    if s.mag_uncalibrated == 1 and not uncalibrated:
+        carry_drift(s, p)
+        forget_iron(s)
+        forget_strength(s)
+    s.mag_uncalibrated = 1 if uncalibrated else 0
 
 
 @compiled
