@@ -255,6 +255,15 @@ def test_a_compass_that_was_never_calibrated_is_reported_until_it_is() -> None:
     assert told == ["Compass not calibrated", "Compass calibrated"]
 
 
+def test_a_latency_that_stands_for_a_lost_fix_is_not_announced_yet() -> None:
+    """It moves on until it is what the motion shows."""
+    vehicle, told = make(), []
+    for n in range(200):
+        time_us, moved = n * ONE_S // 5, min(n - n // 10, 70)
+        told += texts(vehicle.on_latency(0.3 - 0.002 * moved, 0.3, time_us))
+    assert told == ["GPS is 0.16 s late, not 0.30: set gps_latency_s"]
+
+
 def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
     vehicle = make()
     told = texts(fly(vehicle, 0, 2))

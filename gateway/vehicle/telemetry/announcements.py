@@ -61,6 +61,8 @@ FLAG_TEXTS: Final = (
 """A flag of the estimator, the text when it rises, and the text when it falls."""
 
 
+LATENCY_SETTLED_US: Final = 5_000_000
+"""A latency that has not moved for so long is the one that the motion shows."""
 RESTART_REPORTS: Final = 10
 """Reports of the link, one a second, in which restarts of a node are counted."""
 MANY_RESTARTS: Final = 3
@@ -77,6 +79,7 @@ class Announcements:
         self._restarts: dict[int, deque[int]] = {}
         """How often each node had restarted in the last reports."""
         self._latency_s: float | None = None
+        self._latency_since_us = 0
 
     def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
         """Announce the estimator's changes."""
@@ -112,10 +115,11 @@ class Announcements:
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
         """Announce once that fixes come later or sooner than is set, when it is known by how much.
 
-        The latency in use moves slowly to what the motion shows.
+        The latency in use moves slowly to what the motion shows, and stands where fixes are lost.
         """
-        is_settled, self._latency_s = used_s == self._latency_s, used_s
-        if used_s == set_s or not is_settled:
+        if used_s != self._latency_s:
+            self._latency_s, self._latency_since_us = used_s, now_us
+        if used_s == set_s or now_us - self._latency_since_us < LATENCY_SETTLED_US:
             return []
         text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
         return self._announcer.track("latency", set_s, StatusText(NOTICE, text), now_us)
