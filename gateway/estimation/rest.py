@@ -4,10 +4,10 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
+from gateway.estimation.kernel_record import FloatArray, as_vec, fill, write_vec
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
-from gateway.units import RAD_PER_DEG
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 BIAS_CHANGE_RADPS: Final = 0.15 * RAD_PER_DEG
 """What a gyroscope's bias may change by between rest and flight, by heat and vibration."""
@@ -27,6 +27,8 @@ LEAN_SQ: Final = 0.1
 """Square of how far, as a share, the axis of such a turn leans from the mean force."""
 LONGEST_TURN_S: Final = 40.0
 """What seems to turn for longer is a bias that has changed, unless the compass turns too."""
+LEAN_RAD: Final = 2.0 * RAD_PER_DEG
+"""So far the rate must seem to have turned the level before it is asked whether it has."""
 PUSH_MPS2: Final = 0.3
 PUSHED_SQ: Final = 9.0
 """A steady level force beyond both, three standard deviations of tilt, is no rest."""
@@ -90,6 +92,14 @@ class RestState:
     """Speed to which a steady force would have pushed by now, were it no tilt."""
     turn_s: float
     """For how long the mean rate has been that of a turn, since the compass last turned too."""
+    still: int
+    """1 while both sensors are as quiet as at rest."""
+    lean_b: Annotated[FloatArray, (3,)]
+    """By what the mean rate seems to have turned the level, in body FRD, rad."""
+    lean_force_b: Annotated[FloatArray, (3,)]
+    """Direction of the force when that began."""
+    bias_jumped: int
+    """1 once the force has not turned along: the bias is another now, and the level is wrong."""
     bias_shown: int
     """1 once a rest has shown the bias: before, it may be any."""
     gyro_lp: Annotated[FloatArray, (3,)]
@@ -149,13 +159,13 @@ def watch_rest(
         largest = max(largest, abs(s.gyro_lp[k]))
     still_sq = p.rest_gyro_radps**2
     shaken = gyro_sq < SHAKEN**2 * still_sq and mean_sq < STEADY**2 * still_sq
-    quiet = (
+    still = (
         (gyro_sq < still_sq or shaken)
         and accel_sq < p.rest_accel_mps2**2
         and largest < p.bias_limit_radps
-        and not moving
     )
-    s.rest_s = s.rest_s + dt if quiet else 0.0
+    s.still = 1 if still else 0
+    s.rest_s = s.rest_s + dt if still and not moving else 0.0
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
     if s.at_rest == 1:
         s.bias_shown = 1
@@ -181,7 +191,7 @@ def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> b
     level_sq = force_level[0] * force_level[0] + force_level[1] * force_level[1]
     pushed = level_sq > PUSHED_SQ * unsure_sq + PUSH_MPS2 * PUSH_MPS2
     s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
-    return bool(pushed and s.pushed_mps < PUSHED_MPS)
+    return bool(pushed and s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0)
 
 
 @compiled
@@ -213,7 +223,56 @@ def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float, dt: float) -> bo
     leans = off_sq - upright_sq > max(most_sq, LEAN_SQ * upright_sq)
     turns = s.bias_shown == 1 and upright_sq > most_sq and not leans
     s.turn_s = s.turn_s + dt if turns else 0.0
-    return bool(turns and s.turn_s < LONGEST_TURN_S)
+    watch_lean(s, off, force, upright_sq, dt)
+    return bool(turns and s.turn_s < LONGEST_TURN_S and s.bias_jumped == 0)
+
+
+@compiled
+def watch_lean(s: RestState, off: Vec3, force: Vec3, upright_sq: float, dt: float) -> None:
+    """Look whether what seems to turn about a level axis turns the force in the body.
+
+    If not, the bias has jumped, and what now pulls is the level that it has turned. In a turn that
+    is flown the force stands still in the body too, but is stronger: by the bank, which is how far
+    the axis of the turn leans from the force.
+
+    Parameters
+    ----------
+    s : RestState
+        Changed in place.
+    off : tuple of 3 floats
+        Mean rate in body FRD, the bias out of it, rad/s.
+    force : tuple of 3 floats
+        Mean specific force in body FRD, m/s2.
+    upright_sq : float
+        Square of what of the rate is along the force, rad2/s2.
+    dt : float
+        Time step, s.
+    """
+    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+    if s.still == 0 or norm == 0.0:
+        s.bias_jumped = 0
+        fill(s.lean_b, 0.0)
+        return
+    along = (off[0] * force[0] + off[1] * force[1] + off[2] * force[2]) / norm
+    off_sq = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
+    banked = math.sqrt(off_sq / upright_sq) if upright_sq > 0.0 else math.inf
+    flown = norm > STANDARD_GRAVITY_MPS2 * (1.0 + 0.5 * (banked - 1.0))
+    least_sq = max(SLOW_TURN_RADPS**2, LEAN_SQ * upright_sq)
+    leans = s.bias_shown == 1 and off_sq - upright_sq > least_sq and not flown
+    turned_sq, changed_sq = 0.0, 0.0
+    for k in range(3):
+        s.lean_b[k] += (off[k] - along * force[k] / norm) * dt
+        turned_sq += s.lean_b[k] ** 2
+        changed_sq += (force[k] / norm - s.lean_force_b[k]) ** 2
+    if s.bias_jumped == 1:
+        s.bias_jumped = 1 if changed_sq < LEAN_RAD * LEAN_RAD else 0
+    elif leans and turned_sq > LEAN_RAD * LEAN_RAD:
+        s.bias_jumped = 1 if changed_sq < 0.25 * turned_sq else 0
+    elif leans:
+        return
+    if s.bias_jumped == 0:
+        fill(s.lean_b, 0.0)
+        write_vec(s.lean_force_b, (force[0] / norm, force[1] / norm, force[2] / norm))
 
 
 @compiled

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
@@ -25,7 +26,7 @@ from gateway.geometry.angle import wrap_pi
 from gateway.geometry.geodesy import radii_m
 from gateway.records import NavFlags
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
-from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
+from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, correlated, estimator_of
 
 FIELD_N_UT = (21.0, 0.0, 43.0)
 SPEED_MPS = 8.0
@@ -115,3 +116,73 @@ def test_a_slow_turn_is_no_rest_and_its_rate_no_bias(name: str, seed: int) -> No
     assert not (out[turning, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
     found = Rotation.from_quat(out[turning, :4], scalar_first=True).as_euler("ZYX")[:, 0]
     assert np.degrees(np.abs(wrap_pi(found - heading_rad[turning]))).max() < 4.0
+
+
+def waved(seed: int, jump_degps: tuple[float, float, float]) -> tuple[SampleLog, Rotation]:
+    """Stand, be waved about by a hand, and be laid down, the gyroscope's bias jumping midway."""
+    rng, n = np.random.default_rng(seed), round(ENDS_S * RATE_HZ)
+    time_s = np.arange(n) / RATE_HZ
+    waves = ((time_s > STARTS_S) & (time_s < LOST_S)).astype(float)[:, None]
+    rate = correlated(rng, n, RATE_HZ, 0.8, 0.6) * waves
+    turns, attitude = [], Rotation.identity()
+    for step in Rotation.from_rotvec(rate / RATE_HZ):
+        turns.append(attitude.as_quat())
+        attitude *= step
+    attitudes = Rotation.from_quat(turns)
+    imu = np.full((n, IMU_COLUMNS), 0.0)
+    imu[:, ACCEL : ACCEL + 3] = attitudes.inv().apply(np.tile([0.0, 0.0, -G], (n, 1)))
+    imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 0.05, (n, 3))
+    imu[:, ACCEL : ACCEL + 3] += correlated(rng, n, RATE_HZ, 1.0, 0.3) * waves
+    jumped = time_s > 0.5 * (STARTS_S + LOST_S)
+    imu[1:, GYRO : GYRO + 3] = rate[:-1]
+    imu[:, GYRO : GYRO + 3] += np.outer(jumped, np.radians(jump_degps))
+    imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
+    imu[:, MAG : MAG + 3] = math.nan
+    us = np.round(time_s * 1e6).astype(np.int64)
+    no_fixes = np.empty((0, GPS_COLUMNS))
+    return SampleLog(us, imu, us[:0], np.empty(0), us[:0], no_fixes), attitudes
+
+
+def tilt_off(out: np.ndarray, attitudes: Rotation) -> np.ndarray:
+    """Return the angle between what is told to be up and what is, rad."""
+    found = Rotation.from_quat(out[:, :4], scalar_first=True)
+    up = (0.0, 0.0, -1.0)
+    cosine = np.sum(found.inv().apply(up) * attitudes.inv().apply(up), axis=1)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+@pytest.mark.parametrize("jump_degps", [(1.0, 1.0, 1.0), (1.0, -1.5, 0.0)])
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_level_that_a_bias_has_turned_is_no_push(
+    name: str, seed: int, jump_degps: tuple[float, float, float]
+) -> None:
+    """Laid down, the force stands still in the body, whatever the gyroscope says."""
+    log, attitudes = waved(seed, jump_degps)
+    out = estimator_of(name).run(log)
+    laid = log.imu_time_us > (LOST_S + 15.0) * 1e6
+    assert np.degrees(tilt_off(out[laid], attitudes[np.flatnonzero(laid)])).max() < 2.0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_a_banked_circle_in_calm_air_is_no_rest(name: str, seed: int) -> None:
+    """The force stands still in the body there too, but it turns more about the vertical."""
+    rng, n = np.random.default_rng(seed), round(ENDS_S * RATE_HZ)
+    time_s = np.arange(n) / RATE_HZ
+    turns = gaussian_filter1d((time_s > STARTS_S + PACE_S).astype(float), RATE_HZ)
+    bank = math.radians(25.0) * turns
+    yaw = np.cumsum(math.radians(5.0) * turns) / RATE_HZ
+    attitudes = Rotation.from_euler("ZYX", np.column_stack([yaw, 0.0 * yaw, bank]))
+    imu = np.full((n, IMU_COLUMNS), 0.0)
+    imu[:, ACCEL : ACCEL + 3] = rng.normal(0.0, 0.06, (n, 3))
+    imu[:, ACCEL + 2] -= G / np.cos(bank)
+    imu[1:, GYRO : GYRO + 3] = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() * RATE_HZ
+    imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
+    imu[:, MAG : MAG + 3] = math.nan
+    us = np.round(time_s * 1e6).astype(np.int64)
+    log = SampleLog(us, imu, us[:0], np.empty(0), us[:0], np.empty((0, GPS_COLUMNS)))
+    out = estimator_of(name).run(log)
+    banked = (time_s > STARTS_S + PACE_S + 2.0) & (time_s < STARTS_S + PACE_S + 6.0)
+    assert not (out[banked, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
+    assert np.degrees(tilt_off(out[banked], attitudes[np.flatnonzero(banked)])).max() < 10.0

@@ -140,7 +140,8 @@ def take_imu(
         check_rest(s, p, gyro, accel)
         moving = is_moving(s, p)
         rested = s.at_rest == 1
-        watch_rest(s, p, gyro, accel, is_pushed_on(s, dt) or moving or is_turning(s, dt), dt)
+        turning, pushed = is_turning(s, dt), is_pushed_on(s, dt)
+        watch_rest(s, p, gyro, accel, moving or turning or pushed, dt)
         raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
@@ -203,7 +204,7 @@ def level_force(s: EskfState) -> Vec3:
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
     """Return whether GPS or dead reckoning says that it moves, or without any the way it went."""
-    if s.aided == 0 and s.flies == 1 and s.pushed_mps < PUSHED_MPS:
+    if s.aided == 0 and s.flies == 1 and s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0:
         return True
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     if s.aided == 0:
