@@ -279,6 +279,12 @@ def compare_field(s: FieldState, p: FieldGains, norm: float, dip: float, dt: flo
 
 
 @compiled
+def usual_dip(s: FieldState) -> float:
+    """Return the dip of the usual field, or of what may become it while none is known, rad."""
+    return float(s.mag_dip_ref if s.mag_norm_ref > 0.0 else s.mag_new_dip)
+
+
+@compiled
 def steepness(dip_rad: float) -> float:
     """Return by what the dip of the field multiplies the variance of a heading by compass.
 

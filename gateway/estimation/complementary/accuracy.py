@@ -32,6 +32,7 @@ from gateway.estimation.complementary.unaided import unaided_level_std, watch_le
 from gateway.estimation.filtering.covariance_scale import scale_state
 from gateway.estimation.filtering.receiver_noise import lasting_noise_sq
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
+from gateway.estimation.magfield import usual_dip
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -142,7 +143,7 @@ def write_attitude_std(s: ComplementaryState) -> None:
     heading_var = P[HEADING, HEADING]
     if s.level_by_gps == 0:
         # A field that is turned by a wrong tilt points elsewhere, the more the steeper it is.
-        heading_var += (told[0] * math.tan(s.mag_dip_ref)) ** 2
+        heading_var += (told[0] * math.tan(usual_dip(s))) ** 2
     if s.heading_true == 0:
         heading_var += NO_DECLINATION_RAD * NO_DECLINATION_RAD
     told[2] = min(math.sqrt(heading_var), ANY_HEADING_RAD)

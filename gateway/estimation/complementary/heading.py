@@ -33,7 +33,13 @@ from gateway.estimation.filtering.iron_evidence import (
     unexplained_iron_sq,
 )
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.magfield import MIN_FIELD_UT, STALE_MAG_S, steepness, take_field
+from gateway.estimation.magfield import (
+    MIN_FIELD_UT,
+    STALE_MAG_S,
+    steepness,
+    take_field,
+    usual_dip,
+)
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import rotate
 from gateway.records import Vec3
@@ -93,7 +99,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if s.heading_known == 0:
         s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
     innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
-    dip = s.mag_dip_ref if s.mag_norm_ref > 0.0 else math.asin(down / norm)
+    dip = usual_dip(s)
     density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 * steepness(dip)
     if s.level_by_gps == 0:
         # A level that is off turns the field for as long, the more the steeper it is.
