@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -277,3 +278,14 @@ def test_iron_that_was_found_is_forgotten_once_the_compass_is_calibrated(name: s
     log.imu[calibrated, MAG : MAG + 3] -= CAR_IRON_UT
     out = estimator_of(name).run(log)[calibrated]
     assert np.degrees(heading_off(out, heading[calibrated]).max()) < 5.0
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_without_gps_a_compass_that_nobody_has_calibrated_is_told_as_unsure(name: str) -> None:
+    for seed in range(6):
+        log, heading = driven(seed)
+        log.imu[:, UNCALIBRATED] = 1.0
+        no_fixes = replace(log, gps_time_us=log.gps_time_us[:0], gps=log.gps[:0])
+        out = estimator_of(name).run(no_fixes)[round(LEARNED_S * RATE_HZ) :]
+        off = heading_off(out, heading[-len(out) :])
+        assert np.mean(off < 2.0 * out[:, NAV_ATTITUDE_STD + 2]) > 0.9

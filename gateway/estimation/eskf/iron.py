@@ -194,6 +194,8 @@ def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
             s.mag_bias_b[k] = 0.0
             renew(s, MAG_BIAS + k, p.mag_bias_var)
         forget_strength(s)
+    if s.mag_uncalibrated == 0 and uncalibrated:
+        s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
     s.mag_uncalibrated = 1 if uncalibrated else 0
 
 
@@ -211,8 +213,6 @@ def start_iron_search(s: EskfState, p: EskfGains) -> None:
     left = s.left_iron_ut * s.left_iron_ut
     variance = left if s.aided == 1 else min(left, p.mag_bias_var)
     s.left_iron_ut = math.sqrt(left - variance)
-    if s.aided == 1 and s.mag_uncalibrated == 1:
-        variance = max(variance, UNCALIBRATED_IRON_UT**2 - s.P[MAG_BIAS, MAG_BIAS])
     if s.aided == 1 and has_followed_compass(s):
         north, east, down = as_vec(s.field_n)
         level_sq = north * north + east * east
@@ -235,6 +235,8 @@ def doubt_standing_field(s: EskfState, p: EskfGains, dt: float) -> None:
         s.field_held_s += dt
         variance = s.left_iron_ut * s.left_iron_ut
         least = p.mag_bias_var if s.iron_search_started == 0 else 0.0
+        if s.aided_before == 0 and s.mag_uncalibrated == 1:
+            least = UNCALIBRATED_IRON_UT**2
         variance += dt / FIELD_TAU_S * (least - variance)
         s.left_iron_ut = math.sqrt(variance)
         if s.iron_search_started == 0 and s.heading_known == 1 and s.field_held_s >= FIRST_FIELD_S:

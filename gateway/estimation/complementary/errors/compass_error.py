@@ -12,7 +12,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.magfield import MIN_FIELD_UT, PLACE_RAD, steepness
+from gateway.estimation.magfield import MIN_FIELD_UT, PLACE_RAD, UNCALIBRATED_IRON_UT, steepness
 from gateway.records import Vec3
 
 IRON_TAU_S: Final = 60.0
@@ -48,6 +48,8 @@ def compass_variance(s: ComplementaryState, p: ComplementaryGains) -> float:
     level_ut = s.strength_ut * math.cos(s.level_dip_rad)
     if level_ut > MIN_FIELD_UT and s.level_by_gps == 0:
         x, y, z = s.field_direction_b[0], s.field_direction_b[1], s.field_direction_b[2]
+        if s.mag_uncalibrated == 1:
+            variance = max(variance, (UNCALIBRATED_IRON_UT / level_ut) ** 2)
         turned = max(1.0 - x * x - y * y - z * z, 0.0)
         place = min(PLACE_RAD * PLACE_RAD, variance)
         variance = place + (variance - place) * EXPECTED_SHARE / (EXPECTED_SHARE + turned)
