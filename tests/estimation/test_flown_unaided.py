@@ -19,17 +19,25 @@ from gateway.estimation.columns import (
     IMU_COLUMNS,
     MAG,
     NAV_ATTITUDE_STD,
+    NAV_FLAGS,
 )
 from gateway.estimation.eskf.eskf_settings import EskfSettings, make_gains
 from gateway.estimation.eskf.eskf_state import VEL, EskfState
 from gateway.estimation.eskf.recovery import begin_attitude, found_level_var
+from gateway.estimation.filtering.hidden_pull import (
+    HIDDEN_MPS2,
+    hidden_level_var,
+    watch_hidden_pull,
+)
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
+from gateway.records import NavFlags
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.test_carried_iron import driven
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
 
 ESTIMATORS = ("complementary", "eskf")
@@ -139,3 +147,33 @@ def test_an_attitude_found_in_flight_knows_of_the_speed_that_has_shown_itself() 
     assert found_level_var(s) == pytest.approx(0.02**2)
     begin_attitude(s, gains, 0.01, 1.0)
     assert np.diag(s.P)[VEL : VEL + 3].tolist() == [12.0**2] * 3
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_where_no_rest_was_seen_what_may_pull_unseen_is_told(name: str) -> None:
+    """A gateway started in a drive, without GPS: what the car pulls passes for its level."""
+    off, told = [], []
+    for seed in range(6):
+        log, _ = driven(seed)
+        begins = round(40.0 * RATE_HZ)
+        drive = (log.imu_time_us[begins:], log.imu[begins:])
+        none, no_fixes = log.imu_time_us[:0], log.gps[:0]
+        out = estimator_of(name).run(SampleLog(*drive, none, np.empty(0), none, no_fixes))
+        valid = (out[:, NAV_FLAGS].astype(int) & NavFlags.ATTITUDE_VALID) != 0
+        off.append(tilt_rad(out)[valid])
+        told.append(np.hypot(*out[valid, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 2].T))
+    assert np.mean(np.concatenate(off) < 2.0 * np.concatenate(told)) > 0.9
+
+
+@pytest.mark.parametrize("tilts", [False, True], ids=["a vehicle", "a hand"])
+def test_what_tilts_and_does_not_pull_hides_no_pull(tilts: bool) -> None:
+    s, upright = new_record(EskfState), (1.0, 0.0, 0.0, 0.0)
+    rate_b = (0.0, 1.0, 0.0) if tilts else (0.0, 0.0, 1.0)
+    for _ in range(300):
+        watch_hidden_pull(s, upright, rate_b, False, False, 0.1)
+    hidden = math.sqrt(hidden_level_var(s))
+    assert hidden == pytest.approx(0.0 if tilts else HIDDEN_MPS2 / G, abs=1e-3)
+    watch_hidden_pull(s, upright, rate_b, False, True, 0.1)
+    assert math.sqrt(hidden_level_var(s)) == pytest.approx(HIDDEN_MPS2 / G)
+    watch_hidden_pull(s, upright, rate_b, True, False, 0.1)
+    assert hidden_level_var(s) == 0.0

@@ -125,7 +125,7 @@ def test_what_force_turns_is_told_until_it_is_found_out() -> None:
     seconds, accel_mps2, runs = 5.0, 2.0 * G, []
     for accel in (0.0, accel_mps2):
         s, row = new_record(EskfState), np.zeros(NAV_COLUMNS)
-        s.started, s.aided_before, s.q_nb[0] = 1, 1, 1.0
+        s.started, s.aided_before, s.level_shown, s.q_nb[0] = 1, 1, 1, 1.0
         s.P[:] = 1e-4 * np.eye(STATES)
         s.pending_s, s.pending_accel_sq = seconds, accel * accel * seconds
         s.pending_force_n[:] = (0.0, 0.0, -G * seconds)

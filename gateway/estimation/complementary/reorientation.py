@@ -24,6 +24,7 @@ from gateway.estimation.complementary.errors.drift import (
     start_level,
 )
 from gateway.estimation.complementary.tilt import LEVEL_STD_RAD, hold_level, refresh
+from gateway.estimation.filtering.hidden_pull import forget_level
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
 from gateway.geometry.quaternion import multiply, normalise
@@ -33,6 +34,7 @@ from gateway.geometry.quaternion import multiply, normalise
 def lose_attitude(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Give the attitude up; the place follows the fixes until the alignment has found another."""
     lose(s)
+    forget_level(s)
     if s.level_by_gps == 1:
         end_level(s, p)
     begin_level(s)

@@ -20,6 +20,7 @@ from gateway.estimation.eskf.eskf_state import POS, TILT, VEL, EskfState
 from gateway.estimation.eskf.iron import board_var, standing_field_var
 from gateway.estimation.eskf.level_doubt import standing_level_var
 from gateway.estimation.filtering.filter_state import sensor_flags
+from gateway.estimation.filtering.hidden_pull import hidden_level_var
 from gateway.estimation.flagbits import (
     ALTITUDE_VALID,
     ATTITUDE_VALID,
@@ -71,7 +72,7 @@ def write_output(s: EskfState, row: FloatArray) -> None:
         write_std(row, NAV_ATTITUDE_STD, s, TILT)
         for k in range(2):
             told = row[NAV_ATTITUDE_STD + k]
-            lasting = standing_level_var(s) + s.force_turn_var
+            lasting = standing_level_var(s) + hidden_level_var(s) + s.force_turn_var
             row[NAV_ATTITUDE_STD + k] = math.sqrt(told * told + lasting)
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_place(s, row)

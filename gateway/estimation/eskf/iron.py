@@ -188,12 +188,14 @@ def doubt_iron(s: EskfState, variance: float) -> None:
 @compiled
 def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
     """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
-    if s.mag_uncalibrated == 1 and not uncalibrated and s.iron_search_started == 1:
-        propagate(s, p)
-        for k in range(3):
-            s.mag_bias_b[k] = 0.0
-            renew(s, MAG_BIAS + k, p.mag_bias_var)
+    if s.mag_uncalibrated == 1 and not uncalibrated:
+        s.left_iron_ut = math.sqrt(p.mag_bias_var)
         forget_strength(s)
+        if s.iron_search_started == 1:
+            propagate(s, p)
+            for k in range(3):
+                s.mag_bias_b[k] = 0.0
+                renew(s, MAG_BIAS + k, p.mag_bias_var)
     if s.mag_uncalibrated == 0 and uncalibrated:
         s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
     s.mag_uncalibrated = 1 if uncalibrated else 0

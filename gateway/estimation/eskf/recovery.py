@@ -15,6 +15,7 @@ from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, headi
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
+from gateway.estimation.filtering.hidden_pull import forget_level
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.rest import BIAS_CHANGE_RADPS, SHAKEN
 from gateway.geometry.quaternion import multiply, normalise
@@ -74,6 +75,8 @@ def turn_heading(s: EskfState, turn_rad: float) -> None:
 def lose_attitude(s: EskfState, p: EskfGains) -> None:
     """Give the attitude up; the place follows the fixes until the alignment has found another."""
     lose(s)
+    if s.aided == 0:
+        forget_level(s)
     begin_attitude(s, p, LOST_TILT_VAR, NO_HEADING_VAR)
 
 

@@ -146,7 +146,7 @@ def restart_at(s: EskfState, p: EskfGains, pos: Vec3, vel: Vec3, lag: float) -> 
     for k in range(2):
         start_position(s, k, pos[k] + vel[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + vel[2] * lag)
-    s.aided = 1
+    s.aided = s.level_shown = 1
     fill(s.assumed_bias, 0.0)
     fill(s.assumed_scale, 0.0)
     if s.aided_before == 0:

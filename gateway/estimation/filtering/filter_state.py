@@ -7,6 +7,7 @@ from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
+from gateway.estimation.filtering.hidden_pull import HiddenPullState
 from gateway.estimation.filtering.iron_evidence import IronState
 from gateway.estimation.filtering.roughness import RoughnessState
 from gateway.estimation.flagbits import (
@@ -60,6 +61,7 @@ class FilterState(
     RestState,
     FieldState,
     IronState,
+    HiddenPullState,
     LagState,
     LatencyState,
     ReviewState,
