@@ -24,7 +24,7 @@ from gateway.estimation.complementary.errors.drift import (
     bias_std,
 )
 from gateway.estimation.complementary.tilt import begin_pull
-from gateway.estimation.filtering.hidden_pull import hidden_level_var, watch_hidden_pull
+from gateway.estimation.filtering.hidden_pull import SHOWN_S, hidden_level_var, watch_hidden_pull
 from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.rest import REST_TAU_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -66,7 +66,7 @@ def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None
     s.unaided_pull_sq += share * (pull_sq - s.unaided_pull_sq)
     drift = math.sqrt(drift_sq) / tau
     expected_sq = expected_pull_sq(s, pull_sq, dt)
-    shown = s.at_rest == 1 or s.by_gps == 1
+    shown = s.rest_s > SHOWN_S or s.by_gps == 1
     watch_hidden_pull(s, as_quat(s.q_eb), as_vec(s.rate_b), shown, s.unaided_pulled == 1, dt)
     # Here the sum of both errors is least.
     best = (4.0 * TURN_S**2 * math.sqrt(expected_sq) / (g * drift)) ** (1.0 / 3.0)

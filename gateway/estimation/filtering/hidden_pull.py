@@ -19,6 +19,9 @@ TILTING_RADPS: Final = 0.3
 HAND_S: Final = 4.0
 """What has tilted for a few times this long and has not pulled is in a hand."""
 
+SHOWN_S: Final = 5.0
+"""A rest of this time shows the level: on a smooth road a pull is as quiet, but shorter."""
+
 
 class HiddenPullState:
     """What has been seen of the level."""
