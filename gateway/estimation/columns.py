@@ -69,6 +69,7 @@ NAV_FLAGS: Final = 22
 NAV_COLUMNS: Final = 23
 
 CLIP_FLAGS: Final = ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
+COMPASS_FLAG: Final = ImuFlags.MAG_UNCALIBRATED
 
 _flags_of = cache(NavFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
@@ -77,7 +78,7 @@ _flags_of = cache(NavFlags)
 def imu_row(sample: ImuSample) -> ImuRow:
     """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
     clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
-    uncalibrated = 1.0 if sample.flags & ImuFlags.MAG_UNCALIBRATED else 0.0
+    uncalibrated = 1.0 if sample.flags & COMPASS_FLAG else 0.0
     mag = sample.mag_b_ut or UNKNOWN_VEC3
     return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped, uncalibrated)
 
@@ -99,7 +100,7 @@ def imu_rows(
     ndarray, shape (n, IMU_COLUMNS)
         What `imu_row` gives for each.
     """
-    shown = [(flags & int(bits)) != 0 for bits in (CLIP_FLAGS, ImuFlags.MAG_UNCALIBRATED)]
+    shown = [(flags & int(bits)) != 0 for bits in (CLIP_FLAGS, COMPASS_FLAG)]
     return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
 

@@ -97,8 +97,10 @@ class Announcements:
 
     def on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
         """Announce a compass that was never calibrated."""
+        if sample.mag_b_ut is None:
+            return []
         shown = sample.flags & ImuFlags.MAG_UNCALIBRATED
-        if shown == self._uncalibrated or sample.mag_b_ut is None:
+        if shown == self._uncalibrated:
             return []
         self._uncalibrated = shown
         text = StatusText(INFO, "Compass calibrated")
