@@ -74,7 +74,10 @@ class NodeCalibration(Settings, frozen=True):
     ] = FACE_UP
     mag_hard_iron_ut: Annotated[
         tuple[_Field, _Field, _Field],
-        setting("Field of the aircraft's own magnets in sensor axes.", "uT"),
+        setting(
+            "Field of the aircraft's own magnets in sensor axes; all zero if never calibrated.",
+            "uT",
+        ),
     ] = _NO_OFFSET
     mag_soft_iron: Annotated[
         _Rows, setting("Rows of the matrix that turns the measured ellipsoid into a sphere.")
