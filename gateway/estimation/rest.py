@@ -191,7 +191,13 @@ def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> b
     level_sq = force_level[0] * force_level[0] + force_level[1] * force_level[1]
     pushed = level_sq > PUSHED_SQ * unsure_sq + PUSH_MPS2 * PUSH_MPS2
     s.pushed_mps = s.pushed_mps + dt * math.sqrt(level_sq) if pushed else 0.0
-    return bool(pushed and s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0)
+    return pushed and may_be_pushed(s)
+
+
+@compiled
+def may_be_pushed(s: RestState) -> bool:
+    """Return whether what pulls may be a push: a level that is wrong pulls as well."""
+    return bool(s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0)
 
 
 @compiled
@@ -215,55 +221,65 @@ def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float, dt: float) -> bo
     """
     rate, force = as_vec(s.gyro_lp), as_vec(s.accel_lp)
     off = (rate[0] - bias_b[0], rate[1] - bias_b[1], rate[2] - bias_b[2])
-    off_sq = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
-    force_sq = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
-    along = off[0] * force[0] + off[1] * force[1] + off[2] * force[2]
-    upright_sq = along * along / force_sq if force_sq > 0.0 else 0.0
+    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+    if norm == 0.0:
+        s.turn_s, s.bias_jumped = 0.0, 0
+        return False
+    up = (force[0] / norm, force[1] / norm, force[2] / norm)
+    along = off[0] * up[0] + off[1] * up[1] + off[2] * up[2]
+    lean = (off[0] - along * up[0], off[1] - along * up[1], off[2] - along * up[2])
+    lean_sq, upright_sq = lean[0] * lean[0] + lean[1] * lean[1] + lean[2] * lean[2], along * along
     most_sq = (SLOW_TURN_RADPS + TURN_SIGMA * bias_std) ** 2
-    leans = off_sq - upright_sq > max(most_sq, LEAN_SQ * upright_sq)
+    leans = lean_sq > max(most_sq, LEAN_SQ * upright_sq)
     turns = s.bias_shown == 1 and upright_sq > most_sq and not leans
     s.turn_s = s.turn_s + dt if turns else 0.0
-    watch_lean(s, off, force, upright_sq, dt)
+    leans = lean_sq > max(SLOW_TURN_RADPS**2, LEAN_SQ * upright_sq)
+    leans = s.bias_shown == 1 and leans and not is_banked_turn(lean_sq, upright_sq, norm)
+    watch_lean(s, lean, up, leans, dt)
     return bool(turns and s.turn_s < LONGEST_TURN_S and s.bias_jumped == 0)
 
 
 @compiled
-def watch_lean(s: RestState, off: Vec3, force: Vec3, upright_sq: float, dt: float) -> None:
+def is_banked_turn(lean_sq: float, upright_sq: float, force_mps2: float) -> bool:
+    """Return whether the force is that of a turn with such a rate across it and along it, squared.
+
+    In a turn that is flown the force stands still in the body, across which the axis of the turn
+    leans by the bank; and it is as much stronger than gravity as that bank takes.
+    """
+    if upright_sq == 0.0:
+        return False
+    share = math.sqrt(1.0 + lean_sq / upright_sq)
+    return force_mps2 > STANDARD_GRAVITY_MPS2 * (1.0 + 0.5 * (share - 1.0))
+
+
+@compiled
+def watch_lean(s: RestState, lean: Vec3, up: Vec3, leans: bool, dt: float) -> None:
     """Look whether what seems to turn about a level axis turns the force in the body.
 
-    If not, the bias has jumped, and what now pulls is the level that it has turned. In a turn that
-    is flown the force stands still in the body too, but is stronger: by the bank, which is how far
-    the axis of the turn leans from the force.
+    If not, the bias has jumped, and what now pulls is the level that it has turned.
 
     Parameters
     ----------
     s : RestState
         Changed in place.
-    off : tuple of 3 floats
-        Mean rate in body FRD, the bias out of it, rad/s.
-    force : tuple of 3 floats
-        Mean specific force in body FRD, m/s2.
-    upright_sq : float
-        Square of what of the rate is along the force, rad2/s2.
+    lean : tuple of 3 floats
+        What of the mean rate in body FRD, the bias out of it, is across the force, rad/s.
+    up : tuple of 3 floats
+        Direction of the mean specific force in body FRD.
+    leans : bool
+        Whether that is more than a known bias explains, and is no banked turn.
     dt : float
         Time step, s.
     """
-    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
-    if s.still == 0 or norm == 0.0:
+    if s.still == 0:
         s.bias_jumped = 0
         fill(s.lean_b, 0.0)
         return
-    along = (off[0] * force[0] + off[1] * force[1] + off[2] * force[2]) / norm
-    off_sq = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
-    banked = math.sqrt(off_sq / upright_sq) if upright_sq > 0.0 else math.inf
-    flown = norm > STANDARD_GRAVITY_MPS2 * (1.0 + 0.5 * (banked - 1.0))
-    least_sq = max(SLOW_TURN_RADPS**2, LEAN_SQ * upright_sq)
-    leans = s.bias_shown == 1 and off_sq - upright_sq > least_sq and not flown
     turned_sq, changed_sq = 0.0, 0.0
     for k in range(3):
-        s.lean_b[k] += (off[k] - along * force[k] / norm) * dt
+        s.lean_b[k] += lean[k] * dt
         turned_sq += s.lean_b[k] ** 2
-        changed_sq += (force[k] / norm - s.lean_force_b[k]) ** 2
+        changed_sq += (up[k] - s.lean_force_b[k]) ** 2
     if s.bias_jumped == 1:
         s.bias_jumped = 1 if changed_sq < LEAN_RAD * LEAN_RAD else 0
     elif leans and turned_sq > LEAN_RAD * LEAN_RAD:
@@ -272,7 +288,7 @@ def watch_lean(s: RestState, off: Vec3, force: Vec3, upright_sq: float, dt: floa
         return
     if s.bias_jumped == 0:
         fill(s.lean_b, 0.0)
-        write_vec(s.lean_force_b, (force[0] / norm, force[1] / norm, force[2] / norm))
+        write_vec(s.lean_force_b, up)
 
 
 @compiled

@@ -100,7 +100,7 @@ class SensorChain:
         self._accel = Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2)
         self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
         self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
-        self._shown = ImuFlags(0) if cal.knows_iron else ImuFlags.MAG_UNCALIBRATED
+        self._added_flags = ImuFlags(0) if cal.knows_iron else ImuFlags.MAG_UNCALIBRATED
         self.reset()
 
     def reset(self) -> None:
@@ -158,7 +158,7 @@ class SensorChain:
             gyro,
             mag,
             temperature_from_counts(raw.temperature_raw),
-            _joined_flags(raw.flags, self._shown),
+            _joined_flags(raw.flags, self._added_flags),
         )
 
     def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
@@ -250,7 +250,7 @@ class SensorChain:
             self._gyro.apply_all(gyro),
             self._mag.apply_all(new_field_ut(counts, flags)),
             temperature_from_counts(counts[:, 9]),
-            flags | int(self._shown),
+            flags | int(self._added_flags),
         )
 
     def imu_si_log(

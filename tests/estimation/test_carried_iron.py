@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     ACCEL,
-    GPS_ALT,
-    GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
     GYRO,
     IMU_COLUMNS,
     MAG,
@@ -58,9 +51,8 @@ from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
-from gateway.geometry.geodesy import radii_m
 from gateway.records import Quat, Vec3
-from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.samples import G, fix_rows, log_of
 from tests.estimation.test_without_compass import (
     FIXES_HZ,
     RATE_HZ,
@@ -234,18 +226,14 @@ def driven(seed: int) -> tuple[SampleLog, np.ndarray]:
     at = np.arange(RATE_HZ, n, RATE_HZ // FIXES_HZ)
     vel_n = np.column_stack([speed * np.cos(heading), speed * np.sin(heading), 0.0 * speed])
     place = np.cumsum(vel_n, axis=0)[at] / RATE_HZ
-    gps = np.full((len(at), GPS_COLUMNS), math.nan)
-    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
-    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
-    gps[:, GPS_LAT : GPS_LAT + 2] += np.degrees(place[:, :2] / radii_m(LAT_DEG, ALT_M))
-    gps[:, GPS_ALT] = ALT_M
-    gps[:, GPS_VEL : GPS_VEL + 3] = vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3))
-    us = np.round(time_s * 1e6).astype(np.int64)
-    return SampleLog(us, imu, us[:0], np.empty(0), us[at], gps), heading
+    fixes = fix_rows(place, vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3)))
+    return log_of(imu, RATE_HZ, at, fixes), heading
 
 
 @pytest.mark.parametrize(
-    ("marked", "most_deg", "share"), [(False, 6.5, 0.8), (True, 2.5, 0.93)], ids=["", "marked"]
+    ("marked", "most_deg", "share"),
+    [(False, 6.5, 0.8), (True, 2.5, 0.93)],
+    ids=["unmarked", "marked"],
 )
 @pytest.mark.parametrize("name", ["complementary", "eskf"])
 def test_a_compass_that_nobody_has_calibrated_is_found_out_by_driving(
@@ -281,7 +269,6 @@ def test_without_gps_a_compass_that_nobody_has_calibrated_is_told_as_unsure(name
     for seed in range(6):
         log, heading = driven(seed)
         log.imu[:, UNCALIBRATED] = 1.0
-        no_fixes = replace(log, gps_time_us=log.gps_time_us[:0], gps=log.gps[:0])
-        out = estimator_of(name).run(no_fixes)[round(LEARNED_S * RATE_HZ) :]
+        out = estimator_of(name).run(log_of(log.imu, RATE_HZ))[round(LEARNED_S * RATE_HZ) :]
         off = heading_off(out, heading[-len(out) :])
         assert np.mean(off < 2.0 * out[:, NAV_ATTITUDE_STD + 2]) > 0.9

@@ -9,12 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     ACCEL,
-    GPS_ALT,
-    GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
     GYRO,
     IMU_COLUMNS,
     MAG,
@@ -26,6 +20,7 @@ from gateway.estimation.eskf.eskf_state import VEL, EskfState
 from gateway.estimation.eskf.recovery import begin_attitude, found_level_var
 from gateway.estimation.filtering.hidden_pull import (
     HIDDEN_MPS2,
+    SHOWN_S,
     hidden_level_var,
     watch_hidden_pull,
 )
@@ -34,9 +29,8 @@ from gateway.estimation.kernel_record import new_record
 from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.rest import RestSettings
-from gateway.geometry.geodesy import radii_m
 from gateway.records import NavFlags
-from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.samples import G, fix_rows, log_of
 from tests.estimation.test_carried_iron import driven
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, estimator_of
 
@@ -59,14 +53,8 @@ def samples(seed: int, accel_n_mps2: np.ndarray, fixes_until_s: float) -> Sample
     vel_n = np.cumsum(accel_n_mps2, axis=0) / RATE_HZ
     pos_n = np.cumsum(vel_n, axis=0) / RATE_HZ
     at = np.arange(RATE_HZ, round(fixes_until_s * RATE_HZ), RATE_HZ // FIXES_HZ)
-    gps = np.full((len(at), GPS_COLUMNS), math.nan)
-    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
-    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
-    gps[:, GPS_LAT : GPS_LAT + 2] += np.degrees(pos_n[at, :2] / radii_m(LAT_DEG, ALT_M))
-    gps[:, GPS_ALT] = ALT_M - pos_n[at, 2]
-    gps[:, GPS_VEL : GPS_VEL + 3] = vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3))
-    us = np.round(np.arange(n) / RATE_HZ * 1e6).astype(np.int64)
-    return SampleLog(us, imu, np.empty(0, np.int64), np.empty(0), us[at], gps)
+    fixes = fix_rows(pos_n[at], vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3)))
+    return log_of(imu, RATE_HZ, at, fixes)
 
 
 def tilt_rad(out: np.ndarray) -> np.ndarray:
@@ -114,10 +102,7 @@ def hovering(seed: int, seconds: float) -> tuple[SampleLog, Rotation]:
     imu[:, ACCEL : ACCEL + 3] = R_nb.inv().apply(accel_n - (0.0, 0.0, G))
     imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 0.3, (n, 3))
     imu[:, MAG : MAG + 3] = R_nb.inv().apply(FIELD_N_UT) + rng.normal(0.0, 0.4, (n, 3))
-    us = np.round(np.arange(n) / RATE_HZ * 1e6).astype(np.int64)
-    empty = np.empty(0, np.int64)
-    log = SampleLog(us, imu, empty, np.empty(0), empty, np.empty((0, GPS_COLUMNS)))
-    return log, R_nb
+    return log_of(imu, RATE_HZ), R_nb
 
 
 def test_a_hover_that_was_taken_for_a_hand_leaves_no_false_bias() -> None:
@@ -156,9 +141,7 @@ def test_where_no_rest_was_seen_what_may_pull_unseen_is_told(name: str) -> None:
     for seed in range(6):
         log, _ = driven(seed)
         begins = round(40.0 * RATE_HZ)
-        drive = (log.imu_time_us[begins:], log.imu[begins:])
-        none, no_fixes = log.imu_time_us[:0], log.gps[:0]
-        out = estimator_of(name).run(SampleLog(*drive, none, np.empty(0), none, no_fixes))
+        out = estimator_of(name).run(log_of(log.imu[begins:], RATE_HZ))
         valid = (out[:, NAV_FLAGS].astype(int) & NavFlags.ATTITUDE_VALID) != 0
         off.append(tilt_rad(out)[valid])
         told.append(np.hypot(*out[valid, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 2].T))
@@ -170,10 +153,11 @@ def test_what_tilts_and_does_not_pull_hides_no_pull(tilts: bool) -> None:
     s, upright = new_record(EskfState), (1.0, 0.0, 0.0, 0.0)
     rate_b = (0.0, 1.0, 0.0) if tilts else (0.0, 0.0, 1.0)
     for _ in range(300):
-        watch_hidden_pull(s, upright, rate_b, False, False, 0.1)
+        watch_hidden_pull(s, upright, rate_b, False, 0.1)
     hidden = math.sqrt(hidden_level_var(s))
     assert hidden == pytest.approx(0.0 if tilts else HIDDEN_MPS2 / G, abs=1e-3)
-    watch_hidden_pull(s, upright, rate_b, False, True, 0.1)
+    watch_hidden_pull(s, upright, rate_b, True, 0.1)
     assert math.sqrt(hidden_level_var(s)) == pytest.approx(HIDDEN_MPS2 / G)
-    watch_hidden_pull(s, upright, rate_b, True, False, 0.1)
+    s.rest_s = SHOWN_S + 0.1
+    watch_hidden_pull(s, upright, rate_b, False, 0.1)
     assert hidden_level_var(s) == 0.0

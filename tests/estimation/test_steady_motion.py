@@ -9,12 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     ACCEL,
-    GPS_ALT,
-    GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
     GYRO,
     IMU_COLUMNS,
     MAG,
@@ -23,9 +17,8 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.kernel import SampleLog
 from gateway.geometry.angle import wrap_pi
-from gateway.geometry.geodesy import radii_m
 from gateway.records import NavFlags
-from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.samples import G, fix_rows, log_of
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, correlated, estimator_of
 
 FIELD_N_UT = (21.0, 0.0, 43.0)
@@ -54,15 +47,10 @@ def drive(seed: int, *, stops: bool) -> tuple[SampleLog, np.ndarray]:
     imu[:, GYRO : GYRO + 3] = rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
     imu[:, MAG : MAG + 3] = FIELD_N_UT + rng.normal(0.0, 0.4, (n, 3))
     at = np.arange(RATE_HZ, round(LOST_S * RATE_HZ), RATE_HZ // FIXES_HZ)
-    gps = np.full((len(at), GPS_COLUMNS), math.nan)
-    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
-    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
-    gps[:, GPS_LAT] += np.degrees(np.cumsum(speed)[at] / RATE_HZ / radii_m(LAT_DEG, ALT_M)[0])
-    gps[:, GPS_ALT] = ALT_M
-    gps[:, GPS_VEL : GPS_VEL + 3] = rng.normal(0.0, 0.1, (len(at), 3))
-    gps[:, GPS_VEL] += speed[at]
-    us = np.round(time_s * 1e6).astype(np.int64)
-    return SampleLog(us, imu, np.empty(0, np.int64), np.empty(0), us[at], gps), speed
+    vel_n = np.outer(speed, (1.0, 0.0, 0.0))
+    place = np.cumsum(vel_n, axis=0)[at] / RATE_HZ
+    fixes = fix_rows(place, vel_n[at] + rng.normal(0.0, 0.1, (len(at), 3)))
+    return log_of(imu, RATE_HZ, at, fixes), speed
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -101,9 +89,7 @@ def circle(seed: int) -> tuple[SampleLog, np.ndarray]:
     imu[:, GYRO + 2] += rolls * TURN_RADPS
     back = Rotation.from_rotvec(np.outer(-heading_rad, [0.0, 0.0, 1.0]))
     imu[:, MAG : MAG + 3] = back.apply(np.tile(FIELD_N_UT, (n, 1))) + rng.normal(0.0, 0.4, (n, 3))
-    us = np.round(time_s * 1e6).astype(np.int64)
-    no_fixes = np.empty((0, GPS_COLUMNS))
-    return SampleLog(us, imu, us[:0], np.empty(0), us[:0], no_fixes), heading_rad
+    return log_of(imu, RATE_HZ), heading_rad
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -138,9 +124,7 @@ def waved(seed: int, jump_degps: tuple[float, float, float]) -> tuple[SampleLog,
     imu[:, GYRO : GYRO + 3] += np.outer(jumped, np.radians(jump_degps))
     imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
     imu[:, MAG : MAG + 3] = math.nan
-    us = np.round(time_s * 1e6).astype(np.int64)
-    no_fixes = np.empty((0, GPS_COLUMNS))
-    return SampleLog(us, imu, us[:0], np.empty(0), us[:0], no_fixes), attitudes
+    return log_of(imu, RATE_HZ), attitudes
 
 
 def tilt_off(out: np.ndarray, attitudes: Rotation) -> np.ndarray:
@@ -167,7 +151,7 @@ def test_a_level_that_a_bias_has_turned_is_no_push(
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", ["complementary", "eskf"])
 def test_a_banked_circle_in_calm_air_is_no_rest(name: str, seed: int) -> None:
-    """The force stands still in the body there too, but it turns more about the vertical."""
+    """The force stands still in the body there too, but is as strong as the bank makes it."""
     rng, n = np.random.default_rng(seed), round(ENDS_S * RATE_HZ)
     time_s = np.arange(n) / RATE_HZ
     turns = gaussian_filter1d((time_s > STARTS_S + PACE_S).astype(float), RATE_HZ)
@@ -180,9 +164,7 @@ def test_a_banked_circle_in_calm_air_is_no_rest(name: str, seed: int) -> None:
     imu[1:, GYRO : GYRO + 3] = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() * RATE_HZ
     imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 0.003, (n, 3)) + rng.normal(0.0, 0.005, 3)
     imu[:, MAG : MAG + 3] = math.nan
-    us = np.round(time_s * 1e6).astype(np.int64)
-    log = SampleLog(us, imu, us[:0], np.empty(0), us[:0], np.empty((0, GPS_COLUMNS)))
-    out = estimator_of(name).run(log)
+    out = estimator_of(name).run(log_of(imu, RATE_HZ))
     banked = (time_s > STARTS_S + PACE_S + 2.0) & (time_s < STARTS_S + PACE_S + 6.0)
     assert not (out[banked, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
     assert np.degrees(tilt_off(out[banked], attitudes[np.flatnonzero(banked)])).max() < 10.0

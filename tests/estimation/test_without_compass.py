@@ -12,12 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     ACCEL,
-    GPS_ALT,
-    GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
     GYRO,
     IMU_COLUMNS,
     MAG,
@@ -28,9 +22,8 @@ from gateway.estimation.eskf.recovery import turn_heading
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
-from gateway.geometry.geodesy import radii_m
 from gateway.records import NavFlags
-from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G
+from tests.estimation.samples import G, fix_rows, log_of
 
 STANDS_S = 40.0
 ENDS_S = 100.0
@@ -72,17 +65,10 @@ def flight(seed: int, receiver: str) -> tuple[SampleLog, np.ndarray]:
     imu[:, MAG : MAG + 3] = math.nan
     at = np.arange(RATE_HZ, n, RATE_HZ // FIXES_HZ)
     white, lasting, tau_s = RECEIVERS[receiver]
-    gps = np.full((len(at), GPS_COLUMNS), math.nan)
     place = np.cumsum(vel_n, axis=0)[at] / RATE_HZ + correlated(rng, len(at), FIXES_HZ, 1.0, 30.0)
-    gps[:, GPS_USABLE], gps[:, GPS_DECLINATION] = 1.0, 0.0
-    gps[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
-    gps[:, GPS_LAT : GPS_LAT + 2] += np.degrees(place[:, :2] / radii_m(LAT_DEG, ALT_M))
-    gps[:, GPS_ALT] = ALT_M - place[:, 2]
-    gps[:, GPS_VEL : GPS_VEL + 3] = vel_n[at] + rng.normal(0.0, white, (len(at), 3))
-    gps[:, GPS_VEL : GPS_VEL + 3] += correlated(rng, len(at), FIXES_HZ, lasting, tau_s)
-    us = np.round(time_s * 1e6).astype(np.int64)
-    log = SampleLog(us, imu, np.empty(0, np.int64), np.empty(0), us[at], gps)
-    return log, heading
+    told = vel_n[at] + rng.normal(0.0, white, (len(at), 3))
+    told += correlated(rng, len(at), FIXES_HZ, lasting, tau_s)
+    return log_of(imu, RATE_HZ, at, fix_rows(place, told)), heading
 
 
 @cache

@@ -24,7 +24,11 @@ from gateway.estimation.complementary.errors.drift import (
     bias_std,
 )
 from gateway.estimation.complementary.tilt import begin_pull
-from gateway.estimation.filtering.hidden_pull import SHOWN_S, hidden_level_var, watch_hidden_pull
+from gateway.estimation.filtering.hidden_pull import (
+    flight_share,
+    hidden_level_var,
+    watch_hidden_pull,
+)
 from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.rest import REST_TAU_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -36,8 +40,6 @@ PULL_TAU_S: Final = 1.5
 """What a hand does averages out in this time."""
 HAND_MPS2: Final = 0.2
 """A hand pulls less over it: recorded ones up to 0.15, a hovering quadrotor up to 0.7."""
-HAND_S: Final = 4.0
-"""What has moved for a few times this long and pulled no harder is in a hand."""
 TILTED_SQ: Final = 8.0
 """Up to two standard deviations about both axes, what seems to pull is a level that is off."""
 EXPECTED_MPS2: Final = 0.3
@@ -66,8 +68,9 @@ def watch_level(s: ComplementaryState, p: ComplementaryGains, dt: float) -> None
     s.unaided_pull_sq += share * (pull_sq - s.unaided_pull_sq)
     drift = math.sqrt(drift_sq) / tau
     expected_sq = expected_pull_sq(s, pull_sq, dt)
-    shown = s.rest_s > SHOWN_S or s.by_gps == 1
-    watch_hidden_pull(s, as_quat(s.q_eb), as_vec(s.rate_b), shown, s.unaided_pulled == 1, dt)
+    if s.by_gps == 1:
+        s.level_shown = 1
+    watch_hidden_pull(s, as_quat(s.q_eb), as_vec(s.rate_b), s.unaided_pulled == 1, dt)
     # Here the sum of both errors is least.
     best = (4.0 * TURN_S**2 * math.sqrt(expected_sq) / (g * drift)) ** (1.0 / 3.0)
     s.gravity_tau_s = tau = max(p.tau_accel_s, best)
@@ -95,7 +98,7 @@ def expected_pull_sq(s: ComplementaryState, pull_sq: float, dt: float) -> float:
         s.unaided_pulled = 1
     if s.unaided_pulled == 0:
         s.unaided_hand_s += dt
-    share = 1.0 if s.unaided_pulled == 1 else math.exp(-s.unaided_hand_s / HAND_S)
+    share = flight_share(s.unaided_pulled, s.unaided_hand_s)
     return float(max(s.unaided_pull_sq, (share * EXPECTED_MPS2) ** 2))
 
 

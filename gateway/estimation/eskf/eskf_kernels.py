@@ -75,9 +75,9 @@ from gateway.estimation.magfield import (
 )
 from gateway.estimation.rest import (
     BIAS_CHANGE_RADPS,
-    PUSHED_MPS,
     doubt_rest_bias,
     is_pushed,
+    may_be_pushed,
     outruns,
     turns_steadily,
     watch_rest,
@@ -204,7 +204,7 @@ def level_force(s: EskfState) -> Vec3:
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
     """Return whether GPS or dead reckoning says that it moves, or without any the way it went."""
-    if s.aided == 0 and s.flies == 1 and s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0:
+    if s.aided == 0 and s.flies == 1 and may_be_pushed(s):
         return True
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     if s.aided == 0:

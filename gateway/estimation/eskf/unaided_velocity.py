@@ -11,7 +11,7 @@ from gateway.estimation.eskf.eskf_state import VEL, EskfState
 from gateway.estimation.eskf.late_fix import lag_integrals
 from gateway.estimation.eskf.measure import UNAIDED_CORRELATION_S, take_back
 from gateway.estimation.filtering.fix_intake import look_back
-from gateway.estimation.filtering.hidden_pull import SHOWN_S, watch_hidden_pull
+from gateway.estimation.filtering.hidden_pull import watch_hidden_pull
 from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.local_position import past_state
 from gateway.estimation.rest import PUSHED_SQ
@@ -72,8 +72,7 @@ def watch_way(s: EskfState, dt: float) -> None:
     for k in range(3):
         s.assumed_bias[k] *= settled
         s.assumed_scale[k] *= settled
-    shown = s.rest_s > SHOWN_S
-    watch_hidden_pull(s, as_quat(s.q_nb), as_vec(s.rate_b), shown, s.flies == 1, dt)
+    watch_hidden_pull(s, as_quat(s.q_nb), as_vec(s.rate_b), s.flies == 1, dt)
     if s.at_rest == 1:
         s.unaided_sq, s.hand_sq, s.flies = 0.0, 0.0, 0
     elif s.flies == 1:
