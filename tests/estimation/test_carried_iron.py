@@ -232,7 +232,7 @@ def driven(seed: int) -> tuple[SampleLog, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("marked", "most_deg", "share"),
-    [(False, 6.5, 0.8), (True, 2.5, 0.93)],
+    [(False, 6.5, 0.77), (True, 2.5, 0.93)],
     ids=["unmarked", "marked"],
 )
 @pytest.mark.parametrize("name", ["complementary", "eskf"])

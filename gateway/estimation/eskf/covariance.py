@@ -27,6 +27,11 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
+from gateway.estimation.filtering.bias_evidence import (
+    note_bias_correction,
+    unexpected_bias_density,
+    watch_bias_corrections,
+)
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.filtering.roughness import note_force_noise
 from gateway.estimation.kernel_record import FloatArray, as_quat, fill, write_quat
@@ -71,17 +76,28 @@ def propagate(s: EskfState, p: EskfGains) -> None:
         s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
         s.P[POS + k, POS + k] += s.place_density[k] * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
+        raise_bias(s, p, k, unexpected_bias_density(s, k) * dt)
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[MAG_BIAS + k, MAG_BIAS + k] += p.mag_bias_density * dt
         decay(s.P, WANDER + k, kept, s.wander_var[k])
         s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
     limit_variance(s.P, TILT + 2, NO_HEADING_VAR)
+    known = s.heading_known == 1 and s.aided == 1
+    watch_bias_corrections(s, known, dt)
     s.pending_s = 0.0
     fill(s.pending_force_n, 0.0)
     for k in range(3):
         for j in range(3):
             s.pending_turn[k, j] = s.pending_scaled[k, j] = 0.0
+
+
+@compiled
+def raise_bias(s: EskfState, p: EskfGains, k: int, more: float) -> None:
+    """Add to the variance of an axis of the bias, up to what it began with."""
+    more = min(more, max(p.gyro_bias_var - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0))
+    s.P[GYRO_BIAS + k, GYRO_BIAS + k] += more
+    s.bias_raised[k] += more
 
 
 @compiled
@@ -227,6 +243,10 @@ def update_scalar(s: EskfState, innovation: float, variance: float, gate_sq: flo
     """
     rest = residual(s, innovation)
     total = max(innovation_variance(s, variance), rest * rest / gate_sq)
+    std = math.sqrt(total)
+    for k in range(3):
+        if s.considered[GYRO_BIAS + k] == 0.0:
+            note_bias_correction(s, k, rest / std, s.Ph[GYRO_BIAS + k] / std)
     for i in range(STATES):
         gain = s.Ph[i] / total
         s.dx[i] += (1.0 - s.considered[i]) * gain * rest

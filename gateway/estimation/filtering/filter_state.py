@@ -7,6 +7,7 @@ from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
+from gateway.estimation.filtering.bias_evidence import BiasEvidenceState
 from gateway.estimation.filtering.hidden_pull import HiddenPullState
 from gateway.estimation.filtering.iron_evidence import IronState
 from gateway.estimation.filtering.roughness import RoughnessState
@@ -62,6 +63,7 @@ class FilterState(
     FieldState,
     IronState,
     HiddenPullState,
+    BiasEvidenceState,
     LagState,
     LatencyState,
     ReviewState,

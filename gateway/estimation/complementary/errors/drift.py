@@ -36,6 +36,10 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.errors.compass_error import compass_variance
 from gateway.estimation.complementary.errors.drift_update import widen_prior
+from gateway.estimation.filtering.bias_evidence import (
+    unexpected_bias_density,
+    watch_bias_corrections,
+)
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
 from gateway.estimation.kernel_record import as_quat
@@ -198,12 +202,14 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
     limit_variance(s.drift_cov, HEADING, UNKNOWN_VAR)
     carry_compass(s, p)
     for k in range(3):
-        P[k, k] += BIAS_WALK_RAD2PS3 * s.carried_s
+        P[k, k] += (BIAS_WALK_RAD2PS3 + unexpected_bias_density(s, k)) * s.carried_s
         P[FORCE + k, FORCE + k] += FORCE_WALK_M2PS5 * s.carried_s
         limit_variance(s.drift_cov, k, p.bias_initial_radps**2)
         limit_variance(s.drift_cov, FORCE + k, FORCE_BIAS_MPS2**2)
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
         scaled[0, k] = scaled[1, k] = scaled[2, k] = 0.0
+    known = s.heading_known == 1 and s.level_by_gps == 1 and s.iron_doubted == 0
+    watch_bias_corrections(s, known, s.carried_s)
     s.carried_s = s.carried_rad = 0.0
 
 

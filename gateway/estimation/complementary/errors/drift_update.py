@@ -17,6 +17,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
     states_in_use,
 )
+from gateway.estimation.filtering.bias_evidence import note_bias_correction
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
@@ -72,8 +73,11 @@ def correct_drift(
         count = IRON
     spread = variance + expected_variance(s)
     reduce_covariance(s, spread, count)
-    most = clip * math.sqrt(spread)
-    apply_gain(s, p, max(-most, min(most, innovation)) / spread, count)
+    std = math.sqrt(spread)
+    off = max(-clip, min(clip, innovation / std))
+    for k in range(3):
+        note_bias_correction(s, k, off, s.drift_gain[k] / std)
+    apply_gain(s, p, off / std, count)
 
 
 @compiled
