@@ -18,7 +18,11 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryGains,
     ComplementaryState,
 )
-from gateway.estimation.complementary.errors.carried_iron import look_for_iron, tells_heading
+from gateway.estimation.complementary.errors.carried_iron import (
+    look_for_iron,
+    renew_iron,
+    tells_heading,
+)
 from gateway.estimation.complementary.errors.compass_error import note_dip, note_field
 from gateway.estimation.complementary.errors.drift import carry_drift, heading_variance
 from gateway.estimation.complementary.errors.drift_update import (
@@ -26,6 +30,7 @@ from gateway.estimation.complementary.errors.drift_update import (
     cleared_row,
     correct_drift,
 )
+from gateway.estimation.filtering.field_jump import has_jumped
 from gateway.estimation.filtering.iron_evidence import (
     MISFIT_S,
     heading_by_iron,
@@ -60,6 +65,18 @@ def is_heading_good(s: ComplementaryState) -> bool:
 
 
 @compiled
+def compass_density(s: ComplementaryState, level_sq: float) -> float:
+    """Return the density of the compass's noise, rad2 s; `level_sq` is of the field, uT2."""
+    dip = usual_dip(s)
+    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 * steepness(dip)
+    if s.level_by_gps == 0:
+        # A level that is off turns the field for as long, the more the steeper it is.
+        steep = math.tan(dip)
+        density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
+    return density + MISFIT_S * unexplained_iron_sq(s) / level_sq
+
+
+@compiled
 def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     """Correct the heading by one magnetometer sample.
 
@@ -81,6 +98,8 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     north, east, down = field
     norm = math.sqrt(north * north + east * east + down * down)
     upright = not tells_heading(field)
+    if has_jumped(s, mag_b) and s.level_by_gps == 1:
+        renew_iron(s, p)
     if norm > MIN_FIELD_UT and dt > 0.0:
         note_field(s, own_b, norm, dt)
         if is_likely(norm, s.strength_ut) and not upright:
@@ -99,13 +118,7 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     if s.heading_known == 0:
         s.heading_rad, s.heading_known = wrap_pi(measured - s.compass_rad), 1
     innovation = wrap_pi(measured - s.compass_rad - s.heading_rad)
-    dip = usual_dip(s)
-    density = (MAG_NOISE_DEG * RAD_PER_DEG) ** 2 * steepness(dip)
-    if s.level_by_gps == 0:
-        # A level that is off turns the field for as long, the more the steeper it is.
-        steep = math.tan(dip)
-        density += 2.0 * s.unaided_level_sq * steep * steep * s.gravity_tau_s
-    density += MISFIT_S * unexplained_iron_sq(s) / (north * north + east * east)
+    density = compass_density(s, north * north + east * east)
     row = cleared_row(s)
     row[HEADING] = row[COMPASS] = 1.0
     turned = heading_by_iron(as_quat(s.q_eb), field)

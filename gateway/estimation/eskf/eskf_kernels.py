@@ -19,6 +19,7 @@ from gateway.estimation.eskf.iron import (
     follow_field,
     look_for_iron,
     note_calibration,
+    renew_iron,
     update_by_dip,
 )
 from gateway.estimation.eskf.measure import (
@@ -45,6 +46,7 @@ from gateway.estimation.eskf.start import (
     start_heading_by_compass,
 )
 from gateway.estimation.eskf.unaided_velocity import unaided_density, watch_way
+from gateway.estimation.filtering.field_jump import has_jumped
 from gateway.estimation.filtering.height_intake import is_height_told
 from gateway.estimation.filtering.roughness import collect_roughness
 from gateway.estimation.filtering.sample_clock import (
@@ -325,6 +327,8 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     present = present_field(s, (mag_b[0] - b[0], mag_b[1] - b[1], mag_b[2] - b[2]))
     if s.lost == 1:
         return
+    if has_jumped(s, mag_b):
+        renew_iron(s, p)
     look_for_iron(s, p, mag_b, s.time_s - s.mag_s)
     field = rotate(as_quat(s.q_nb), present)
     level = math.hypot(field[0], field[1])

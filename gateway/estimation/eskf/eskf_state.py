@@ -110,6 +110,8 @@ class EskfState(FilterState):
     beside `P`, and fades as that is reduced."""
     bias_raised: Annotated[FloatArray, (3,)]
     """Sum of what doubt has added to the variance of the gyroscope's bias, rad2/s2."""
+    iron_raised: Annotated[FloatArray, (3,)]
+    """The same of the iron, uT2."""
     renewals: Annotated[FloatArray, (STATES,)]
     """How often each state began anew: what it was before says nothing of what it is since."""
     off_last_m: float

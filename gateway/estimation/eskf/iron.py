@@ -186,6 +186,19 @@ def doubt_iron(s: EskfState, variance: float) -> None:
 
 
 @compiled
+def renew_iron(s: EskfState, p: EskfGains) -> None:
+    """Be unsure of the iron by what the field has just jumped by: the heading has none of it."""
+    if s.aided == 0 or s.iron_search_started == 0:
+        return
+    propagate(s, p)
+    for k in range(3):
+        jump_sq = s.jump_b[k] * s.jump_b[k]
+        s.P[MAG_BIAS + k, MAG_BIAS + k] += jump_sq
+        s.iron_raised[k] += jump_sq
+    forget_strength(s)
+
+
+@compiled
 def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
     """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
     if s.mag_uncalibrated == 1 and not uncalibrated:

@@ -8,6 +8,7 @@ from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
 from gateway.estimation.filtering.bias_evidence import BiasEvidenceState
+from gateway.estimation.filtering.field_jump import FieldJumpState
 from gateway.estimation.filtering.hidden_pull import HiddenPullState
 from gateway.estimation.filtering.iron_evidence import IronState
 from gateway.estimation.filtering.roughness import RoughnessState
@@ -64,6 +65,7 @@ class FilterState(
     IronState,
     HiddenPullState,
     BiasEvidenceState,
+    FieldJumpState,
     LagState,
     LatencyState,
     ReviewState,

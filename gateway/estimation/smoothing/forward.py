@@ -125,10 +125,12 @@ def is_renewed(s: EskfState, copy: EskfState) -> bool:
 
 @compiled
 def share_doubt(s: EskfState, copy: EskfState) -> None:
-    """Let the copy doubt the gyroscope's bias as the filter does, from rest to motion and back."""
+    """Let the copy doubt the gyroscope's bias and the iron as the filter does."""
     for k in range(3):
         copy.P[GYRO_BIAS + k, GYRO_BIAS + k] += s.bias_raised[k] - copy.bias_raised[k]
         copy.bias_raised[k] = s.bias_raised[k]
+        copy.P[MAG_BIAS + k, MAG_BIAS + k] += s.iron_raised[k] - copy.iron_raised[k]
+        copy.iron_raised[k] = s.iron_raised[k]
 
 
 @compiled

@@ -124,6 +124,17 @@ def doubt_iron(s: ComplementaryState, p: ComplementaryGains, variance: float) ->
 
 
 @compiled
+def renew_iron(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Be unsure of the iron by what the field has just jumped by: the heading has none of it."""
+    carry_drift(s, p)
+    x, y, z = as_vec(s.jump_b)
+    for k in range(3):
+        s.drift_cov[IRON + k, IRON + k] += s.jump_b[k] * s.jump_b[k]
+    s.iron_var += max(x * x, y * y, z * z)
+    forget_strength(s)
+
+
+@compiled
 def update_by_strength(s: ComplementaryState, p: ComplementaryGains, raw: Vec3, dt: float) -> None:
     """Correct the iron by how the strength of the field varies, once it does so beyond noise."""
     off, along = compare_strength(s, raw, as_vec(s.iron_b), dt)
