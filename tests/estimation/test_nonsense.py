@@ -314,6 +314,17 @@ def test_single_heights_of_fixes_are_left_out(flight: Flight, name: str) -> None
     assert np.nanmax(np.abs(off_m)) < 2.0
 
 
+@pytest.mark.parametrize(("name", "most_m"), [("complementary", 18.0), ("eskf", 4.0)])
+def test_heights_that_leave_the_barometer_for_a_while_are_doubted(
+    flight: Flight, name: str, most_m: float
+) -> None:
+    log, spoilt = part(flight, 30.0, 80.0), part(flight, 30.0, 80.0)
+    since_s = (spoilt.gps_time_us - spoilt.gps_time_us[0]) * 1e-6
+    spoilt.gps[(since_s > 30.0) & (since_s < 50.0), GPS_ALT] += 50.0
+    off_m = run(flight, name, spoilt)[:, NAV_ALT] - run(flight, name, log)[:, NAV_ALT]
+    assert np.nanmax(np.abs(off_m)) < most_m
+
+
 @pytest.mark.parametrize(("north_m", "speed_mps"), [(2.0, 5.0), (1e7, 3.0)])
 def test_only_a_way_that_can_be_flown_adds_to_the_velocity(
     north_m: float, speed_mps: float

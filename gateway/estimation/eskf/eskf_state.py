@@ -122,6 +122,8 @@ class EskfState(FilterState):
     """By how much the velocities of fixes did of late, along an axis."""
     height_off_s: float
     """For how long the heights of the fixes have contradicted the filter's."""
+    height_held_s: float
+    """For how long they have agreed with it while there was a barometer."""
     weighed_s: float
     """Arrival of the last fix that was weighed, accepted or not."""
     doubt_vel_sq: float

@@ -37,10 +37,12 @@ from gateway.estimation.filtering.fix_intake import (
 )
 from gateway.estimation.filtering.sample_clock import silence_before
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
-from gateway.estimation.local_position import is_relocked, past_state
+from gateway.estimation.local_position import BARO_STALE_S, is_relocked, past_state
 from gateway.estimation.sensor_faults import is_sound
 from gateway.records import Vec3
 
+HELD_S: Final = 60.0
+"""A height that barometer and fixes have agreed on is held against fixes for so long at most."""
 LONGEST_S: Final = 1.0
 """A fix speaks for no longer than this."""
 
@@ -130,15 +132,19 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
 def watch_height(s: EskfState, p: EskfGains, row: FloatArray, off_m: float) -> None:
     """Give a height up that the fixes contradict for long: the next one tells it anew.
 
-    The first heights of a receiver may be hundreds of metres off, and agree with one another.
+    The first heights of a receiver may be hundreds of metres off, and agree with one another. Later
+    ones that leave what barometer and fixes have told together are doubted for as long as they have.
     """
     if not math.isfinite(off_m):
         return
     known = s.P[POS + 2, POS + 2] + s.wander_var[2] + place_variance(p, row, 2)
     near = abs(off_m) < p.gate_m or off_m * off_m < p.gate_sq * known
-    s.height_off_s = 0.0 if near else s.height_off_s + min(s.time_s - s.weighed_s, LONGEST_S)
-    if s.height_off_s > p.gps_relock_s:
-        s.has_height, s.doubt_pos_sq = 0, 0.0
+    dt = min(s.time_s - s.weighed_s, LONGEST_S)
+    s.height_off_s = 0.0 if near else s.height_off_s + dt
+    if near and s.time_s - s.baro_s < BARO_STALE_S:
+        s.height_held_s = min(s.height_held_s + dt, HELD_S)
+    if s.height_off_s > max(p.gps_relock_s, s.height_held_s):
+        s.has_height, s.doubt_pos_sq, s.height_held_s = 0, 0.0, 0.0
 
 
 @compiled
