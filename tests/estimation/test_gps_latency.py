@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.estimation.alignment.latency_of_log import estimate_latency
+from gateway.estimation.columns import ACCEL, GPS_VEL
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.flights.log_facts import with_reference
@@ -46,6 +47,22 @@ def test_the_latency_is_found(flight: Flight, latency_s: float) -> None:
     assert found is not None
     assert found.latency_s == pytest.approx(latency_s, abs=0.015)
     assert found.std_s < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("latency_s", [0.05, 0.16, 0.4])
+def test_noise_moves_it_no_further_than_told(
+    flight: Flight, rng: np.random.Generator, latency_s: float
+) -> None:
+    """Noise puts the lowest point of a manoeuvre that says little anywhere, on average midway."""
+    log = delayed(flight.log, latency_s - TOLD_S)
+    imu, gps = log.imu.copy(), log.gps.copy()
+    imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 1.0, (len(imu), 3))
+    gps[:, GPS_VEL : GPS_VEL + 3] += rng.normal(0.0, 0.1, (len(gps), 3))
+    found = estimate_latency(replace(log, imu=imu, gps=gps))
+    assert found is not None
+    assert abs(found.latency_s - latency_s) < 2.5 * found.std_s
+    assert found.std_s < 0.011
 
 
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 The specific force is summed in the gyroscope's own frame. Over a few seconds, one turn takes all
 its changes from fix to fix to those of the GPS velocity, gravity added: Wahba's problem, whose
-misfit is known without the turn itself [1]_. It is known for several latencies at once, and the
-true one is where a parabola through the least has its lowest point; how sharp that is tells how
-well it is known. Straight flight has no least.
+misfit is known without the turn itself [1]_. It is known for several latencies at once. The misfits
+of all manoeuvres add up, and the true latency is where a parabola through the least has its lowest
+point; how sharp that is tells how well it is known. Straight flight has no least.
 
 References
 ----------
@@ -46,6 +46,12 @@ KNOWN_STD_S: Final = 0.012
 """A latency that is told less well is not known."""
 CONTRADICTED_S: Final = 0.07
 """What is set stands within this: a position may be a little later than the velocity."""
+MOST_HALF_SPAN: Final = 3
+"""A parabola is fitted to so many misfits at most on either side of the least."""
+LEAST_RISE: Final = 16.0
+"""By how much the logarithm of the likelihood, twice, has to fall from the best to these."""
+CERTAIN: Final = 1e30
+"""Information in 1/s2 that no manoeuvre adds to."""
 SLEW: Final = 0.01
 """Seconds by which the latency in use changes in a second, so that no fix seems to jump."""
 NEWTON_STEPS: Final = 12
@@ -70,10 +76,12 @@ class LatencyState(PlaceState):
     lag_outer: Annotated[FloatArray, (LAGS, 9)]
     lag_squares: Annotated[FloatArray, (LAGS,)]
     """Of this window."""
+    lag_misfit: Annotated[FloatArray, (LAGS,)]
+    """Of all windows: twice the logarithm by which a latency is less likely than the best."""
     found_latency_s: float
-    """Mean of all windows that told it."""
+    """That fits all windows best."""
     found_information: float
-    """Of that mean, 1/s2."""
+    """Of that latency, 1/s2."""
 
 
 @compiled
@@ -81,6 +89,15 @@ def begin_latency(s: LatencyState, latency_s: float) -> None:
     """Begin with the latency that is set."""
     s.gps_latency_s = latency_s
     forget_velocities(s)
+
+
+@compiled
+def begin_certain(s: LatencyState, latency_s: float) -> None:
+    """Begin with a latency that is known: no manoeuvre contradicts it."""
+    begin_latency(s, latency_s)
+    s.found_latency_s, s.found_information = latency_s, CERTAIN
+    for k in range(LAGS):
+        s.lag_misfit[k] = CERTAIN * (lag_of(k) - latency_s) ** 2
 
 
 @compiled
@@ -162,8 +179,7 @@ def close_window(s: LatencyState) -> None:
             s.lag_squares[k] = max(s.lag_squares[k] - 2.0 * best_fit(s, k), 1e-9)
             if s.lag_squares[k] < s.lag_squares[least]:
                 least = k
-        if 0 < least < LAGS - 1:
-            learn_latency(s, least, 3.0 * n / (SHARED * s.lag_squares[least]))
+        learn_latency(s, least, 3.0 * n / (SHARED * s.lag_squares[least]))
     s.lag_pairs = s.lag_accel_sq = 0.0
     fill(s.lag_accel, 0.0)
     fill(s.lag_squares, 0.0)
@@ -213,16 +229,63 @@ def best_fit(s: LatencyState, k: int) -> float:
 
 
 @compiled
-def learn_latency(s: LatencyState, k: int, weight: float) -> None:
-    """Average the lowest point of a parabola through a window's least misfit with the others'."""
+def learn_latency(s: LatencyState, least: int, weight: float) -> None:
+    """Add a window's misfits to those of the others, and find the latency that fits all best.
+
+    Each counts by what it has beyond the least: of a window that says little, noise makes the
+    lowest point, but it is hardly lower than the rest.
+    """
     m = s.lag_squares
-    bend = weight * (m[k - 1] - 2.0 * m[k] + m[k + 1])
-    if not bend > 0.0:
-        return
-    latency_s = lag_of(k) + LAG_STEP_S * 0.5 * weight * (m[k - 1] - m[k + 1]) / bend
-    information = 1.0 / (WINDOW_STD_S * WINDOW_STD_S + 2.0 * LAG_STEP_S * LAG_STEP_S / bend)
-    s.found_information = WINDOW_KEPT * s.found_information + information
-    s.found_latency_s += (latency_s - s.found_latency_s) * information / s.found_information
+    _, curve = parabola(m, least, MOST_HALF_SPAN)
+    share = weight / (1.0 + max(weight * curve, 0.0) * (WINDOW_STD_S / LAG_STEP_S) ** 2)
+    best = 0
+    for k in range(LAGS):
+        s.lag_misfit[k] = WINDOW_KEPT * s.lag_misfit[k] + share * (m[k] - m[least])
+        if s.lag_misfit[k] < s.lag_misfit[best]:
+            best = k
+    lowest, curve = sharpest_parabola(s.lag_misfit, best)
+    known = curve > 0.0 and 0.0 <= lowest <= LAGS - 1.0
+    s.found_information = curve / (LAG_STEP_S * LAG_STEP_S) if known else 0.0
+    if known:
+        s.found_latency_s = EARLIEST_S + LAG_STEP_S * lowest
+
+
+@compiled
+def sharpest_parabola(misfit: FloatArray, least: int) -> tuple[float, float]:
+    """Fit a parabola over the shortest span in which the misfit rises beyond noise.
+
+    Its neighbours alone would mostly tell the noise of the accelerometer, which differs from one
+    latency to the next; far from it, the misfit is no parabola.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Where it is lowest, in steps from the earliest latency, and its curvature by steps; 0 where
+        it does not rise so far.
+    """
+    for half in range(1, MOST_HALF_SPAN + 1):
+        lowest, curve = parabola(misfit, least, half)
+        # Noise is the same over any span, so it bends a short one more.
+        if curve * half * half > LEAST_RISE * (MOST_HALF_SPAN + 1 - half):
+            return lowest, curve
+    return 0.0, 0.0
+
+
+@compiled
+def parabola(misfit: FloatArray, least: int, half: int) -> tuple[float, float]:
+    """Fit a parabola to the misfits around the least, `half` of them on either side."""
+    middle = min(max(least, half), LAGS - 1 - half)
+    mean_sq = half * (half + 1) / 3.0
+    slope = curve = second = fourth = 0.0
+    for x in range(-half, half + 1):
+        second += x * x
+        fourth += (x * x - mean_sq) * x * x
+        slope += x * misfit[middle + x]
+        curve += (x * x - mean_sq) * misfit[middle + x]
+    slope, curve = slope / second, curve / fourth
+    if curve <= 0.0:
+        return 0.0, 0.0
+    return middle - 0.5 * slope / curve, curve
 
 
 @compiled

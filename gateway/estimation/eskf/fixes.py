@@ -132,8 +132,8 @@ def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, 
 def watch_height(s: EskfState, p: EskfGains, row: FloatArray, off_m: float) -> None:
     """Give a height up that the fixes contradict for long: the next one tells it anew.
 
-    The first heights of a receiver may be hundreds of metres off, and agree with one another. Later
-    ones that leave what barometer and fixes have told together are doubted for as long as they have.
+    The first heights of a receiver may be hundreds of metres off, and agree with one another. Those
+    that leave what barometer and fixes have told together are doubted for as long as they have.
     """
     if not math.isfinite(off_m):
         return

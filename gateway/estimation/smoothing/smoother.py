@@ -26,6 +26,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from gateway.estimation.alignment.gps_latency import begin_certain
 from gateway.estimation.alignment.latency_of_log import latency_of_flight
 from gateway.estimation.alignment.wahba import SPEED_MEMORY_S
 from gateway.estimation.columns import (
@@ -64,8 +65,6 @@ LASTING_ROUGHNESS: Final = 1.5
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Share of its own variance that each state foreseen is blurred by, so that all can be divided."""
-CERTAIN: Final = 1e30
-"""Information in 1/s2 that nothing found on the way adds to."""
 BLOCK: Final = 256
 """Nodes whose gains are computed at once."""
 BYTES_PER_SECOND: Final = round(3 * 8 * STATES * STATES / NODE_S)
@@ -93,8 +92,8 @@ def smooth(estimator: KernelEstimator[Any, Any], log: SampleLog) -> tuple[FloatA
     """
     state, gains = estimator.state, _gains_of(estimator)
     latency_s = latency_of_flight(log, gains.gps_latency_s)
-    gains.gps_latency_s = state.gps_latency_s = state.found_latency_s = latency_s
-    state.found_information = CERTAIN
+    gains.gps_latency_s = latency_s
+    begin_certain(state, latency_s)
     states = np.zeros(2, np.asarray(state).dtype)
     states[0] = state
     nodes = _nodes(log.imu_time_us)
