@@ -60,14 +60,20 @@ def test_a_heading_is_kept_where_the_field_jumps(name: str, passes_deg: float) -
         assert within > 0.95
 
 
-def told_jumps(fields: list[np.ndarray], iron_b: Vec3 = (0.0, 0.0, 0.0)) -> list[int]:
-    """Tell at which of ten fields a second one has jumped, in turns and beside iron."""
+def told_jumps(
+    fields: list[np.ndarray], iron_b: Vec3 = (0.0, 0.0, 0.0), unseen_s: float = 0.0
+) -> list[int]:
+    """Tell at which of ten fields a second one has jumped, in turns and beside iron.
+
+    The IMU is silent up to `unseen_s`.
+    """
     s, found = FieldJumpState(), []
     s.jump_from_b, s.jump_from_i, s.jump_b = np.zeros(3), np.zeros(3), np.zeros(3)
     s.jump_from_s = s.jump_noise_sq = s.jump_noise_s = 0.0
     s.jump_seen = 0
     for k, field_i in enumerate(fields):
         s.time_s = 0.1 * (k + 1)
+        s.sound_s = max(s.time_s - unseen_s, 0.0)
         turn = from_rotation_vector((0.0, 0.0, 0.5 * s.time_s))
         s.q_ib = np.array(turn)
         x, y, z = rotate_inverse(turn, (field_i[0], field_i[1], field_i[2]))
@@ -86,6 +92,13 @@ def test_a_jump_is_told_once_at_its_second_field(rng: np.random.Generator) -> No
     for k in range(203, 300):
         fields[k] += WEAK_UT
     assert told_jumps(fields) == [204]
+
+
+def test_what_changes_while_the_imu_is_silent_is_no_jump(rng: np.random.Generator) -> None:
+    fields = noisy(300, rng)
+    for k in range(203, 300):
+        fields[k] += WEAK_UT
+    assert told_jumps(fields, unseen_s=20.39) == []
 
 
 def test_noise_and_one_odd_field_are_no_jump(rng: np.random.Generator) -> None:

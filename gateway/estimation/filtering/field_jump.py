@@ -34,6 +34,8 @@ class FieldJumpState(AlignmentState):
     """The field that the newest one is compared with."""
 
     time_s: float
+    sound_s: float
+    """For how long the IMU has been sound: what it did not see turns the frame."""
     jump_from_s: float
     jump_from_b: Annotated[FloatArray, (3,)]
     """As it was in body FRD, uT; all zeros before the first."""
@@ -62,7 +64,7 @@ def has_jumped(s: FieldJumpState, mag_b: Vec3) -> bool:
     """
     since_s, b, f = s.time_s - s.jump_from_s, s.jump_from_b, as_vec(s.jump_from_i)
     known = bool(b[0] or b[1] or b[2])
-    if not known or not 0.0 <= since_s <= STALE_S:
+    if not known or not 0.0 <= since_s <= min(STALE_S, s.sound_s):
         compare_from(s, mag_b)
         return False
     carried = rotate_inverse(as_quat(s.q_ib), f)
