@@ -95,7 +95,7 @@ def test_corrections_to_and_fro_say_nothing_of_the_bias(rng: np.random.Generator
     to_and_fro, one_way = BiasEvidenceState(), BiasEvidenceState()
     for s in (to_and_fro, one_way):
         s.bias_corrected, s.bias_corrected_var = np.zeros(3), np.zeros(3)
-        s.bias_watched_s = SETTLED_S
+        s.bias_watched_s = s.sound_s = SETTLED_S
     chance = 0
     for off in rng.normal(0.0, 1.0, 6000):
         note_bias_correction(to_and_fro, 0, off, 1e-4)

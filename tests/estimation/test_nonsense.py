@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gateway.estimation.alignment.gps_velocity import forget_way, is_zero_refuted
 from gateway.estimation.columns import (
     ACCEL,
     CLIPPED,
@@ -242,6 +243,32 @@ def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: s
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
     check_sane(flight, name, log)
+
+
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_zeros_that_the_fixes_refute_are_no_velocity(flight: Flight, name: str) -> None:
+    """As of a receiver that measures none, or a log that holds none."""
+    log = part(flight, 0.0, 120.0)
+    log.gps[:, GPS_VEL : GPS_VEL + 3] = 0.0
+    out, late = run(flight, name, log), log.imu_time_us > 60_000_000
+    counted = replace(flight, counts=late, q_nb=flight.q_nb[: len(out)])
+    scores = attitude_scores(counted, out[:, :4])
+    assert max(scores["heading"], scores["inclination"]) < 3.5
+
+
+def test_what_stands_may_tell_zeros(rng: np.random.Generator) -> None:
+    s = new_record(ComplementaryState)
+    forget_way(s)
+    zero, refuted = (0.0, 0.0, 0.0), []
+    for k in range(600):
+        north_m, east_m = 2.0 * rng.standard_normal(2)
+        if k >= 300:
+            north_m += 1.5 * (k - 300)
+        refuted.append(is_zero_refuted(s, 0.2 * k, (north_m, east_m, 0.0), zero))
+    assert not any(refuted[:300])
+    assert all(refuted[330:])
+    assert not is_zero_refuted(s, 120.0, zero, (0.1, 0.0, 0.0))
+    assert not is_zero_refuted(s, 120.2, zero, zero)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

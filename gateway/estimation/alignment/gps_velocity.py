@@ -13,6 +13,9 @@ BASELINE_S: Final = 0.9
 """Places closer together differ by their noise rather than by the way between."""
 MAX_BASELINE_S: Final = 2.5
 FASTEST_MPS: Final = 1000.0
+ZERO_S: Final = 3.0
+ZERO_MPS: Final = 2.0
+"""Fixes that go on for so long, so fast, belong to no aircraft that stands."""
 TOLD_NOISE_MPS: Final = 0.2
 WAY_NOISE_MPS: Final = 0.6
 """Noise of a velocity that is told, and of one made of two places."""
@@ -24,18 +27,56 @@ class WayState:
     way_s: float
     """When the aircraft was there; `NEVER_S` before the first fix."""
     way_from: Annotated[FloatArray, (3,)]
+    zero_s: float
+    """When a velocity of exactly zero was first told, or last compared; `NEVER_S` else."""
+    zero_from: Annotated[FloatArray, (3,)]
+    zero_moves: int
+    """1 while the fixes that tell it move on."""
 
 
 @compiled
 def forget_way(s: WayState) -> None:
     """Measure no way from a fix that was never there, or on another clock."""
-    s.way_s = NEVER_S
+    s.way_s = s.zero_s = NEVER_S
+    s.zero_moves = 0
 
 
 @compiled
 def is_velocity_told(vel: Vec3) -> bool:
     """Return whether a fix has a level velocity of its own."""
     return is_sound((vel[0], vel[1], 0.0), FASTEST_MPS)
+
+
+@compiled
+def is_zero_refuted(s: WayState, time_s: float, pos: Vec3, vel: Vec3) -> bool:
+    """Return whether a velocity of exactly zero is none; to be asked of each fix.
+
+    A receiver that measures no velocity, or a log without any, may tell zeros. What stands tells
+    them as well, but its fixes do not move on.
+
+    Parameters
+    ----------
+    s : WayState
+        Changed in place.
+    time_s : float
+        Of the fix.
+    pos : tuple of 3 floats
+        Its place, m.
+    vel : tuple of 3 floats
+        What it tells, m/s.
+    """
+    if vel[0] != 0.0 or vel[1] != 0.0 or vel[2] != 0.0:
+        s.zero_s, s.zero_moves = NEVER_S, 0
+        return False
+    dt, begin = time_s - s.zero_s, s.zero_from
+    if 0.0 <= dt < ZERO_S:
+        return s.zero_moves == 1
+    if s.zero_s != NEVER_S:
+        way_m = math.hypot(pos[0] - begin[0], pos[1] - begin[1])
+        s.zero_moves = 1 if way_m > ZERO_MPS * dt else 0
+    s.zero_s = time_s
+    write_vec(s.zero_from, pos)
+    return s.zero_moves == 1
 
 
 @compiled

@@ -33,6 +33,8 @@ SETTLED_S: Final = 20.0
 class BiasEvidenceState:
     """What the bias was corrected by of late, along the body's axes."""
 
+    sound_s: float
+    """For how long the IMU has been sound: a turn that it did not see is none of the bias."""
     bias_corrected: Annotated[FloatArray, (3,)]
     """Sum of the corrections, rad/s; it fades."""
     bias_corrected_var: Annotated[FloatArray, (3,)]
@@ -71,7 +73,7 @@ def unexpected_bias_density(s: BiasEvidenceState, k: int) -> float:
 def watch_bias_corrections(s: BiasEvidenceState, known: bool, dt: float) -> None:
     """Let the sums fade; they begin anew while the errors that correct the bias are not `known`."""
     s.bias_watched_s = min(s.bias_watched_s + dt, SETTLED_S) if known else 0.0
-    if s.bias_watched_s < SETTLED_S:
+    if min(s.bias_watched_s, s.sound_s) < SETTLED_S:
         fill(s.bias_corrected, 0.0)
         fill(s.bias_corrected_var, 0.0)
         return

@@ -5,7 +5,7 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.gps_latency import watch_latency
-from gateway.estimation.alignment.gps_velocity import FASTEST_MPS
+from gateway.estimation.alignment.gps_velocity import FASTEST_MPS, is_zero_refuted
 from gateway.estimation.alignment.review import MOVING_MPS
 from gateway.estimation.alignment.wahba import align_by_velocity
 from gateway.estimation.columns import GPS_DECLINATION, GPS_DIP, GPS_LAT, GPS_LON, GPS_USABLE
@@ -15,7 +15,7 @@ from gateway.estimation.history import recall
 from gateway.estimation.kernel_record import FloatArray, as_vec
 from gateway.estimation.local_position import NEVER_S, fix_position, fix_velocity, move_origin
 from gateway.estimation.sensor_faults import is_sound
-from gateway.records import Vec3
+from gateway.records import UNKNOWN_VEC3, Vec3
 
 STANDING_MPS: Final = 0.1
 """A receiver that stands tells up to this speed."""
@@ -72,7 +72,8 @@ def look_back(s: FilterState, time_s: float) -> float:
 def place_fix(s: FilterState, row: FloatArray) -> tuple[Vec3, Vec3]:
     """Return place, metres from the origin, and velocity of a fix; the first sets the origin."""
     move_origin(s, row[GPS_LAT], row[GPS_LON])
-    return (fix_position(s, row), fix_velocity(row))
+    pos, vel = fix_position(s, row), fix_velocity(row)
+    return (pos, UNKNOWN_VEC3 if is_zero_refuted(s, s.time_s, pos, vel) else vel)
 
 
 @compiled
