@@ -14,6 +14,7 @@ from gateway.estimation.columns import (
     IMU_COLUMNS,
     MAG,
     NAV_ATTITUDE_STD,
+    UNCALIBRATED,
 )
 from tests.estimation.test_receiver_noise import FIELD_N_UT
 from tests.estimation.test_without_compass import (
@@ -73,6 +74,27 @@ def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure(
     errors, std = errors_beside_iron(name, IRON_UT, fixes=True)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < most_deg
     assert np.mean(errors < 2.0 * std) > least_share
+
+
+@pytest.mark.parametrize("iron_ut", [(15.0, 15.0, 15.0), (-10.0, 12.0, 18.0)])
+def test_iron_as_strong_as_the_level_field_is_told_as_unsure(
+    iron_ut: tuple[float, float, float],
+) -> None:
+    """It turns the heading by no straight line of its strength."""
+    off, told = [], []
+    settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
+    for seed in SEEDS:
+        log, heading = flight(seed, "good")
+        imu = np.empty((len(log.imu), IMU_COLUMNS))
+        imu[:] = log.imu
+        imu[:, MAG : MAG + 3] = field_of(seed, heading, 0.0) + iron_ut
+        imu[:, UNCALIBRATED] = 1.0
+        out = estimator_of("eskf").run(replace(log, imu=imu))
+        off.append(heading_off(out, heading)[settled:])
+        told.append(out[settled:, NAV_ATTITUDE_STD + 2])
+    errors, std = np.concatenate(off), np.concatenate(told)
+    assert np.degrees(np.sqrt(np.mean(errors**2))) < 5.0
+    assert np.mean(errors < 2.0 * std) > 0.82
 
 
 def flown_with(

@@ -62,6 +62,25 @@ def compass_row(s: EskfState, field_n: Vec3) -> None:
 
 
 @compiled
+def bent_var(s: EskfState) -> float:
+    """Return by how much iron may turn the heading beyond what the row in `h` tells, rad2.
+
+    As strong as the Earth's level field, it turns it by an angle that is no straight line of it:
+    the second-order term of the extended filter [1]_, half the square of the first.
+
+    References
+    ----------
+    .. [1] Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+       Navigation", 2001, section 10.3.2.
+    """
+    turned_sq = 0.0
+    for k in range(MAG_BIAS, MAG_BIAS + 3):
+        for j in range(MAG_BIAS, MAG_BIAS + 3):
+            turned_sq += s.h[k] * s.P[k, j] * s.h[j]
+    return 0.5 * turned_sq * turned_sq
+
+
+@compiled
 def compass_correlation_s(s: EskfState) -> float:
     """Return for how long the errors of the compass are alike, s."""
     unaided = s.aided == 0 and s.iron_search_started == 1
@@ -91,7 +110,7 @@ def update_by_compass(
     level_sq = field_n[0] * field_n[0] + field_n[1] * field_n[1]
     lasting = max(1.0, MISFIT_S / dt) * unexplained_iron_sq(s) / level_sq
     steep = steepness(math.atan2(field_n[2], math.sqrt(level_sq)))
-    noise = repeated * steep * p.mag_var / weight + lasting
+    noise = repeated * (steep * p.mag_var / weight + bent_var(s)) + lasting
     off = wrap_pi(measured)
     # What is off beyond the gate lasts as long as any error of the compass.
     explained = innovation_variance(s, noise)
