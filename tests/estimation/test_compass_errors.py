@@ -48,8 +48,13 @@ def field_of(seed: int, heading: np.ndarray, iron_ut: float) -> np.ndarray:
     return np.asarray(field)
 
 
-def errors_beside_iron(name: str, iron_ut: float, *, fixes: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Tell how far headings are off beside iron, and what they are told to be, rad."""
+def errors_beside_iron(
+    name: str, iron_ut: float, *, fixes: bool, found_ut: tuple[float, ...] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tell how far headings are off beside iron, and what they are told to be, rad.
+
+    `found_ut` is iron that no calibration has taken out.
+    """
     off, told = [], []
     settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
     for seed in SEEDS:
@@ -57,6 +62,9 @@ def errors_beside_iron(name: str, iron_ut: float, *, fixes: bool) -> tuple[np.nd
         imu = np.empty((len(log.imu), IMU_COLUMNS))
         imu[:] = log.imu
         imu[:, MAG : MAG + 3] = field_of(seed, heading, iron_ut)
+        if found_ut is not None:
+            imu[:, MAG : MAG + 3] += found_ut
+            imu[:, UNCALIBRATED] = 1.0
         count = len(log.gps) if fixes else 0
         log = replace(log, imu=imu, gps_time_us=log.gps_time_us[:count], gps=log.gps[:count])
         out = estimator_of(name).run(log)
@@ -81,18 +89,7 @@ def test_iron_as_strong_as_the_level_field_is_told_as_unsure(
     iron_ut: tuple[float, float, float],
 ) -> None:
     """It turns the heading by no straight line of its strength."""
-    off, told = [], []
-    settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
-    for seed in SEEDS:
-        log, heading = flight(seed, "good")
-        imu = np.empty((len(log.imu), IMU_COLUMNS))
-        imu[:] = log.imu
-        imu[:, MAG : MAG + 3] = field_of(seed, heading, 0.0) + iron_ut
-        imu[:, UNCALIBRATED] = 1.0
-        out = estimator_of("eskf").run(replace(log, imu=imu))
-        off.append(heading_off(out, heading)[settled:])
-        told.append(out[settled:, NAV_ATTITUDE_STD + 2])
-    errors, std = np.concatenate(off), np.concatenate(told)
+    errors, std = errors_beside_iron("eskf", 0.0, fixes=True, found_ut=iron_ut)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < 5.0
     assert np.mean(errors < 2.0 * std) > 0.82
 
