@@ -49,22 +49,28 @@ def field_of(seed: int, heading: np.ndarray, iron_ut: float) -> np.ndarray:
 
 
 def errors_beside_iron(
-    name: str, iron_ut: float, *, fixes: bool, found_ut: tuple[float, ...] | None = None
+    name: str,
+    iron_ut: float,
+    *,
+    fixes: bool = True,
+    added: Callable[[np.ndarray], np.ndarray] | None = None,
+    calibrated: bool = True,
+    since_s: float = STANDS_S + SETTLED_S,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tell how far headings are off beside iron, and what they are told to be, rad.
 
-    `found_ut` is iron that no calibration has taken out.
+    `added` tells more iron, by the time.
     """
     off, told = [], []
-    settled = round((STANDS_S + SETTLED_S) * RATE_HZ)
+    settled = round(since_s * RATE_HZ)
     for seed in SEEDS:
         log, heading = flight(seed, "good")
         imu = np.empty((len(log.imu), IMU_COLUMNS))
         imu[:] = log.imu
         imu[:, MAG : MAG + 3] = field_of(seed, heading, iron_ut)
-        if found_ut is not None:
-            imu[:, MAG : MAG + 3] += found_ut
-            imu[:, UNCALIBRATED] = 1.0
+        if added is not None:
+            imu[:, MAG : MAG + 3] += added(log.imu_time_us * 1e-6)
+        imu[:, UNCALIBRATED] = not calibrated
         count = len(log.gps) if fixes else 0
         log = replace(log, imu=imu, gps_time_us=log.gps_time_us[:count], gps=log.gps[:count])
         out = estimator_of(name).run(log)
@@ -79,7 +85,7 @@ def errors_beside_iron(
 def test_a_heading_beside_iron_comes_from_motion_and_is_told_as_unsure(
     name: str, most_deg: float, least_share: float
 ) -> None:
-    errors, std = errors_beside_iron(name, IRON_UT, fixes=True)
+    errors, std = errors_beside_iron(name, IRON_UT)
     assert np.degrees(np.sqrt(np.mean(errors**2))) < most_deg
     assert np.mean(errors < 2.0 * std) > least_share
 
@@ -89,7 +95,9 @@ def test_iron_as_strong_as_the_level_field_is_told_as_unsure(
     iron_ut: tuple[float, float, float],
 ) -> None:
     """It turns the heading by no straight line of its strength."""
-    errors, std = errors_beside_iron("eskf", 0.0, fixes=True, found_ut=iron_ut)
+    errors, std = errors_beside_iron(
+        "eskf", 0.0, added=lambda _: np.array(iron_ut), calibrated=False
+    )
     assert np.degrees(np.sqrt(np.mean(errors**2))) < 5.0
     assert np.mean(errors < 2.0 * std) > 0.82
 

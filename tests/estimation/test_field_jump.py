@@ -1,26 +1,17 @@
 """A compass beside which iron comes, or a current is switched on, in flight."""
 
-import math
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cache
-
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import IMU_COLUMNS, MAG, NAV_ATTITUDE_STD
 from gateway.estimation.filtering.field_jump import FieldJumpState, has_jumped
 from gateway.geometry.quaternion import from_rotation_vector, rotate_inverse
 from gateway.records import Vec3
-from tests.estimation.test_compass_errors import field_of
+from tests.estimation.test_compass_errors import errors_beside_iron
 from tests.estimation.test_receiver_noise import FIELD_N_UT
-from tests.estimation.test_without_compass import RATE_HZ, SEEDS, estimator_of, flight, heading_off
 
 STRONG_UT = np.array([25.0, -20.0, 10.0])
 WEAK_UT = np.array([9.0, -9.0, 6.0])
 COMES_S, GOES_S = 80.0, 100.0
-
-Added = Callable[[np.ndarray], np.ndarray]
 
 
 def passes(time_s: np.ndarray) -> np.ndarray:
@@ -34,30 +25,12 @@ def stays(time_s: np.ndarray) -> np.ndarray:
     return np.outer(time_s > COMES_S, WEAK_UT)
 
 
-@cache
-def heading_since(name: str, added: Added) -> tuple[float, float]:
-    """Tell how far the heading is off from then on, deg rms, and its share within two sigma."""
-    off, told = [], []
-    since = round(COMES_S * RATE_HZ)
-    for seed in SEEDS:
-        log, heading = flight(seed, "good")
-        imu = np.empty((len(log.imu), IMU_COLUMNS))
-        imu[:] = log.imu
-        field = field_of(seed, heading, 0.0)
-        imu[:, MAG : MAG + 3] = field + added(log.imu_time_us * 1e-6)
-        out = estimator_of(name).run(replace(log, imu=imu))
-        off.append(heading_off(out, heading)[since:])
-        told.append(out[since:, NAV_ATTITUDE_STD + 2])
-    errors, std = np.concatenate(off), np.concatenate(told)
-    return math.degrees(math.sqrt(np.mean(errors**2))), float(np.mean(errors < 2.0 * std))
-
-
 @pytest.mark.parametrize(("name", "passes_deg"), [("complementary", 3.5), ("eskf", 1.5)])
 def test_a_heading_is_kept_where_the_field_jumps(name: str, passes_deg: float) -> None:
     for added, most_deg in ((passes, passes_deg), (stays, 1.6)):
-        off_deg, within = heading_since(name, added)
-        assert off_deg < most_deg
-        assert within > 0.95
+        errors, std = errors_beside_iron(name, 0.0, added=added, since_s=COMES_S)
+        assert np.degrees(np.sqrt(np.mean(errors**2))) < most_deg
+        assert np.mean(errors < 2.0 * std) > 0.95
 
 
 def told_jumps(

@@ -51,7 +51,7 @@ MOST_HALF_SPAN: Final = 3
 LEAST_RISE: Final = 16.0
 """By how much the logarithm of the likelihood, twice, has to fall from the best to these."""
 CERTAIN: Final = 1e30
-"""Information in 1/s2 that no manoeuvre adds to."""
+"""Information in 1/s2 that no manoeuvre outweighs."""
 SLEW: Final = 0.01
 """Seconds by which the latency in use changes in a second, so that no fix seems to jump."""
 NEWTON_STEPS: Final = 12
@@ -95,7 +95,6 @@ def begin_latency(s: LatencyState, latency_s: float) -> None:
 def begin_certain(s: LatencyState, latency_s: float) -> None:
     """Begin with a latency that is known: no manoeuvre contradicts it."""
     begin_latency(s, latency_s)
-    s.found_latency_s, s.found_information = latency_s, CERTAIN
     for k in range(LAGS):
         s.lag_misfit[k] = CERTAIN * (lag_of(k) - latency_s) ** 2
 

@@ -19,8 +19,8 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.carried_iron import (
+    doubt_iron_anew,
     look_for_iron,
-    renew_iron,
     tells_heading,
 )
 from gateway.estimation.complementary.errors.compass_error import note_dip, note_field
@@ -98,8 +98,8 @@ def take_mag(s: ComplementaryState, p: ComplementaryGains, mag_b: Vec3) -> None:
     north, east, down = field
     norm = math.sqrt(north * north + east * east + down * down)
     upright = not tells_heading(field)
-    if has_jumped(s, mag_b) and s.level_by_gps == 1:
-        renew_iron(s, p)
+    if has_jumped(s, mag_b):
+        doubt_iron_anew(s, p)
     if norm > MIN_FIELD_UT and dt > 0.0:
         note_field(s, own_b, norm, dt)
         if is_likely(norm, s.strength_ut) and not upright:

@@ -83,8 +83,7 @@ def propagate(s: EskfState, p: EskfGains) -> None:
         s.wander_n[k] *= kept
     s.P[BARO_BIAS, BARO_BIAS] += p.baro_density * dt
     limit_variance(s.P, TILT + 2, NO_HEADING_VAR)
-    known = s.heading_known == 1 and s.aided == 1
-    watch_bias_corrections(s, known, dt)
+    watch_bias_corrections(s, s.heading_known == 1 and s.aided == 1, dt)
     s.pending_s = 0.0
     fill(s.pending_force_n, 0.0)
     for k in range(3):

@@ -15,11 +15,11 @@ from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, GYRO_BIAS, VEL, EskfState
 from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.iron import (
+    doubt_iron_anew,
     doubt_standing_field,
     follow_field,
     look_for_iron,
     note_calibration,
-    renew_iron,
     update_by_dip,
 )
 from gateway.estimation.eskf.measure import (
@@ -328,7 +328,7 @@ def take_mag(s: EskfState, p: EskfGains, mag_b: Vec3) -> None:
     if s.lost == 1:
         return
     if has_jumped(s, mag_b):
-        renew_iron(s, p)
+        doubt_iron_anew(s, p)
     look_for_iron(s, p, mag_b, s.time_s - s.mag_s)
     field = rotate(as_quat(s.q_nb), present)
     level = math.hypot(field[0], field[1])

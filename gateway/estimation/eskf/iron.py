@@ -186,7 +186,7 @@ def doubt_iron(s: EskfState, variance: float) -> None:
 
 
 @compiled
-def renew_iron(s: EskfState, p: EskfGains) -> None:
+def doubt_iron_anew(s: EskfState, p: EskfGains) -> None:
     """Be unsure of the iron by what the field has just jumped by: the heading has none of it."""
     if s.aided == 0 or s.iron_search_started == 0:
         return

@@ -124,8 +124,10 @@ def doubt_iron(s: ComplementaryState, p: ComplementaryGains, variance: float) ->
 
 
 @compiled
-def renew_iron(s: ComplementaryState, p: ComplementaryGains) -> None:
+def doubt_iron_anew(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Be unsure of the iron by what the field has just jumped by: the heading has none of it."""
+    if s.level_by_gps == 0:
+        return
     carry_drift(s, p)
     x, y, z = as_vec(s.jump_b)
     for k in range(3):
