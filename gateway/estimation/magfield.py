@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 from gateway.compiled import compiled
 from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
+from gateway.estimation.rest import UNTURNED_RAD
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG
@@ -89,6 +90,7 @@ class FieldState:
     at_rest: int
     bias_shown: int
     turn_s: float
+    spun_rad: float
     """See `RestState`."""
     mag_s: float
     """Time of the last sample that told a field."""
@@ -191,10 +193,10 @@ def compare_turn(s: FieldState, mag_b: Vec3) -> None:
     if norm_sq == 0.0:
         return
     if changed_sq > STILL_SHARE * expected_sq:
-        s.turn_s = 0.0
+        s.turn_s = s.spun_rad = 0.0
     else:
         # The gyroscope alone says that it turns: its bias may be any by now.
-        s.bias_shown = 0
+        s.bias_shown, s.spun_rad = 0, UNTURNED_RAD
     if s.mag_changed_ut2 == 0.0:
         # Until turns of a radian or so have shown otherwise, it is a compass.
         s.mag_changed_ut2 = norm_sq

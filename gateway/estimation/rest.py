@@ -9,11 +9,6 @@ from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
-BIAS_CHANGE_RADPS: Final = 0.15 * RAD_PER_DEG
-"""What a gyroscope's bias may change by between rest and flight, by heat and vibration."""
-LEAST_CHANGE_RADPS: Final = 0.05 * RAD_PER_DEG
-LEAST_MOTION_S: Final = 20.0
-"""A bias is that of a motion which lasted so long."""
 REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
 SHAKEN: Final = 5.0
@@ -27,6 +22,12 @@ LEAN_SQ: Final = 0.1
 """Square of how far, as a share, the axis of such a turn leans from the mean force."""
 LONGEST_TURN_S: Final = 40.0
 """What seems to turn for longer is a bias that has changed, unless the compass turns too."""
+USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
+"""A steady rate beyond this is more often a turn than a bias."""
+UNTURNED_RAD: Final = 1.0
+"""What has seemed to turn by so much while the compass has not has not turned."""
+REST_FORCE_SHARE: Final = 0.2
+"""By so much of gravity the force of a rest may seem to be off it."""
 LEAN_RAD: Final = 2.0 * RAD_PER_DEG
 """So far the rate must seem to have turned the level before it is asked whether it has."""
 PUSH_MPS2: Final = 0.3
@@ -58,8 +59,15 @@ class RestSettings(Settings, frozen=True):
         float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
     ] = 0.7
     bias_limit_degps: Annotated[
-        float, setting("No gyroscope bias is larger than this.", "deg/s", ge=0.1, le=30.0)
-    ] = 6.0
+        float,
+        setting(
+            "No gyroscope bias is larger than this; an MPU6050 that nobody has calibrated may "
+            "have 20.",
+            "deg/s",
+            ge=0.1,
+            le=30.0,
+        ),
+    ] = 20.0
 
 
 class RestGains:
@@ -102,6 +110,12 @@ class RestState:
     """1 once the force has not turned along: the bias is another now, and the level is wrong."""
     bias_shown: int
     """1 once a rest has shown the bias: before, it may be any."""
+    shown_bias_b: Annotated[FloatArray, (3,)]
+    """What it has shown, rad/s; zeros before."""
+    spins: int
+    """1 while a seeming rest turns faster than by a usual bias: nothing has judged it yet."""
+    spun_rad: float
+    """What it seems to turn by about the vertical, since the compass last turned too."""
     gyro_lp: Annotated[FloatArray, (3,)]
     gyro_rest: Annotated[FloatArray, (3,)]
     """Behind `gyro_lp`: still the bias when a slow start of motion is noticed."""
@@ -164,11 +178,55 @@ def watch_rest(
         and accel_sq < p.rest_accel_mps2**2
         and largest < p.bias_limit_radps
     )
+    usual = is_usual_bias(s, as_vec(s.gyro_lp))
+    still = still and (usual or s.bias_shown == 0)
     s.still = 1 if still else 0
-    s.rest_s = s.rest_s + dt if still and not moving else 0.0
+    rests, upright = still and not moving, abs(upright_rate(s))
+    s.spun_rad = s.spun_rad + upright * dt if rests else 0.0
+    s.spins = 1 if rests and not usual else 0
+    rests = rests and (s.spins == 0 or has_not_turned(s, upright))
+    s.rest_s = s.rest_s + dt if rests else 0.0
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
     if s.at_rest == 1:
         s.bias_shown = 1
+        write_vec(s.shown_bias_b, as_vec(s.gyro_rest))
+
+
+@compiled
+def upright_rate(s: RestState) -> float:
+    """Return the mean rate about the mean force, beyond the bias that has shown itself, rad/s."""
+    along, norm_sq = 0.0, 0.0
+    for k in range(3):
+        along += (s.gyro_lp[k] - s.shown_bias_b[k]) * s.accel_lp[k]
+        norm_sq += s.accel_lp[k] ** 2
+    return along / math.sqrt(norm_sq) if norm_sq > 0.0 else 0.0
+
+
+@compiled
+def is_usual_bias(s: RestState, rate: Vec3) -> bool:
+    """Return whether a rate in body FRD, rad/s, is close to the bias that has shown itself."""
+    return largest_difference(rate, as_vec(s.shown_bias_b)) < USUAL_BIAS_RADPS
+
+
+@compiled
+def has_not_turned(s: RestState, upright_radps: float) -> bool:
+    """Return whether what seems to turn fast has turned nothing, so that the rate is a bias.
+
+    About a level axis it would have turned the force, which stands still and is that of a rest.
+    About the vertical it would have turned the field; without a compass, what does not end is
+    believed.
+
+    Parameters
+    ----------
+    s : RestState
+        What has been seen.
+    upright_radps : float
+        Size of the rate about the vertical.
+    """
+    x, y, z = as_vec(s.accel_lp)
+    force = math.sqrt(x * x + y * y + z * z) / STANDARD_GRAVITY_MPS2
+    told = s.spun_rad > UNTURNED_RAD or upright_radps < USUAL_BIAS_RADPS
+    return told and abs(force - 1.0) < REST_FORCE_SHARE
 
 
 @compiled
@@ -234,7 +292,8 @@ def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float, dt: float) -> bo
     turns = s.bias_shown == 1 and upright_sq > most_sq and not leans
     s.turn_s = s.turn_s + dt if turns else 0.0
     leans = lean_sq > max(SLOW_TURN_RADPS**2, LEAN_SQ * upright_sq)
-    leans = s.bias_shown == 1 and leans and not is_banked_turn(lean_sq, upright_sq, norm)
+    known = s.bias_shown == 1 or lean_sq > USUAL_BIAS_RADPS**2
+    leans = known and leans and not is_banked_turn(lean_sq, upright_sq, norm)
     watch_lean(s, lean, up, leans, dt)
     return bool(turns and s.turn_s < LONGEST_TURN_S and s.bias_jumped == 0)
 
@@ -289,50 +348,6 @@ def watch_lean(s: RestState, lean: Vec3, up: Vec3, leans: bool, dt: float) -> No
     if s.bias_jumped == 0:
         fill(s.lean_b, 0.0)
         write_vec(s.lean_force_b, up)
-
-
-@compiled
-def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: float) -> float:
-    """Return how firmly a bias that was learned at rest may be believed in flight, or reversed.
-
-    Parameters
-    ----------
-    s : RestState
-        Changed in place.
-    bias_b : tuple of 3 floats
-        The estimator's, rad/s.
-    rested : bool
-        Whether it rested until the newest sample.
-    moving : bool
-        What GPS or dead reckoning says.
-    dt : float
-        Time step, s.
-
-    Returns
-    -------
-    float
-        Standard deviation in rad/s at the start of a motion: what the bias has changed by from
-        motion to rest before, or may change by where that is not known. At the start of a rest: by
-        how much the rate differs from the bias of the motion. 0 at other times.
-    """
-    if s.at_rest == 1:
-        change = 0.0
-        if not rested and s.flown_s > LEAST_MOTION_S:
-            s.flown_known = 1
-            write_vec(s.flown_bias_b, bias_b)
-            change = largest_difference(bias_b, as_vec(s.gyro_rest))
-        s.flown_s, s.bias_of_rest = 0.0, 1
-        return change
-    if not moving:
-        return 0.0
-    s.flown_s += dt
-    if s.bias_of_rest == 0:
-        return 0.0
-    s.bias_of_rest = 0
-    if s.flown_known == 0:
-        return BIAS_CHANGE_RADPS
-    change = largest_difference(bias_b, as_vec(s.flown_bias_b))
-    return min(max(change, LEAST_CHANGE_RADPS), BIAS_CHANGE_RADPS)
 
 
 @compiled

@@ -25,7 +25,7 @@ FOUND_LEVEL_RAD: Final = 0.08
 FOUND_HEADING_RAD: Final = 0.2
 """Up to these standard deviations an alignment is taken for the attitude, or contradicts it."""
 PATIENCE_S: Final = 8.0
-"""What pulls for longer is taken for gravity, where nothing else is told."""
+"""What pulls for longer is taken for gravity, where nothing else is told, and what spins turns."""
 PULLED_MPS2: Final = 1.0
 DOUBT_LEVEL_RAD: Final = 0.14
 DOUBT_HEADING_RAD: Final = 0.3
@@ -58,6 +58,8 @@ class ReviewState(AlignmentState):
     doubt_s: float
     """For how long the alignment has contradicted the attitude."""
     heading_known: int
+    spins: int
+    """See `RestState`."""
     found_q_nb: Annotated[FloatArray, (4,)]
     level_std: float
     heading_std: float
@@ -152,8 +154,8 @@ def is_to_be_taken(
         s.lost_s += dt
         # Of a motion that does not end, a worse level in time is better than none.
         level_found = s.level_std < FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S)
-        pulled = s.by_gps == 0 and s.pull_mps2 > PULLED_MPS2
-        return level_found and not (pulled and s.lost_s < PATIENCE_S)
+        unlikely = s.spins == 1 or (s.by_gps == 0 and s.pull_mps2 > PULLED_MPS2)
+        return level_found and not (unlikely and s.lost_s < PATIENCE_S)
     doubted = is_contradicted(s, q_nb, level_told, heading_told)
     s.doubt_s = s.doubt_s + dt if doubted else 0.0
     return s.doubt_s > (DOUBT_S if s.by_gps == 1 else DOUBT_GRAVITY_S)

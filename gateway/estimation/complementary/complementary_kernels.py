@@ -40,6 +40,7 @@ from gateway.estimation.complementary.navigation import (
 )
 from gateway.estimation.complementary.reorientation import (
     lose_attitude,
+    take_rest_bias,
     watch_gravity,
 )
 from gateway.estimation.complementary.tilt import (
@@ -70,7 +71,8 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
-from gateway.estimation.rest import doubt_rest_bias, is_pushed, outruns, turns_steadily, watch_rest
+from gateway.estimation.rest import is_pushed, outruns, turns_steadily, watch_rest
+from gateway.estimation.rest_bias import doubt_rest_bias, has_spun
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -158,7 +160,7 @@ def take_imu(
         if dt < -GAP_S:
             forget_times(s)
         return
-    if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
+    if is_silent(s, gyro, accel, is_moving(s, p), dt):
         bridge_silence(s, p, gyro, accel, dt)
         write_attitude_std(s)
         return
@@ -215,10 +217,7 @@ def advance(
         accel = force_instead(s, level)
     since_fix = s.time_s - s.fix_s
     if sound_gyro and sound_accel:
-        rested, moving = s.at_rest == 1, is_moving(s, p)
-        turning = turns_steadily(s, as_vec(s.bias_b), bias_std(s), dt) and since_fix > FRESH_GPS_S
-        watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), dt)
-        raise_bias_variance(s, DOUBT * doubt_rest_bias(s, as_vec(s.bias_b), rested, moving, dt))
+        look_for_rest(s, p, gyro, accel, dt)
         watch_gravity(s, p)
     coasting = since_fix < p.coast_s and s.at_rest == 0 and is_under_way(s)
     by_gps = since_fix < FRESH_GPS_S or coasting
@@ -237,6 +236,19 @@ def advance(
         stand_still(s, dt)
     s.ring_count = remember(s.ring, s.ring_count, s.time_s, s.integrals)
     watch_accuracy(s, p)
+
+
+@compiled
+def look_for_rest(
+    s: ComplementaryState, p: ComplementaryGains, gyro: Vec3, accel: Vec3, dt: float
+) -> None:
+    """Look whether the aircraft stands, and what that says of the gyroscope's bias."""
+    moving, rested, bias_b = is_moving(s, p), s.at_rest == 1, as_vec(s.bias_b)
+    turning = turns_steadily(s, bias_b, bias_std(s), dt) and s.time_s - s.fix_s > FRESH_GPS_S
+    watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), dt)
+    raise_bias_variance(s, DOUBT * doubt_rest_bias(s, bias_b, rested, moving, dt))
+    if has_spun(s, bias_b):
+        take_rest_bias(s, p)
 
 
 @compiled
@@ -287,8 +299,11 @@ def is_moving(s: ComplementaryState, p: ComplementaryGains) -> bool:
     since_fix = s.time_s - s.fix_s
     if since_fix > DEAD_RECKONING_MAX_S:
         return False
+    fresh = since_fix <= FRESH_GPS_S
+    if fresh and s.bias_jumped == 1:
+        return math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
     unsure_sq = 0.0
-    if since_fix > FRESH_GPS_S:
+    if not fresh:
         unsure_sq = s.told_speed_mps[0] ** 2 + s.told_speed_mps[1] ** 2
     return outruns(math.hypot(s.vel_n[0], s.vel_n[1]), unsure_sq, p)
 

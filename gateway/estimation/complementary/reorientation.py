@@ -16,6 +16,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.drift import (
+    begin_state,
     doubt_sensors,
     end_level,
     forget_heading,
@@ -27,6 +28,8 @@ from gateway.estimation.complementary.tilt import LEVEL_STD_RAD, hold_level, ref
 from gateway.estimation.filtering.hidden_pull import forget_level
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.magfield import begin_turn
+from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import multiply, normalise
 
 
@@ -39,6 +42,17 @@ def lose_attitude(s: ComplementaryState, p: ComplementaryGains) -> None:
         end_level(s, p)
     begin_level(s)
     forget_heading(s, p)
+
+
+@compiled
+def take_rest_bias(s: ComplementaryState, p: ComplementaryGains) -> None:
+    """Begin anew with the bias that a rest has shown: the one before has turned the attitude."""
+    lose_attitude(s, p)
+    doubt_sensors(s, p)
+    for k in range(3):
+        s.bias_b[k] = s.gyro_rest[k]
+        begin_state(s, k, BIAS_CHANGE_RADPS * BIAS_CHANGE_RADPS)
+    begin_turn(s, (0.0, 0.0, 0.0))
 
 
 @compiled

@@ -32,6 +32,7 @@ from gateway.estimation.eskf.recovery import (
     check_rest,
     lose_attitude,
     raise_bias_variance,
+    take_rest_bias,
     watch_gravity,
 )
 from gateway.estimation.eskf.start import (
@@ -76,14 +77,13 @@ from gateway.estimation.magfield import (
     take_field,
 )
 from gateway.estimation.rest import (
-    BIAS_CHANGE_RADPS,
-    doubt_rest_bias,
     is_pushed,
     may_be_pushed,
     outruns,
     turns_steadily,
     watch_rest,
 )
+from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS, doubt_rest_bias, has_spun
 from gateway.estimation.sensor_faults import (
     check_sensors,
     clipped_squares,
@@ -132,7 +132,7 @@ def take_imu(
             bridge_gap(s, p, 1.0)
             forget_times(s)
         return
-    if is_silent(s, p, gyro, accel, is_moving(s, p), dt):
+    if is_silent(s, gyro, accel, is_moving(s, p), dt):
         bridge_silence(s, p, gyro, accel, dt)
         return
     sound = move(s, gyro, accel, row[CLIPPED], dt)
@@ -140,11 +140,7 @@ def take_imu(
         doubt_clipped(s, dt)
     if sound:
         check_rest(s, p, gyro, accel)
-        moving = is_moving(s, p)
-        rested = s.at_rest == 1
-        turning, pushed = is_turning(s, dt), is_pushed_on(s, dt)
-        watch_rest(s, p, gyro, accel, moving or turning or pushed, dt)
-        raise_bias_variance(s, doubt_rest_bias(s, as_vec(s.gyro_bias_b), rested, moving, dt))
+        look_for_rest(s, p, gyro, accel, dt)
         watch_gravity(s, p)
     if s.pending_s >= COVARIANCE_S:
         propagate(s, p)
@@ -156,6 +152,18 @@ def take_imu(
     elif s.mag_misplaced > misplaced:
         raise_bias_variance(s, BIAS_CHANGE_RADPS)
         lose_attitude(s, p)
+
+
+@compiled
+def look_for_rest(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Look whether the aircraft stands, and what that says of the gyroscope's bias."""
+    moving, rested = is_moving(s, p), s.at_rest == 1
+    turning, pushed = is_turning(s, dt), is_pushed_on(s, dt)
+    watch_rest(s, p, gyro, accel, moving or turning or pushed, dt)
+    bias_b = as_vec(s.gyro_bias_b)
+    raise_bias_variance(s, doubt_rest_bias(s, bias_b, rested, moving, dt))
+    if has_spun(s, bias_b):
+        take_rest_bias(s, p)
 
 
 @compiled
@@ -209,7 +217,7 @@ def is_moving(s: EskfState, p: EskfGains) -> bool:
     if s.aided == 0 and s.flies == 1 and may_be_pushed(s):
         return True
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
-    if s.aided == 0:
+    if s.aided == 0 or (fresh and s.bias_jumped == 1):
         return fresh and math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
     unsure_sq = 0.0 if fresh else s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1]
     return outruns(math.hypot(s.vel_n[0], s.vel_n[1]), unsure_sq, p)

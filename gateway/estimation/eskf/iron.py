@@ -202,16 +202,24 @@ def doubt_iron_anew(s: EskfState, p: EskfGains) -> None:
 def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
     """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
     if s.mag_uncalibrated == 1 and not uncalibrated:
-        s.left_iron_ut = math.sqrt(p.mag_bias_var)
-        forget_strength(s)
-        if s.iron_search_started == 1:
-            propagate(s, p)
-            for k in range(3):
-                s.mag_bias_b[k] = 0.0
-                renew(s, MAG_BIAS + k, p.mag_bias_var)
+        s.left_iron_ut, s.mag_uncalibrated = math.sqrt(p.mag_bias_var), 0
+        forget_iron(s, p)
     if s.mag_uncalibrated == 0 and uncalibrated:
         s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
     s.mag_uncalibrated = 1 if uncalibrated else 0
+
+
+@compiled
+def forget_iron(s: EskfState, p: EskfGains) -> None:
+    """Know nothing of the iron that has been found, but that a calibration leaves little."""
+    forget_strength(s)
+    if s.iron_search_started == 0:
+        return
+    propagate(s, p)
+    left_ut = UNCALIBRATED_IRON_UT if s.mag_uncalibrated == 1 else 0.0
+    for k in range(3):
+        s.mag_bias_b[k] = 0.0
+        renew(s, MAG_BIAS + k, max(p.mag_bias_var, left_ut * left_ut))
 
 
 @compiled

@@ -15,9 +15,12 @@ from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, headi
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
+from gateway.estimation.eskf.iron import forget_iron
 from gateway.estimation.filtering.hidden_pull import forget_level
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
-from gateway.estimation.rest import BIAS_CHANGE_RADPS, SHAKEN
+from gateway.estimation.magfield import begin_turn
+from gateway.estimation.rest import SHAKEN
+from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS
 from gateway.geometry.quaternion import multiply, normalise
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -78,6 +81,17 @@ def lose_attitude(s: EskfState, p: EskfGains) -> None:
     if s.aided == 0:
         forget_level(s)
     begin_attitude(s, p, LOST_TILT_VAR, NO_HEADING_VAR)
+
+
+@compiled
+def take_rest_bias(s: EskfState, p: EskfGains) -> None:
+    """Begin anew with the bias that a rest has shown: the one before has turned the attitude."""
+    lose_attitude(s, p)
+    for k in range(3):
+        s.gyro_bias_b[k] = s.gyro_rest[k]
+        renew(s, GYRO_BIAS + k, BIAS_CHANGE_RADPS * BIAS_CHANGE_RADPS)
+    begin_turn(s, (0.0, 0.0, 0.0))
+    forget_iron(s, p)
 
 
 @compiled

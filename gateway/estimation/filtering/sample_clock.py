@@ -5,9 +5,10 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S
-from gateway.estimation.filtering.filter_state import FilterGains, FilterState
+from gateway.estimation.filtering.filter_state import FilterState
 from gateway.estimation.kernel_record import as_vec, write_vec
 from gateway.estimation.magfield import begin_turn
+from gateway.estimation.rest import is_usual_bias
 from gateway.estimation.sensor_faults import (
     ACCEL_LIMIT_MPS2,
     GYRO_LIMIT_RADPS,
@@ -182,17 +183,13 @@ def unseen_variances(
 
 
 @compiled
-def is_silent(
-    s: FilterState, p: FilterGains, gyro: Vec3, accel: Vec3, moving: bool, dt: float
-) -> bool:
+def is_silent(s: FilterState, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bool:
     """Return whether the IMU has told nothing new for too long; to be asked at each sample.
 
     Parameters
     ----------
     s : FilterState
         Changed in place: a silence may end, and sensors that hang are a fault.
-    p : FilterGains
-        Constants.
     gyro, accel : tuple of 3 floats
         Newest sample in body FRD.
     moving : bool
@@ -200,7 +197,7 @@ def is_silent(
     dt : float
         Time since the sample before, s.
     """
-    may_rest = is_sound(gyro, p.bias_limit_radps) and not moving
+    may_rest = is_usual_bias(s, gyro) and not moving
     # What fixes have lost in it, the sample at its end does not bring back.
     silent_s = dt if s.lost == 1 else s.gap_s
     hangs = silent_s <= GAP_S and is_hanging(s, gyro, accel, may_rest, dt)

@@ -43,7 +43,7 @@ from gateway.estimation.filtering.bias_evidence import (
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
 from gateway.estimation.kernel_record import as_quat
-from gateway.estimation.rest import BIAS_CHANGE_RADPS
+from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import rotate_inverse
 from gateway.units import RAD_PER_DEG

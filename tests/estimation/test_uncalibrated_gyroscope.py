@@ -1,0 +1,90 @@
+"""A gyroscope that nobody has calibrated: an MPU6050 may tell 20 deg/s of a turn at rest."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.estimation.columns import ACCEL, GYRO, IMU_COLUMNS, MAG, NAV_FLAGS
+from gateway.estimation.kernel import SampleLog
+from gateway.records import NavFlags
+from tests.estimation.samples import G, log_of
+from tests.estimation.test_steady_motion import FIELD_N_UT, TURN_RADPS
+from tests.estimation.test_without_compass import RATE_HZ, estimator_of
+from tools.flights import Flight, simulated_flight
+from tools.score_estimators import OWN
+
+BIASES_DEGPS = ((7.5, -2.0, 1.0), (-3.0, 12.0, -9.0), (2.0, 1.0, -17.0), (18.0, -16.0, 14.0))
+NAMES = ("complementary", "eskf")
+SEEDS = (41, 42)
+FOUND_S = 12.0
+"""At the latest, with or without a compass."""
+TURNS_S = 60.0
+
+
+@cache
+def flown(seed: int, *, fixes: bool, compass: bool) -> Flight:
+    flight = simulated_flight(seed, calibrated=True)
+    imu = flight.log.imu.copy()
+    if not compass:
+        imu[:, MAG : MAG + 3] = math.nan
+    flight = replace(flight, log=replace(flight.log, imu=imu))
+    return flight if fixes else flight.with_gps(np.zeros(len(flight.log.gps), bool))
+
+
+def errors(name: str, flight: Flight, bias_degps: tuple[float, ...]) -> np.ndarray:
+    """Tell tilt and heading off in deg, (n, 2); NaN where no attitude is told."""
+    imu = flight.log.imu.copy()
+    imu[:, GYRO : GYRO + 3] += np.radians(bias_degps)
+    out = OWN[name](replace(flight, log=replace(flight.log, imu=imu)))
+    off = np.full((len(out), 2), math.nan)
+    told = (out[:, NAV_FLAGS].astype(int) & NavFlags.ATTITUDE_VALID) != 0
+    true = Rotation.from_quat(flight.q_nb[told], scalar_first=True)
+    x, y, z = (true * Rotation.from_quat(out[told, :4], scalar_first=True).inv()).as_rotvec().T
+    off[told] = np.degrees(np.column_stack([np.hypot(x, y), np.abs(z)]))
+    return off
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bias_degps", BIASES_DEGPS)
+@pytest.mark.parametrize("fixes", [True, False])
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_found_at_rest(name: str, fixes: bool, bias_degps: tuple[float, ...]) -> None:
+    for seed in SEEDS:
+        flight = flown(seed, fixes=fixes, compass=True)
+        later = flight.log.imu_time_us > FOUND_S * 1e6
+        usual, off = (errors(name, flight, bias) for bias in ((0.0, 0.0, 0.0), bias_degps))
+        assert np.nanmax(off[~later, 0]) < 5.0, "told before it was found"
+        assert np.isfinite(off[later]).all()
+        rms, usual_rms = (np.sqrt(np.mean(x[later] ** 2, axis=0)) for x in (off, usual))
+        assert (rms < usual_rms + 1.5).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_found_without_a_compass(name: str) -> None:
+    off = errors(name, flown(SEEDS[0], fixes=False, compass=False), BIASES_DEGPS[2])
+    time_s = flown(SEEDS[0], fixes=False, compass=False).log.imu_time_us * 1e-6
+    stands = (time_s > FOUND_S - 1.0) & (time_s < FOUND_S)
+    assert off[stands, 0].max() < 1.0
+
+
+def turning(rate_radps: float) -> SampleLog:
+    """Roll round a circle on a smooth road from the first sample on, with a compass and no GPS."""
+    rng, n = np.random.default_rng(7), round(TURNS_S * RATE_HZ)
+    heading_rad = rate_radps * np.arange(n) / RATE_HZ
+    imu = np.zeros((n, IMU_COLUMNS))
+    imu[:, ACCEL : ACCEL + 3] = (0.0, 8.0 * rate_radps, -G) + rng.normal(0.0, 0.03, (n, 3))
+    imu[:, GYRO : GYRO + 3] = (0.0, 0.0, rate_radps) + rng.normal(0.0, 0.003, (n, 3))
+    back = Rotation.from_rotvec(np.outer(-heading_rad, [0.0, 0.0, 1.0]))
+    imu[:, MAG : MAG + 3] = back.apply(FIELD_N_UT) + rng.normal(0.0, 0.4, (n, 3))
+    return log_of(imu, RATE_HZ)
+
+
+@pytest.mark.parametrize("times", [2.5, -4.0, 6.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_turn_in_which_it_begins_is_none(name: str, times: float) -> None:
+    out = estimator_of(name).run(turning(times * TURN_RADPS))
+    assert not (out[:, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
