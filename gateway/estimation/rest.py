@@ -11,6 +11,11 @@ from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 REST_TAU_S: Final = 0.5
 """Time constant of the averages that rest is judged by."""
+REST_RATE_RADPS: Final = 0.5 * RAD_PER_DEG
+REST_FORCE_MPS2: Final = 0.35
+"""At rest mean rate and force stay this close to what they began with: 2 deg of a turn."""
+REST_DRIFT_S: Final = 10.0
+"""Time constant by which they may drift, as in a sensor that warms up."""
 SHAKEN: Final = 5.0
 """An engine that idles shakes the gyroscope by so many times more than rest without one."""
 STEADY: Final = 0.15
@@ -116,6 +121,9 @@ class RestState:
     """1 while a seeming rest turns faster than by a usual bias: nothing has judged it yet."""
     spun_rad: float
     """What it seems to turn by about the vertical, since the compass last turned too."""
+    rest_rate_b: Annotated[FloatArray, (3,)]
+    rest_force_b: Annotated[FloatArray, (3,)]
+    """Mean rate and force with which a seeming rest began; they follow slowly."""
     gyro_lp: Annotated[FloatArray, (3,)]
     gyro_rest: Annotated[FloatArray, (3,)]
     """Behind `gyro_lp`: still the bias when a slow start of motion is noticed."""
@@ -138,6 +146,14 @@ def outruns(speed_mps: float, unsure_sq: float, p: RestGains) -> bool:
     its speed: one standard deviation is enough to go on.
     """
     return speed_mps > p.rest_speed_mps + math.sqrt(unsure_sq)
+
+
+@compiled
+def begin_rest(s: RestState, gyro: Vec3, accel: Vec3) -> None:
+    """Begin the means at a first sample."""
+    write_vec(s.gyro_lp, gyro)
+    write_vec(s.gyro_rest, gyro)
+    write_vec(s.accel_lp, accel)
 
 
 @compiled
@@ -185,11 +201,27 @@ def watch_rest(
     s.spun_rad = s.spun_rad + upright * dt if rests else 0.0
     s.spins = 1 if rests and not usual else 0
     rests = rests and (s.spins == 0 or has_not_turned(s, upright))
-    s.rest_s = s.rest_s + dt if rests else 0.0
+    s.rest_s = s.rest_s + dt if stays(s, dt) and rests else 0.0
+    if s.rest_s == 0.0:
+        write_vec(s.rest_rate_b, as_vec(s.gyro_lp))
+        write_vec(s.rest_force_b, as_vec(s.accel_lp))
     s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
     if s.at_rest == 1:
         s.bias_shown = 1
         write_vec(s.shown_bias_b, as_vec(s.gyro_rest))
+
+
+@compiled
+def stays(s: RestState, dt: float) -> bool:
+    """Return whether mean rate and force are those with which a seeming rest began."""
+    rate_sq, force_sq, share = 0.0, 0.0, min(1.0, dt / REST_DRIFT_S)
+    for k in range(3):
+        rate_off, force_off = s.gyro_lp[k] - s.rest_rate_b[k], s.accel_lp[k] - s.rest_force_b[k]
+        rate_sq += rate_off * rate_off
+        force_sq += force_off * force_off
+        s.rest_rate_b[k] += share * rate_off
+        s.rest_force_b[k] += share * force_off
+    return bool(rate_sq < REST_RATE_RADPS**2 and force_sq < REST_FORCE_MPS2**2)
 
 
 @compiled

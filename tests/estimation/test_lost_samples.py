@@ -38,10 +38,10 @@ SLOW_HZ = 0.2
 GENTLE_HZ = 0.02
 
 
-def swinging(swing_hz: float = SWING_HZ) -> tuple[SampleLog, Rotation]:
+def swinging(swing_hz: float = SWING_HZ, stands_s: float = STANDS_S) -> tuple[SampleLog, Rotation]:
     """Swing about the forward axis to and fro, after a rest; each sample tells its own instant."""
     t = np.arange(0.0, SECONDS, 1.0 / RATE_HZ)
-    phase = 2.0 * math.pi * swing_hz * np.clip(t - STANDS_S, 0.0, None)
+    phase = 2.0 * math.pi * swing_hz * np.clip(t - stands_s, 0.0, None)
     roll = SWING_RAD * (1.0 - np.cos(phase)) / 2.0
     truth = Rotation.from_rotvec(np.outer(roll, [1.0, 0.0, 0.0]))
     imu = np.full((len(t), IMU_COLUMNS), math.nan)

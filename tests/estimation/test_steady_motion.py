@@ -19,6 +19,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.geometry.angle import wrap_pi
 from gateway.records import NavFlags
 from tests.estimation.samples import G, fix_rows, log_of
+from tests.estimation.test_lost_samples import swinging, tilt_errors_deg
 from tests.estimation.test_without_compass import FIXES_HZ, RATE_HZ, correlated, estimator_of
 
 FIELD_N_UT = (21.0, 0.0, 43.0)
@@ -168,3 +169,14 @@ def test_a_banked_circle_in_calm_air_is_no_rest(name: str, seed: int) -> None:
     banked = (time_s > STARTS_S + PACE_S + 2.0) & (time_s < STARTS_S + PACE_S + 6.0)
     assert not (out[banked, NAV_FLAGS].astype(int) & NavFlags.AT_REST).any()
     assert np.degrees(tilt_off(out[banked], attitudes[np.flatnonzero(banked)])).max() < 10.0
+
+
+@pytest.mark.parametrize("swing_hz", [0.02, 0.05])
+@pytest.mark.parametrize("name", ["complementary", "eskf"])
+def test_what_swings_slowly_does_not_rest(name: str, swing_hz: float) -> None:
+    """From the first sample on: the force and the rate turn on, if slowly, and the bias is none."""
+    log, truth = swinging(swing_hz, stands_s=0.0)
+    tilt_deg, valid = tilt_errors_deg(name, log, truth)
+    after = log.imu_time_us > 10e6
+    assert valid[after].all()
+    assert tilt_deg[after].max() < 1.0

@@ -76,8 +76,8 @@ def turning(rate_radps: float) -> SampleLog:
     rng, n = np.random.default_rng(7), round(TURNS_S * RATE_HZ)
     heading_rad = rate_radps * np.arange(n) / RATE_HZ
     imu = np.zeros((n, IMU_COLUMNS))
-    imu[:, ACCEL : ACCEL + 3] = (0.0, 8.0 * rate_radps, -G) + rng.normal(0.0, 0.03, (n, 3))
-    imu[:, GYRO : GYRO + 3] = (0.0, 0.0, rate_radps) + rng.normal(0.0, 0.003, (n, 3))
+    imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 8.0 * rate_radps, -G), 0.03, (n, 3))
+    imu[:, GYRO : GYRO + 3] = rng.normal((0.0, 0.0, rate_radps), 0.003, (n, 3))
     back = Rotation.from_rotvec(np.outer(-heading_rad, [0.0, 0.0, 1.0]))
     imu[:, MAG : MAG + 3] = back.apply(FIELD_N_UT) + rng.normal(0.0, 0.4, (n, 3))
     return log_of(imu, RATE_HZ)

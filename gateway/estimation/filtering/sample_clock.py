@@ -8,7 +8,7 @@ from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S
 from gateway.estimation.filtering.filter_state import FilterState
 from gateway.estimation.kernel_record import as_vec, write_vec
 from gateway.estimation.magfield import begin_turn
-from gateway.estimation.rest import is_usual_bias
+from gateway.estimation.rest import begin_rest, is_usual_bias
 from gateway.estimation.sensor_faults import (
     ACCEL_LIMIT_MPS2,
     GYRO_LIMIT_RADPS,
@@ -41,9 +41,7 @@ STEADY_S: Final = 1.0
 def begin_clock(s: FilterState, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Begin at a sound sample: the time, and the averages over samples."""
     s.started, s.base_us, s.time_us, s.time_s = 1, time_us, time_us, 0.0
-    write_vec(s.gyro_lp, gyro)
-    write_vec(s.gyro_rest, gyro)
-    write_vec(s.accel_lp, accel)
+    begin_rest(s, gyro, accel)
     write_vec(s.force_first_i, accel)
     write_vec(s.force_mean_i, accel)
     write_vec(s.rate_b, gyro)

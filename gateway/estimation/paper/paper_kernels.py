@@ -14,7 +14,7 @@ from gateway.compiled.entry_point import dispatched
 from gateway.estimation import flagbits
 from gateway.estimation.history import SLOTS, recall, remember
 from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, write_vec
-from gateway.estimation.rest import RestGains, RestState, watch_rest
+from gateway.estimation.rest import RestGains, RestState, begin_rest, watch_rest
 from gateway.estimation.sensor_faults import (
     HealthState,
     check_sensors,
@@ -262,6 +262,7 @@ def level_start(s: Memory, accel: Vec3, gyro: Vec3) -> Quat:
     """Begin with the accelerometer's tilt, facing north."""
     write_vec(s.accel_held, accel)
     write_vec(s.gyro_held, gyro)
+    begin_rest(s, gyro, accel)
     roll, pitch = tilt_of(accel)
     return from_euler(roll, pitch, 0.0)
 
