@@ -35,9 +35,10 @@ MAG: Final = 6
 """Magnetic field in body FRD, uT: three columns, NaN unless new."""
 CLIPPED: Final = 9
 """1 where a sensor touched the end of its range, else 0."""
-UNCALIBRATED: Final = 10
-"""1 where the compass was never calibrated, else 0."""
-IMU_COLUMNS: Final = 11
+MAG_UNCALIBRATED: Final = 10
+ACCEL_UNCALIBRATED: Final = 11
+"""1 where the compass, or the accelerometer, was never calibrated, else 0."""
+IMU_COLUMNS: Final = 12
 
 GPS_USABLE: Final = 0
 """1 for a fix that may be fused, else 0."""
@@ -69,7 +70,8 @@ NAV_FLAGS: Final = 22
 NAV_COLUMNS: Final = 23
 
 CLIP_FLAGS: Final = ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
-COMPASS_FLAG: Final = ImuFlags.MAG_UNCALIBRATED
+ROW_FLAGS: Final = (CLIP_FLAGS, ImuFlags.MAG_UNCALIBRATED, ImuFlags.ACCEL_UNCALIBRATED)
+"""A column each."""
 
 _flags_of = cache(NavFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
@@ -77,10 +79,9 @@ _flags_of = cache(NavFlags)
 
 def imu_row(sample: ImuSample) -> ImuRow:
     """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
-    clipped = 1.0 if sample.flags & CLIP_FLAGS else 0.0
-    uncalibrated = 1.0 if sample.flags & COMPASS_FLAG else 0.0
+    shown = [1.0 if sample.flags & bits else 0.0 for bits in ROW_FLAGS]
     mag = sample.mag_b_ut or UNKNOWN_VEC3
-    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, clipped, uncalibrated)
+    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, *shown)
 
 
 def imu_rows(
@@ -100,7 +101,7 @@ def imu_rows(
     ndarray, shape (n, IMU_COLUMNS)
         What `imu_row` gives for each.
     """
-    shown = [(flags & int(bits)) != 0 for bits in (CLIP_FLAGS, COMPASS_FLAG)]
+    shown = [(flags & int(bits)) != 0 for bits in ROW_FLAGS]
     return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
 

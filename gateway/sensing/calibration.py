@@ -56,7 +56,11 @@ class NodeCalibration(Settings, frozen=True):
         ),
     ] = FACE_UP
     accel_bias_mps2: Annotated[
-        tuple[_Accel, _Accel, _Accel], setting("Accelerometer bias in sensor axes.", "m/s2")
+        tuple[_Accel, _Accel, _Accel],
+        setting(
+            "Accelerometer bias in sensor axes; all zero if never calibrated.",
+            "m/s2",
+        ),
     ] = _NO_OFFSET
     accel_matrix: Annotated[
         _Rows, setting("Rows of the accelerometer's scale and misalignment matrix.")
@@ -109,6 +113,11 @@ class NodeCalibration(Settings, frozen=True):
     def knows_iron(self) -> bool:
         """Whether the compass was ever calibrated; every one has some hard iron."""
         return self.mag_hard_iron_ut != _NO_OFFSET
+
+    @property
+    def knows_accelerometer(self) -> bool:
+        """Whether the accelerometer was ever calibrated; every one has some bias."""
+        return self.accel_bias_mps2 != _NO_OFFSET
 
     def __post_init__(self) -> None:
         """Refuse matrices that are no rotations, or have no inverse."""

@@ -13,8 +13,8 @@ from gateway.estimation.columns import (
     GYRO,
     IMU_COLUMNS,
     MAG,
+    MAG_UNCALIBRATED,
     NAV_ATTITUDE_STD,
-    UNCALIBRATED,
 )
 from gateway.estimation.complementary.complementary_state import (
     COMPASS,
@@ -246,7 +246,7 @@ def test_a_compass_that_nobody_has_calibrated_is_found_out_by_driving(
     off, told = [], []
     for seed in range(6):
         log, heading = driven(seed)
-        log.imu[:, UNCALIBRATED] = marked
+        log.imu[:, MAG_UNCALIBRATED] = marked
         out = estimator_of(name).run(log)[round(LEARNED_S * RATE_HZ) :]
         off.append(heading_off(out, heading[-len(out) :]))
         told.append(out[:, NAV_ATTITUDE_STD + 2])
@@ -258,7 +258,7 @@ def test_a_compass_that_nobody_has_calibrated_is_found_out_by_driving(
 def test_iron_that_was_found_is_forgotten_once_the_compass_is_calibrated(name: str) -> None:
     log, heading = driven(0)
     calibrated = np.arange(len(heading)) >= round(DRIVES_S / 2 * RATE_HZ)
-    log.imu[:, UNCALIBRATED] = ~calibrated
+    log.imu[:, MAG_UNCALIBRATED] = ~calibrated
     log.imu[calibrated, MAG : MAG + 3] -= CAR_IRON_UT
     out = estimator_of(name).run(log)[calibrated]
     assert np.degrees(heading_off(out, heading[calibrated]).max()) < 5.0
@@ -268,7 +268,7 @@ def test_iron_that_was_found_is_forgotten_once_the_compass_is_calibrated(name: s
 def test_without_gps_a_compass_that_nobody_has_calibrated_is_told_as_unsure(name: str) -> None:
     for seed in range(6):
         log, heading = driven(seed)
-        log.imu[:, UNCALIBRATED] = 1.0
+        log.imu[:, MAG_UNCALIBRATED] = 1.0
         out = estimator_of(name).run(log_of(log.imu, RATE_HZ))[round(LEARNED_S * RATE_HZ) :]
         off = heading_off(out, heading[-len(out) :])
         assert np.mean(off < 2.0 * out[:, NAV_ATTITUDE_STD + 2]) > 0.9

@@ -13,8 +13,8 @@ from gateway.estimation.columns import (
     GPS_DIP,
     IMU_COLUMNS,
     MAG,
+    MAG_UNCALIBRATED,
     NAV_ATTITUDE_STD,
-    UNCALIBRATED,
 )
 from tests.estimation.test_receiver_noise import FIELD_N_UT
 from tests.estimation.test_without_compass import (
@@ -70,7 +70,7 @@ def errors_beside_iron(
         imu[:, MAG : MAG + 3] = field_of(seed, heading, iron_ut)
         if added is not None:
             imu[:, MAG : MAG + 3] += added(log.imu_time_us * 1e-6)
-        imu[:, UNCALIBRATED] = not calibrated
+        imu[:, MAG_UNCALIBRATED] = not calibrated
         count = len(log.gps) if fixes else 0
         log = replace(log, imu=imu, gps_time_us=log.gps_time_us[:count], gps=log.gps[:count])
         out = estimator_of(name).run(log)

@@ -37,10 +37,17 @@ def test_level_board_in_si_and_body_axes(chain: SensorChain) -> None:
     assert sample.temperature_degc == pytest.approx(36.53)
 
 
-def test_a_compass_without_a_calibration_is_marked(chain: SensorChain) -> None:
-    calibrated = SensorChain(SensingSettings(), NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)))
-    assert chain.imu(LEVEL).flags == ImuFlags.MAG_NEW | ImuFlags.MAG_UNCALIBRATED
-    assert calibrated.imu(LEVEL).flags == ImuFlags.MAG_NEW
+def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
+    compass, accelerometer = (
+        SensorChain(SensingSettings(), calibration).imu(LEVEL).flags ^ ImuFlags.MAG_NEW
+        for calibration in (
+            NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)),
+            NodeCalibration(accel_bias_mps2=(0.0, 0.1, 0.0)),
+        )
+    )
+    assert compass == ImuFlags.ACCEL_UNCALIBRATED
+    assert accelerometer == ImuFlags.MAG_UNCALIBRATED
+    assert chain.imu(LEVEL).flags == ImuFlags.MAG_NEW | compass | accelerometer
 
 
 @pytest.mark.parametrize(

@@ -245,14 +245,23 @@ def test_a_compass_with_wrong_axes_is_reported_once_with_what_to_do() -> None:
     ]
 
 
-def test_a_compass_that_was_never_calibrated_is_reported_until_it_is() -> None:
+@pytest.mark.parametrize(
+    ("flag", "sensor"),
+    [
+        (ImuFlags.MAG_UNCALIBRATED, "Compass"),
+        (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
+    ],
+)
+def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
+    flag: ImuFlags, sensor: str
+) -> None:
     vehicle, told = make(), []
     for time_us in range(0, 20 * ONE_S, ONE_S // 10):
-        flags = ImuFlags.MAG_UNCALIBRATED if time_us < 10 * ONE_S else ImuFlags(0)
+        flags = flag if time_us < 10 * ONE_S else ImuFlags(0)
         field = None if time_us % ONE_S else (20.0, 0.0, 43.0)
         sample = replace(sample_at(time_us), flags=flags, mag_b_ut=field)
         told += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
-    assert told == ["Compass not calibrated", "Compass calibrated"]
+    assert told == [f"{sensor} not calibrated", f"{sensor} calibrated"]
 
 
 def test_a_latency_that_stands_for_a_lost_fix_is_not_announced_yet() -> None:

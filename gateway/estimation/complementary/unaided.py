@@ -19,6 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.errors.drift import (
     ATTITUDE_WALK_RAD2PS,
+    FORCE_BIAS_MPS2,
     SCALE_SHARE,
     TURN_WALK_RAD,
     bias_std,
@@ -135,7 +136,8 @@ def unaided_pull_sq(s: ComplementaryState, drift_sq: float, dt: float) -> float:
     for k in range(2):
         s.unaided_pull[k] += dt / PULL_TAU_S * (mean[k] - s.unaided_pull[k])
         pull_sq += s.unaided_pull[k] ** 2
-    explained = s.drift_cov[FORCE, FORCE] + STANDARD_GRAVITY_MPS2**2 * drift_sq
+    bias_sq = min(s.drift_cov[FORCE, FORCE], FORCE_BIAS_MPS2**2)
+    explained = bias_sq + STANDARD_GRAVITY_MPS2**2 * drift_sq
     return float(max(pull_sq - 2.0 * explained, 0.0))
 
 

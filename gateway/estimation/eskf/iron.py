@@ -199,7 +199,7 @@ def doubt_iron_anew(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def note_calibration(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
+def note_compass(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
     """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
     if s.mag_uncalibrated == 1 and not uncalibrated:
         s.left_iron_ut, s.mag_uncalibrated = math.sqrt(p.mag_bias_var), 0

@@ -7,6 +7,7 @@ from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
+from gateway.estimation.filtering.accelerometer import AccelerometerState
 from gateway.estimation.filtering.bias_evidence import BiasEvidenceState
 from gateway.estimation.filtering.field_jump import FieldJumpState
 from gateway.estimation.filtering.hidden_pull import HiddenPullState
@@ -58,6 +59,7 @@ def filter_gains(
 
 
 class FilterState(
+    AccelerometerState,
     HealthState,
     RoughnessState,
     RestState,

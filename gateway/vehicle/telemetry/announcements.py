@@ -59,7 +59,11 @@ FLAG_TEXTS: Final = (
     ),
 )
 """A flag of the estimator, the text when it rises, and the text when it falls."""
-
+UNCALIBRATED_SENSORS: Final = (
+    (ImuFlags.MAG_UNCALIBRATED, "Compass"),
+    (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
+)
+UNCALIBRATED: Final = int(ImuFlags.MAG_UNCALIBRATED | ImuFlags.ACCEL_UNCALIBRATED)
 
 LATENCY_SETTLED_US: Final = 5_000_000
 """A latency that has not moved for so long is the one that the motion shows."""
@@ -96,17 +100,22 @@ class Announcements:
         return found
 
     def on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
-        """Announce a compass that was never calibrated."""
+        """Announce sensors that were never calibrated; of the compass, once it tells a field."""
+        changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if sample.mag_b_ut is None:
+            changed &= ~ImuFlags.MAG_UNCALIBRATED
+        if not changed:
             return []
-        shown = sample.flags & ImuFlags.MAG_UNCALIBRATED
-        if shown == self._uncalibrated:
-            return []
-        self._uncalibrated = shown
-        text = StatusText(INFO, "Compass calibrated")
-        if shown:
-            text = StatusText(WARNING, "Compass not calibrated")
-        return self._announcer.track("compass", shown, text, now_us, initially=0)
+        self._uncalibrated ^= changed
+        found = []
+        for flag, sensor in UNCALIBRATED_SENSORS:
+            shown = self._uncalibrated & flag
+            text = StatusText(INFO, f"{sensor} calibrated")
+            if shown:
+                text = StatusText(WARNING, f"{sensor} not calibrated")
+            if changed & flag:
+                found += self._announcer.track(sensor, shown, text, now_us, initially=0)
+        return found
 
     def on_fix(self, now_us: int) -> list[Any]:
         """Announce whether GPS fixes arrive."""

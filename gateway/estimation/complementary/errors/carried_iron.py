@@ -86,7 +86,7 @@ def look_for_iron(
 
 
 @compiled
-def note_calibration(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
+def note_compass(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
     """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
     if s.mag_uncalibrated == 1 and not uncalibrated:
         carry_drift(s, p)

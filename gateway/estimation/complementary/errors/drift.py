@@ -36,6 +36,7 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.errors.compass_error import compass_variance
 from gateway.estimation.complementary.errors.drift_update import widen_prior
+from gateway.estimation.filtering.accelerometer import UNCALIBRATED_BIAS_MPS2
 from gateway.estimation.filtering.bias_evidence import (
     unexpected_bias_density,
     watch_bias_corrections,
@@ -74,7 +75,7 @@ def begin_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Set the covariance of sensors that nothing is known of."""
     for k in range(3):
         s.drift_cov[k, k] = p.bias_initial_radps**2
-        s.drift_cov[FORCE + k, FORCE + k] = FORCE_BIAS_MPS2**2
+        s.drift_cov[FORCE + k, FORCE + k] = force_bias_var(s)
     forget_scale(s)
     forget_iron(s)
     forget_heading(s, p)
@@ -87,6 +88,25 @@ def begin_state(s: ComplementaryState, k: int, variance: float) -> None:
     for j in range(STATES):
         s.drift_cov[k, j] = s.drift_cov[j, k] = 0.0
     s.drift_cov[k, k] = variance
+
+
+@compiled
+def force_bias_var(s: ComplementaryState) -> float:
+    """Return the variance of the accelerometer's bias along an axis, before anything tells it."""
+    std = UNCALIBRATED_BIAS_MPS2 if s.accel_uncalibrated == 1 else FORCE_BIAS_MPS2
+    return std * std
+
+
+@compiled
+def note_accelerometer(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
+    """Note whether the accelerometer is calibrated. Once it is, the bias found is out of it."""
+    if uncalibrated == (s.accel_uncalibrated == 1):
+        return
+    carry_drift(s, p)
+    s.accel_uncalibrated = 1 if uncalibrated else 0
+    for k in range(3):
+        s.accel_bias_b[k] = 0.0
+        begin_state(s, FORCE + k, force_bias_var(s))
 
 
 @compiled
@@ -205,7 +225,7 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         P[k, k] += (BIAS_WALK_RAD2PS3 + unexpected_bias_density(s, k)) * s.carried_s
         P[FORCE + k, FORCE + k] += FORCE_WALK_M2PS5 * s.carried_s
         limit_variance(s.drift_cov, k, p.bias_initial_radps**2)
-        limit_variance(s.drift_cov, FORCE + k, FORCE_BIAS_MPS2**2)
+        limit_variance(s.drift_cov, FORCE + k, force_bias_var(s))
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
         scaled[0, k] = scaled[1, k] = scaled[2, k] = 0.0
     known = s.heading_known == 1 and s.level_by_gps == 1 and s.iron_doubted == 0

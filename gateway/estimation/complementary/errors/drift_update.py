@@ -17,14 +17,14 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
     states_in_use,
 )
+from gateway.estimation.filtering.accelerometer import largest_bias_mps2
 from gateway.estimation.filtering.bias_evidence import note_bias_correction
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 
 SCALE_LIMIT: Final = 0.1
-FORCE_BIAS_LIMIT_MPS2: Final = 0.5
-"""The scale of a gyroscope and the bias of an accelerometer are at most this."""
+"""The scale of a gyroscope is at most this."""
 UNCLIPPED: Final = 1e9
 """An innovation of so many standard deviations counts whole."""
 OUTLIER_SIGMA: Final = 3.0
@@ -136,9 +136,10 @@ def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float, count
             s.iron_b[k] += gain[IRON + k] * share
     if s.level_by_gps == 0:
         return
+    most = largest_bias_mps2(s)
     for k in range(3):
         force = s.accel_bias_b[k] + gain[FORCE + k] * share
-        s.accel_bias_b[k] = max(-FORCE_BIAS_LIMIT_MPS2, min(FORCE_BIAS_LIMIT_MPS2, force))
+        s.accel_bias_b[k] = max(-most, min(most, force))
         if count == SPEED:
             scale = s.scale_b[k] + gain[SCALE + k] * share
             s.scale_b[k] = max(-SCALE_LIMIT, min(SCALE_LIMIT, scale))
