@@ -110,14 +110,11 @@ class NodeCalibration(Settings, frozen=True):
     ] = 0.0
 
     @property
-    def knows_iron(self) -> bool:
-        """Whether the compass was ever calibrated; every one has some hard iron."""
-        return self.mag_hard_iron_ut != _NO_OFFSET
-
-    @property
-    def knows_accelerometer(self) -> bool:
-        """Whether the accelerometer was ever calibrated; every one has some bias."""
-        return self.accel_bias_mps2 != _NO_OFFSET
+    def missing(self) -> ImuFlags:
+        """Flags of the sensors that were never calibrated: each one has some offset."""
+        compass, accelerometer = ImuFlags.MAG_UNCALIBRATED, ImuFlags.ACCEL_UNCALIBRATED
+        flags = compass if self.mag_hard_iron_ut == _NO_OFFSET else ImuFlags(0)
+        return flags | accelerometer if self.accel_bias_mps2 == _NO_OFFSET else flags
 
     def __post_init__(self) -> None:
         """Refuse matrices that are no rotations, or have no inverse."""

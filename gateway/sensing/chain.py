@@ -100,11 +100,7 @@ class SensorChain:
         self._accel = Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2)
         self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
         self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
-        self._added_flags = ImuFlags(0)
-        if not cal.knows_iron:
-            self._added_flags |= ImuFlags.MAG_UNCALIBRATED
-        if not cal.knows_accelerometer:
-            self._added_flags |= ImuFlags.ACCEL_UNCALIBRATED
+        self._added_flags = cal.missing
         self.reset()
 
     def reset(self) -> None:
