@@ -37,8 +37,9 @@ class ImuFlags(IntFlag):
     GYRO_CLIPPED = 1 << 7
     MAG_UNCALIBRATED = 1 << 8
     """The gateway's own: the compass was never calibrated, the aircraft's iron is still in it."""
-    ACCEL_UNCALIBRATED = 1 << 9
-    """The gateway's own: the accelerometer was never calibrated."""
+    GYRO_UNCALIBRATED = 1 << 9
+    ACCEL_UNCALIBRATED = 1 << 10
+    """The same of the inertial sensors: their biases are still in what they tell."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """Returns a plain int to test a bit: building a flag would cost six times as much."""

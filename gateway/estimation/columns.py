@@ -36,9 +36,10 @@ MAG: Final = 6
 CLIPPED: Final = 9
 """1 where a sensor touched the end of its range, else 0."""
 MAG_UNCALIBRATED: Final = 10
-ACCEL_UNCALIBRATED: Final = 11
-"""1 where the compass, or the accelerometer, was never calibrated, else 0."""
-IMU_COLUMNS: Final = 12
+GYRO_UNCALIBRATED: Final = 11
+ACCEL_UNCALIBRATED: Final = 12
+"""1 where that sensor was never calibrated, else 0."""
+IMU_COLUMNS: Final = 13
 
 GPS_USABLE: Final = 0
 """1 for a fix that may be fused, else 0."""
@@ -70,7 +71,12 @@ NAV_FLAGS: Final = 22
 NAV_COLUMNS: Final = 23
 
 CLIP_FLAGS: Final = ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
-ROW_FLAGS: Final = (CLIP_FLAGS, ImuFlags.MAG_UNCALIBRATED, ImuFlags.ACCEL_UNCALIBRATED)
+ROW_FLAGS: Final = (
+    CLIP_FLAGS,
+    ImuFlags.MAG_UNCALIBRATED,
+    ImuFlags.GYRO_UNCALIBRATED,
+    ImuFlags.ACCEL_UNCALIBRATED,
+)
 """A column each."""
 
 _flags_of = cache(NavFlags)

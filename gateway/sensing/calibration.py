@@ -1,6 +1,8 @@
 """A node's calibration: counts in sensor axes to SI in body FRD."""
 
+import operator
 from collections.abc import Callable
+from functools import reduce
 from typing import Annotated, Final, TypeVar
 
 import msgspec
@@ -112,9 +114,13 @@ class NodeCalibration(Settings, frozen=True):
     @property
     def missing(self) -> ImuFlags:
         """Flags of the sensors that were never calibrated: each one has some offset."""
-        compass, accelerometer = ImuFlags.MAG_UNCALIBRATED, ImuFlags.ACCEL_UNCALIBRATED
-        flags = compass if self.mag_hard_iron_ut == _NO_OFFSET else ImuFlags(0)
-        return flags | accelerometer if self.accel_bias_mps2 == _NO_OFFSET else flags
+        offsets = {
+            ImuFlags.MAG_UNCALIBRATED: self.mag_hard_iron_ut,
+            ImuFlags.GYRO_UNCALIBRATED: self.gyro_bias_radps,
+            ImuFlags.ACCEL_UNCALIBRATED: self.accel_bias_mps2,
+        }
+        missing = (flag for flag, offset in offsets.items() if offset == _NO_OFFSET)
+        return reduce(operator.or_, missing, ImuFlags(0))
 
     def __post_init__(self) -> None:
         """Refuse matrices that are no rotations, or have no inverse."""

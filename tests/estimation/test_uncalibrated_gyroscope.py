@@ -8,17 +8,27 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import ACCEL, GYRO, IMU_COLUMNS, MAG, NAV_FLAGS
+from gateway.estimation.columns import (
+    ACCEL,
+    GYRO,
+    GYRO_UNCALIBRATED,
+    IMU_COLUMNS,
+    MAG,
+    NAV_FLAGS,
+)
 from gateway.estimation.kernel import SampleLog
 from gateway.records import NavFlags
 from tests.estimation.samples import G, log_of
 from tests.estimation.test_steady_motion import FIELD_N_UT, TURN_RADPS
 from tests.estimation.test_without_compass import RATE_HZ, estimator_of
 from tools.flights import Flight, simulated_flight
-from tools.score_estimators import OWN
+from tools.score_estimators import OWN, attitude_scores
+from tools.score_honesty import share, two_sigma
+from tools.spoil_flight import mid_air
 
 BIASES_DEGPS = ((7.5, -2.0, 1.0), (-3.0, 12.0, -9.0), (2.0, 1.0, -17.0), (18.0, -16.0, 14.0))
 NAMES = ("complementary", "eskf")
+LIKELY_DEGPS = ((4.0, -3.0, 5.0), (-5.0, 4.0, -3.0))
 SEEDS = (41, 42)
 FOUND_S = 12.0
 """At the latest, with or without a compass."""
@@ -69,6 +79,42 @@ def test_it_is_found_without_a_compass(name: str) -> None:
     time_s = flown(SEEDS[0], fixes=False, compass=False).log.imu_time_us * 1e-6
     stands = (time_s > FOUND_S - 1.0) & (time_s < FOUND_S)
     assert off[stands, 0].max() < 1.0
+
+
+def begun_in_the_air(seed: int, bias_degps: tuple[float, ...]) -> Flight:
+    """Each sample says that nobody has calibrated the gyroscope."""
+    begun = mid_air(flown(seed, fixes=True, compass=True)).flight
+    imu, time_us = begun.log.imu.copy(), begun.log.imu_time_us
+    imu[:, GYRO_UNCALIBRATED] = 1.0
+    imu[:, GYRO : GYRO + 3] += np.radians(bias_degps)
+    later = time_us > time_us[0] + FOUND_S * 1e6
+    return replace(begun, log=replace(begun.log, imu=imu), counts=later)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bias_degps", LIKELY_DEGPS)
+def test_it_is_expected_where_a_flight_begins_in_the_air(bias_degps: tuple[float, ...]) -> None:
+    for seed in SEEDS:
+        flight = begun_in_the_air(seed, bias_degps)
+        out = OWN["eskf"](flight)
+        found = attitude_scores(flight, out[:, :4])
+        assert found["inclination"] < 2.0
+        assert found["heading"] < 2.5
+        assert share(two_sigma(flight, out)["heading"]) > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bias_degps", LIKELY_DEGPS)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_level_begun_so_without_gps_is_told_as_unsure(
+    name: str, bias_degps: tuple[float, ...]
+) -> None:
+    shares = []
+    for seed in SEEDS:
+        flight = begun_in_the_air(seed, bias_degps)
+        alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
+        shares.append(share(two_sigma(alone, OWN[name](alone))["tilt"]))
+    assert np.mean(shares) > 0.65
 
 
 def turning(rate_radps: float) -> SampleLog:

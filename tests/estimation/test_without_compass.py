@@ -1,6 +1,7 @@
 """A first heading without a compass: none while standing, and an honest one in motion."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -18,6 +19,7 @@ from gateway.estimation.columns import (
     NAV_ATTITUDE_STD,
     NAV_FLAGS,
 )
+from gateway.estimation.eskf.eskf_state import EskfState
 from gateway.estimation.eskf.recovery import turn_heading
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.reference import ReferenceSettings
@@ -128,18 +130,37 @@ class TestWithoutCompass:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_heading_that_is_wrong_is_taken_anew(receiver: str, seed: int) -> None:
     """Off by 115 deg and sure to 3 to 7 deg, in the midst of the flight."""
-    log, heading = flight(seed, receiver)
-    turns_at = round(75.0 * RATE_HZ)
-    fixes = int(np.searchsorted(log.gps_time_us, log.imu_time_us[turns_at]))
-    estimator = estimator_of("eskf")
-    estimator.run(part(log, slice(0, turns_at), slice(0, fixes)))
-    state = estimator.state
-    turn_heading(state, 2.0)
-    estimator.state = state
-    out = estimator.run(part(log, slice(turns_at, None), slice(fixes, None)))
-    off_deg = np.degrees(heading_off(out, heading[turns_at:]))
+    off_deg, _ = flown_on_after(seed, receiver, lambda state: turn_heading(state, 2.0))
     assert off_deg[0] > 90.0
     assert off_deg[10 * RATE_HZ :].max() < 25.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_the_sensors_have_shown_by_a_wrong_heading_is_forgotten(seed: int) -> None:
+    def spoil(state: EskfState) -> None:
+        turn_heading(state, 2.0)
+        state.gyro_scale_b, state.accel_bias_b = np.full(3, 0.2), np.full(3, 0.7)
+
+    off_deg, state = flown_on_after(seed, "good", spoil)
+    assert off_deg[10 * RATE_HZ :].max() < 25.0
+    assert np.abs(state.gyro_scale_b).max() < 0.05
+    assert np.abs(state.accel_bias_b).max() < 0.15
+
+
+def flown_on_after(
+    seed: int, receiver: str, change: Callable[[EskfState], None]
+) -> tuple[np.ndarray, EskfState]:
+    """Change the state of `eskf` in flight; tell how far its heading is off then, deg, and it."""
+    log, heading = flight(seed, receiver)
+    changed_at = round(75.0 * RATE_HZ)
+    fixes = int(np.searchsorted(log.gps_time_us, log.imu_time_us[changed_at]))
+    estimator = estimator_of("eskf")
+    estimator.run(part(log, slice(0, changed_at), slice(0, fixes)))
+    state = estimator.state
+    change(state)
+    estimator.state = state
+    out = estimator.run(part(log, slice(changed_at, None), slice(fixes, None)))
+    return np.degrees(heading_off(out, heading[changed_at:])), estimator.state
 
 
 def part(log: SampleLog, samples: slice, fixes: slice) -> SampleLog:

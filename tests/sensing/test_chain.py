@@ -38,16 +38,19 @@ def test_level_board_in_si_and_body_axes(chain: SensorChain) -> None:
 
 
 def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
-    compass, accelerometer = (
-        SensorChain(SensingSettings(), calibration).imu(LEVEL).flags ^ ImuFlags.MAG_NEW
+    missing = chain.imu(LEVEL).flags ^ ImuFlags.MAG_NEW
+    compass, gyroscope, accelerometer = (
+        missing ^ SensorChain(SensingSettings(), calibration).imu(LEVEL).flags ^ ImuFlags.MAG_NEW
         for calibration in (
             NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)),
+            NodeCalibration(gyro_bias_radps=(0.0, 0.0, 0.01)),
             NodeCalibration(accel_bias_mps2=(0.0, 0.1, 0.0)),
         )
     )
-    assert compass == ImuFlags.ACCEL_UNCALIBRATED
-    assert accelerometer == ImuFlags.MAG_UNCALIBRATED
-    assert chain.imu(LEVEL).flags == ImuFlags.MAG_NEW | compass | accelerometer
+    assert compass == ImuFlags.MAG_UNCALIBRATED
+    assert gyroscope == ImuFlags.GYRO_UNCALIBRATED
+    assert accelerometer == ImuFlags.ACCEL_UNCALIBRATED
+    assert missing == compass | gyroscope | accelerometer
 
 
 @pytest.mark.parametrize(

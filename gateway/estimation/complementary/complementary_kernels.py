@@ -8,7 +8,7 @@ from gateway.estimation.alignment.gps_latency import begin_latency, forget_veloc
 from gateway.estimation.alignment.gps_velocity import forget_way
 from gateway.estimation.alignment.pair_sums import doubt_pairs
 from gateway.estimation.alignment.review import GAP_S, MOVING_MPS
-from gateway.estimation.columns import ACCEL_UNCALIBRATED, CLIPPED, MAG_UNCALIBRATED, imu_vectors
+from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import begin_lag, follow_rate, present_field
 from gateway.estimation.complementary.accuracy import watch_accuracy, write_attitude_std
 from gateway.estimation.complementary.complementary_output import (
@@ -20,18 +20,17 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.bias import update_bias
-from gateway.estimation.complementary.errors.carried_iron import note_compass
 from gateway.estimation.complementary.errors.drift import (
     DOUBT,
     begin_drift,
     bias_std,
     doubt_sensors,
     end_level,
-    note_accelerometer,
     note_turn,
     raise_attitude_variance,
     raise_bias_variance,
 )
+from gateway.estimation.complementary.errors.sensor_calibration import note_calibration
 from gateway.estimation.complementary.heading import is_heading_good, take_mag
 from gateway.estimation.complementary.intake import bridge_silence, take_gps
 from gateway.estimation.complementary.navigation import (
@@ -152,8 +151,7 @@ def take_imu(
     A sample that is late is left out; a clock that went far back is a new clock.
     """
     gyro, accel, mag = imu_vectors(row)
-    note_compass(s, p, row[MAG_UNCALIBRATED] != 0.0)
-    note_accelerometer(s, p, row[ACCEL_UNCALIBRATED] != 0.0)
+    note_calibration(s, p, row)
     if s.started == 0:
         begin(s, p, time_us, gyro, accel)
         return

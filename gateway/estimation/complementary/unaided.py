@@ -30,6 +30,7 @@ from gateway.estimation.filtering.hidden_pull import (
     hidden_level_var,
     watch_hidden_pull,
 )
+from gateway.estimation.filtering.uncalibrated import gyro_bias_var
 from gateway.estimation.kernel_record import as_quat, as_vec
 from gateway.estimation.rest import REST_TAU_S
 from gateway.geometry.quaternion import rotate, rotate_inverse
@@ -106,13 +107,14 @@ def expected_pull_sq(s: ComplementaryState, pull_sq: float, dt: float) -> float:
 @compiled
 def level_drift_sq(s: ComplementaryState) -> float:
     """Return the variance by which gravity's low-pass falls behind, about one axis, rad2."""
-    tau = s.gravity_tau_s
-    lag = bias_std(s) * tau
+    tau, bias_sq = s.gravity_tau_s, bias_std(s) ** 2
+    if s.level_shown == 0:
+        bias_sq = gyro_bias_var(s, bias_sq)
     walk = ATTITUDE_WALK_RAD2PS + TURN_WALK_RAD * s.unaided_radps + s.rate_density
     scaled_sq = 0.0
     for k in range(3):
         scaled_sq += 0.5 * (s.unaided_scaled[0, k] ** 2 + s.unaided_scaled[1, k] ** 2)
-    return lag * lag + walk * tau + (SCALE_SHARE * tau) ** 2 * scaled_sq
+    return bias_sq * tau * tau + walk * tau + (SCALE_SHARE * tau) ** 2 * scaled_sq
 
 
 @compiled

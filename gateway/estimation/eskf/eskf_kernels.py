@@ -7,7 +7,7 @@ from gateway.compiled import compiled
 from gateway.estimation.alignment.pair_sums import doubt_pairs
 from gateway.estimation.alignment.review import GAP_LOST_RAD, GAP_S
 from gateway.estimation.alignment.wahba import carry_frame
-from gateway.estimation.columns import ACCEL_UNCALIBRATED, CLIPPED, MAG_UNCALIBRATED, imu_vectors
+from gateway.estimation.columns import CLIPPED, imu_vectors
 from gateway.estimation.compass_lag import follow_rate, present_field
 from gateway.estimation.eskf.covariance import level_variance, propagate
 from gateway.estimation.eskf.eskf_output import write_output
@@ -19,10 +19,8 @@ from gateway.estimation.eskf.iron import (
     doubt_standing_field,
     follow_field,
     look_for_iron,
-    note_compass,
     update_by_dip,
 )
-from gateway.estimation.eskf.level_doubt import note_accelerometer
 from gateway.estimation.eskf.measure import (
     update_by_baro,
     update_by_compass,
@@ -42,6 +40,7 @@ from gateway.estimation.eskf.start import (
     bridge_silence,
     end_dead_reckoning,
     forget_times,
+    note_calibration,
     rate_of,
     restart_baro,
     start,
@@ -122,8 +121,7 @@ def take_imu(
     A sample that is late is left out; a clock that went far back is a new clock.
     """
     gyro, accel, mag = imu_vectors(row)
-    note_compass(s, p, row[MAG_UNCALIBRATED] != 0.0)
-    note_accelerometer(s, p, row[ACCEL_UNCALIBRATED] != 0.0)
+    note_calibration(s, p, row)
     if s.started == 0:
         s.hold_s = p.dead_reckoning_s
         begin(s, p, time_us, gyro, accel)

@@ -199,17 +199,6 @@ def doubt_iron_anew(s: EskfState, p: EskfGains) -> None:
 
 
 @compiled
-def note_compass(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
-    """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
-    if s.mag_uncalibrated == 1 and not uncalibrated:
-        s.left_iron_ut, s.mag_uncalibrated = math.sqrt(p.mag_bias_var), 0
-        forget_iron(s, p)
-    if s.mag_uncalibrated == 0 and uncalibrated:
-        s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
-    s.mag_uncalibrated = 1 if uncalibrated else 0
-
-
-@compiled
 def forget_iron(s: EskfState, p: EskfGains) -> None:
     """Know nothing of the iron that has been found, but that a calibration leaves little."""
     forget_strength(s)

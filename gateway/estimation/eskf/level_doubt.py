@@ -7,10 +7,10 @@ nothing tells that bias from tilt: it cannot be estimated, but the tilt is told 
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.covariance import propagate, renew
+from gateway.estimation.eskf.covariance import renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
-from gateway.estimation.filtering.accelerometer import UNCALIBRATED_BIAS_MPS2
+from gateway.estimation.filtering.uncalibrated import accel_bias_std
 from gateway.estimation.kernel_record import as_quat
 from gateway.geometry.quaternion import body_axes
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -22,7 +22,7 @@ LEFT_BIAS_MPS2: Final = 0.04
 @compiled
 def left_bias_mps2(s: EskfState) -> float:
     """Return the standard deviation of the bias along an axis, before anything has told it."""
-    return UNCALIBRATED_BIAS_MPS2 if s.accel_uncalibrated == 1 else LEFT_BIAS_MPS2
+    return accel_bias_std(s, LEFT_BIAS_MPS2)
 
 
 @compiled
@@ -31,20 +31,6 @@ def standing_level_var(s: EskfState) -> float:
     if s.aided_before == 1:
         return 0.0
     return (left_bias_mps2(s) / STANDARD_GRAVITY_MPS2) ** 2
-
-
-@compiled
-def note_accelerometer(s: EskfState, p: EskfGains, uncalibrated: bool) -> None:
-    """Note whether the accelerometer is calibrated. Once it is, the bias found is out of it."""
-    if uncalibrated == (s.accel_uncalibrated == 1):
-        return
-    s.accel_uncalibrated = 1 if uncalibrated else 0
-    if s.aided_before == 0:
-        return
-    propagate(s, p)
-    for k in range(3):
-        s.accel_bias_b[k] = 0.0
-        renew(s, ACCEL_BIAS + k, max(left_bias_mps2(s) ** 2, p.accel_bias_var))
 
 
 @compiled

@@ -14,9 +14,18 @@ from gateway.estimation.alignment.review import (
 from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, heading_difference
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import GYRO_BIAS, TILT, VEL, EskfState
+from gateway.estimation.eskf.eskf_state import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    TILT,
+    VEL,
+    EskfState,
+)
 from gateway.estimation.eskf.iron import forget_iron
+from gateway.estimation.eskf.level_doubt import left_bias_mps2
 from gateway.estimation.filtering.hidden_pull import forget_level
+from gateway.estimation.filtering.uncalibrated import gyro_bias_var
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
 from gateway.estimation.magfield import begin_turn
 from gateway.estimation.rest import SHAKEN
@@ -129,12 +138,26 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
             s.compass_share = 0.0
             s.heading_known = s.heading_true = 1
         return
+    if s.lost == 0 and s.aided_before == 1:
+        doubt_sensors(s, p)
     write_quat(s.q_nb, find(s, as_quat(s.q_nb), ENOUGH_HEADING_RAD))
     if s.heading_known == 1:
         s.heading_true = 1
     heading_var = s.heading_std * s.heading_std if s.heading_known == 1 else OWN_FRAME_VAR
     raise_bias_variance(s, BIAS_CHANGE_RADPS)
     begin_attitude(s, p, found_level_var(s), heading_var)
+
+
+@compiled
+def doubt_sensors(s: EskfState, p: EskfGains) -> None:
+    """Forget what the sensors have shown with GPS by an attitude that was wrong."""
+    propagate(s, p)
+    for k in range(3):
+        s.gyro_scale_b[k], s.accel_bias_b[k] = 0.0, 0.0
+        renew(s, GYRO_BIAS + k, gyro_bias_var(s, p.gyro_bias_var))
+        renew(s, GYRO_SCALE + k, p.gyro_scale_var)
+        renew(s, ACCEL_BIAS + k, left_bias_mps2(s) ** 2)
+    forget_iron(s, p)
 
 
 @compiled

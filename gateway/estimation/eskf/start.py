@@ -1,4 +1,4 @@
-"""Beginnings: of the filter, of the heading, of position and velocity; and after a gap."""
+"""Beginnings: of the filter, its sensors, heading, position and velocity; and after a gap."""
 
 import math
 from typing import Final
@@ -12,6 +12,7 @@ from gateway.estimation.alignment.review import (
     GAP_TILT_RATE,
 )
 from gateway.estimation.alignment.wahba import carry_frame
+from gateway.estimation.columns import ACCEL_UNCALIBRATED, GYRO_UNCALIBRATED, MAG_UNCALIBRATED
 from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -27,8 +28,8 @@ from gateway.estimation.eskf.eskf_state import (
     WANDER,
     EskfState,
 )
-from gateway.estimation.eskf.iron import start_iron_search
-from gateway.estimation.eskf.level_doubt import doubt_level
+from gateway.estimation.eskf.iron import forget_iron, start_iron_search
+from gateway.estimation.eskf.level_doubt import doubt_level, left_bias_mps2
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
@@ -41,8 +42,17 @@ from gateway.estimation.filtering.sample_clock import (
     silent_rate,
     silent_variance,
 )
-from gateway.estimation.kernel_record import as_quat, as_vec, fill, write_quat, write_vec
+from gateway.estimation.filtering.uncalibrated import gyro_bias_var
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    as_quat,
+    as_vec,
+    fill,
+    write_quat,
+    write_vec,
+)
 from gateway.estimation.local_position import NEVER_S
+from gateway.estimation.magfield import UNCALIBRATED_IRON_UT
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import (
     from_euler,
@@ -93,6 +103,54 @@ def forget_times(s: EskfState) -> None:
     forget_way(s)
     s.reject_s = s.rest_s = 0.0
     s.ring_count = s.at_rest = 0
+
+
+@compiled
+def note_calibration(s: EskfState, p: EskfGains, row: FloatArray) -> None:
+    """Note what a sample's row says of the calibration of its sensors.
+
+    Once one is calibrated, what was found of its error is out of it.
+    """
+    if (row[MAG_UNCALIBRATED] != 0.0) != (s.mag_uncalibrated == 1):
+        note_compass(s, p)
+    if (row[GYRO_UNCALIBRATED] != 0.0) != (s.gyro_uncalibrated == 1):
+        s.gyro_uncalibrated = 1 - s.gyro_uncalibrated
+        forget_gyro_bias(s, p)
+    if (row[ACCEL_UNCALIBRATED] != 0.0) != (s.accel_uncalibrated == 1):
+        s.accel_uncalibrated = 1 - s.accel_uncalibrated
+        if s.aided_before == 1:
+            forget_accel_bias(s, p)
+
+
+@compiled
+def note_compass(s: EskfState, p: EskfGains) -> None:
+    """Turn what is known of the compass's calibration into the opposite."""
+    s.mag_uncalibrated = 1 - s.mag_uncalibrated
+    if s.mag_uncalibrated == 1:
+        s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
+    else:
+        s.left_iron_ut = math.sqrt(p.mag_bias_var)
+        forget_iron(s, p)
+
+
+@compiled
+def forget_gyro_bias(s: EskfState, p: EskfGains) -> None:
+    """Know nothing of the gyroscope's bias."""
+    propagate(s, p)
+    fill(s.gyro_bias_b, 0.0)
+    fill(s.shown_bias_b, 0.0)
+    s.bias_shown = 0
+    for k in range(GYRO_BIAS, GYRO_BIAS + 3):
+        renew(s, k, gyro_bias_var(s, p.gyro_bias_var))
+
+
+@compiled
+def forget_accel_bias(s: EskfState, p: EskfGains) -> None:
+    """Know nothing of the accelerometer's bias."""
+    propagate(s, p)
+    fill(s.accel_bias_b, 0.0)
+    for k in range(ACCEL_BIAS, ACCEL_BIAS + 3):
+        renew(s, k, max(left_bias_mps2(s) ** 2, p.accel_bias_var))
 
 
 @compiled

@@ -7,12 +7,12 @@ from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.alignment.gps_velocity import WayState
 from gateway.estimation.alignment.review import ReviewState
 from gateway.estimation.compass_lag import LagState
-from gateway.estimation.filtering.accelerometer import AccelerometerState
 from gateway.estimation.filtering.bias_evidence import BiasEvidenceState
 from gateway.estimation.filtering.field_jump import FieldJumpState
 from gateway.estimation.filtering.hidden_pull import HiddenPullState
 from gateway.estimation.filtering.iron_evidence import IronState
 from gateway.estimation.filtering.roughness import RoughnessState
+from gateway.estimation.filtering.uncalibrated import UncalibratedState
 from gateway.estimation.flagbits import (
     AT_REST,
     DEGRADED,
@@ -59,7 +59,7 @@ def filter_gains(
 
 
 class FilterState(
-    AccelerometerState,
+    UncalibratedState,
     HealthState,
     RoughnessState,
     RestState,

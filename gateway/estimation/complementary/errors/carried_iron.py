@@ -19,7 +19,7 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
 )
 from gateway.estimation.complementary.errors.compass_error import is_dip_turned
-from gateway.estimation.complementary.errors.drift import carry_drift, forget_iron
+from gateway.estimation.complementary.errors.drift import carry_drift
 from gateway.estimation.complementary.errors.drift_update import (
     OUTLIER_SIGMA,
     UNCLIPPED,
@@ -83,16 +83,6 @@ def look_for_iron(
         update_by_strength(s, p, raw, dt)
     update_by_dip(s, p, field_e, dt)
     follow_iron(s, raw, field_e, before)
-
-
-@compiled
-def note_compass(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
-    """Note whether the compass is calibrated. Once it is, the iron found before is out of it."""
-    if s.mag_uncalibrated == 1 and not uncalibrated:
-        carry_drift(s, p)
-        forget_iron(s)
-        forget_strength(s)
-    s.mag_uncalibrated = 1 if uncalibrated else 0
 
 
 @compiled

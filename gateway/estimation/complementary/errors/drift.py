@@ -36,13 +36,13 @@ from gateway.estimation.complementary.complementary_state import (
 )
 from gateway.estimation.complementary.errors.compass_error import compass_variance
 from gateway.estimation.complementary.errors.drift_update import widen_prior
-from gateway.estimation.filtering.accelerometer import UNCALIBRATED_BIAS_MPS2
 from gateway.estimation.filtering.bias_evidence import (
     unexpected_bias_density,
     watch_bias_corrections,
 )
 from gateway.estimation.filtering.covariance_scale import limit_variance, scale_state
 from gateway.estimation.filtering.roughness import ROUGH_TAU_S, note_force_noise
+from gateway.estimation.filtering.uncalibrated import accel_bias_std
 from gateway.estimation.kernel_record import as_quat
 from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS
 from gateway.geometry.angle import wrap_pi
@@ -93,20 +93,8 @@ def begin_state(s: ComplementaryState, k: int, variance: float) -> None:
 @compiled
 def force_bias_var(s: ComplementaryState) -> float:
     """Return the variance of the accelerometer's bias along an axis, before anything tells it."""
-    std = UNCALIBRATED_BIAS_MPS2 if s.accel_uncalibrated == 1 else FORCE_BIAS_MPS2
+    std = accel_bias_std(s, FORCE_BIAS_MPS2)
     return std * std
-
-
-@compiled
-def note_accelerometer(s: ComplementaryState, p: ComplementaryGains, uncalibrated: bool) -> None:
-    """Note whether the accelerometer is calibrated. Once it is, the bias found is out of it."""
-    if uncalibrated == (s.accel_uncalibrated == 1):
-        return
-    carry_drift(s, p)
-    s.accel_uncalibrated = 1 if uncalibrated else 0
-    for k in range(3):
-        s.accel_bias_b[k] = 0.0
-        begin_state(s, FORCE + k, force_bias_var(s))
 
 
 @compiled

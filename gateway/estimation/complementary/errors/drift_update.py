@@ -17,8 +17,8 @@ from gateway.estimation.complementary.complementary_state import (
     ComplementaryState,
     states_in_use,
 )
-from gateway.estimation.filtering.accelerometer import largest_bias_mps2
 from gateway.estimation.filtering.bias_evidence import note_bias_correction
+from gateway.estimation.filtering.uncalibrated import largest_accel_bias
 from gateway.estimation.kernel_record import FloatArray, as_quat, write_quat
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
@@ -136,7 +136,7 @@ def apply_gain(s: ComplementaryState, p: ComplementaryGains, share: float, count
             s.iron_b[k] += gain[IRON + k] * share
     if s.level_by_gps == 0:
         return
-    most = largest_bias_mps2(s)
+    most = largest_accel_bias(s)
     for k in range(3):
         force = s.accel_bias_b[k] + gain[FORCE + k] * share
         s.accel_bias_b[k] = max(-most, min(most, force))
