@@ -29,8 +29,8 @@ LONGEST_TURN_S: Final = 40.0
 """What seems to turn for longer is a bias that has changed, unless the compass turns too."""
 USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
 """A steady rate beyond this is more often a turn than a bias."""
-UNTURNED_RAD: Final = 1.0
-"""What has seemed to turn by so much while the compass has not has not turned."""
+UNTURNED_RAD: Final = 4.0 * math.pi
+"""What seems to turn by more about the vertical, with no compass to contradict it, is a bias."""
 REST_FORCE_SHARE: Final = 0.2
 """By so much of gravity the force of a rest may seem to be off it."""
 LEAN_RAD: Final = 2.0 * RAD_PER_DEG
@@ -189,15 +189,14 @@ def watch_rest(
         largest = max(largest, abs(s.gyro_lp[k]))
     still_sq = p.rest_gyro_radps**2
     shaken = gyro_sq < SHAKEN**2 * still_sq and mean_sq < STEADY**2 * still_sq
-    still = (
+    quiet = (
         (gyro_sq < still_sq or shaken)
         and accel_sq < p.rest_accel_mps2**2
         and largest < p.bias_limit_radps
     )
     usual = is_usual_bias(s, as_vec(s.gyro_lp))
-    still = still and (usual or s.bias_shown == 0)
-    s.still = 1 if still else 0
-    rests, upright = still and not moving, abs(upright_rate(s))
+    s.still = 1 if quiet and (usual or s.bias_shown == 0) else 0
+    rests, upright = quiet and not moving, abs(upright_rate(s))
     s.spun_rad = s.spun_rad + upright * dt if rests else 0.0
     s.spins = 1 if rests and not usual else 0
     rests = rests and (s.spins == 0 or has_not_turned(s, upright))
@@ -287,7 +286,8 @@ def is_pushed(s: RestState, force_level: Vec3, unsure_sq: float, dt: float) -> b
 @compiled
 def may_be_pushed(s: RestState) -> bool:
     """Return whether what pulls may be a push: a level that is wrong pulls as well."""
-    return bool(s.pushed_mps < PUSHED_MPS and s.bias_jumped == 0)
+    turned = s.bias_jumped == 1 or s.turn_s > LONGEST_TURN_S
+    return bool(s.pushed_mps < PUSHED_MPS and not turned)
 
 
 @compiled

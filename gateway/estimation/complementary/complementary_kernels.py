@@ -295,7 +295,10 @@ def is_under_way(s: ComplementaryState) -> bool:
 
 @compiled
 def is_moving(s: ComplementaryState, p: ComplementaryGains) -> bool:
-    """Return whether GPS or dead reckoning says that the aircraft moves."""
+    """Return whether GPS or dead reckoning says that the aircraft moves.
+
+    A bias that has jumped has turned the level, which then pulls the speed: only fixes tell it.
+    """
     since_fix = s.time_s - s.fix_s
     if since_fix > DEAD_RECKONING_MAX_S:
         return False

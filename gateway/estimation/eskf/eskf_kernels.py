@@ -213,7 +213,10 @@ def level_force(s: EskfState) -> Vec3:
 
 @compiled
 def is_moving(s: EskfState, p: EskfGains) -> bool:
-    """Return whether GPS or dead reckoning says that it moves, or without any the way it went."""
+    """Return whether GPS or dead reckoning says that it moves, or without any the way it went.
+
+    A bias that has jumped has turned the level, which then pulls the speed: only fixes tell it.
+    """
     if s.aided == 0 and s.flies == 1 and may_be_pushed(s):
         return True
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
