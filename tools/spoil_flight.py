@@ -19,10 +19,12 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.estimation.columns import (
     ACCEL,
+    ACCEL_UNCALIBRATED,
     GPS_ALT,
     GPS_LAT,
     GPS_VEL,
     GYRO,
+    GYRO_UNCALIBRATED,
     MAG,
     NAV_FLAGS,
     NAV_LAT,
@@ -37,6 +39,8 @@ HANG_S = 1.5
 RECOVERY_S = 20.0
 """So long after the disturbance an estimator has to be back."""
 GYRO_OFF_RADPS = math.radians(1.0)
+UNCALIBRATED_RADPS = np.radians([9.0, -8.0, 12.0])
+UNCALIBRATED_MPS2 = (0.4, -0.35, 0.5)
 ZERO_ROWS = 3
 ODD_SHARE = 0.003
 BLANK_SHARE = 0.01
@@ -160,6 +164,15 @@ def gyro_off(flight: Flight) -> Spoilt:
     return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
 
 
+def uncalibrated(flight: Flight) -> Spoilt:
+    """Let the inertial sensors be off as those of an MPU6050 that nobody has calibrated."""
+    imu = flight.log.imu.copy()
+    imu[:, GYRO : GYRO + 3] += UNCALIBRATED_RADPS
+    imu[:, ACCEL : ACCEL + 3] += UNCALIBRATED_MPS2
+    imu[:, [GYRO_UNCALIBRATED, ACCEL_UNCALIBRATED]] = 1.0
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+
+
 def half_rate(flight: Flight) -> Spoilt:
     """Lose every other sample of the IMU; what was new in it comes with the next."""
     imu, odd = flight.log.imu.copy(), np.arange(len(flight.log.imu)) % 2 == 1
@@ -208,6 +221,7 @@ SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "silence": silence,
     "mid_air": mid_air,
     "gyro_off": gyro_off,
+    "uncalibrated": uncalibrated,
     "half_rate": half_rate,
     "odd_samples": odd_samples,
     "imu_hangs": imu_hangs,

@@ -4,7 +4,8 @@ import math
 from typing import Annotated, Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, as_vec, fill, write_vec
+from gateway.estimation.flagbits import FRESH_GPS_S
+from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
@@ -20,21 +21,16 @@ SHAKEN: Final = 5.0
 """An engine that idles shakes the gyroscope by so many times more than rest without one."""
 STEADY: Final = 0.15
 """Its average stays this much closer to itself then: noise and vibration average out."""
-SLOW_TURN_RADPS: Final = 0.5 * RAD_PER_DEG
-"""A steady turn of less passes for a change of the bias, and turns little before it ends."""
-TURN_SIGMA: Final = 4.0
-LEAN_SQ: Final = 0.1
-"""Square of how far, as a share, the axis of such a turn leans from the mean force."""
 LONGEST_TURN_S: Final = 40.0
 """What seems to turn for longer is a bias that has changed, unless the compass turns too."""
 USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
 """A steady rate beyond this is more often a turn than a bias."""
 UNTURNED_RAD: Final = 4.0 * math.pi
-"""What seems to turn by more about the vertical, with no compass to contradict it, is a bias."""
+STANDING_UNTURNED_RAD: Final = 1.0
+"""What seems to turn by more about the vertical, with no compass to contradict it, is a bias; the
+second where fixes tell that it stands."""
 REST_FORCE_SHARE: Final = 0.2
 """By so much of gravity the force of a rest may seem to be off it."""
-LEAN_RAD: Final = 2.0 * RAD_PER_DEG
-"""So far the rate must seem to have turned the level before it is asked whether it has."""
 PUSH_MPS2: Final = 0.3
 PUSHED_SQ: Final = 9.0
 """A steady level force beyond both, three standard deviations of tilt, is no rest."""
@@ -158,7 +154,13 @@ def begin_rest(s: RestState, gyro: Vec3, accel: Vec3) -> None:
 
 @compiled
 def watch_rest(
-    s: RestState, p: RestGains, gyro: Vec3, accel: Vec3, moving: bool, dt: float
+    s: RestState,
+    p: RestGains,
+    gyro: Vec3,
+    accel: Vec3,
+    moving: bool,
+    fix_age_s: float,
+    dt: float,
 ) -> None:
     """Judge whether the aircraft stands: quiet sensors, small rate, no speed.
 
@@ -174,6 +176,8 @@ def watch_rest(
         Newest sample in body FRD, bias still in.
     moving : bool
         What GPS or dead reckoning says.
+    fix_age_s : float
+        Age of the newest fix, s.
     dt : float
         Time step, s.
     """
@@ -199,7 +203,7 @@ def watch_rest(
     rests, upright = quiet and not moving, abs(upright_rate(s))
     s.spun_rad = s.spun_rad + upright * dt if rests else 0.0
     s.spins = 1 if rests and not usual else 0
-    rests = rests and (s.spins == 0 or has_not_turned(s, upright))
+    rests = rests and (s.spins == 0 or has_not_turned(s, upright, fix_age_s))
     s.rest_s = s.rest_s + dt if stays(s, dt) and rests else 0.0
     if s.rest_s == 0.0:
         write_vec(s.rest_rate_b, as_vec(s.gyro_lp))
@@ -240,7 +244,7 @@ def is_usual_bias(s: RestState, rate: Vec3) -> bool:
 
 
 @compiled
-def has_not_turned(s: RestState, upright_radps: float) -> bool:
+def has_not_turned(s: RestState, upright_radps: float, fix_age_s: float) -> bool:
     """Return whether what seems to turn fast has turned nothing, so that the rate is a bias.
 
     About a level axis it would have turned the force, which stands still and is that of a rest.
@@ -253,10 +257,13 @@ def has_not_turned(s: RestState, upright_radps: float) -> bool:
         What has been seen.
     upright_radps : float
         Size of the rate about the vertical.
+    fix_age_s : float
+        Age of the newest fix, s; it does not move.
     """
     x, y, z = as_vec(s.accel_lp)
     force = math.sqrt(x * x + y * y + z * z) / STANDARD_GRAVITY_MPS2
-    told = s.spun_rad > UNTURNED_RAD or upright_radps < USUAL_BIAS_RADPS
+    most_rad = STANDING_UNTURNED_RAD if fix_age_s < FRESH_GPS_S else UNTURNED_RAD
+    told = s.spun_rad > most_rad or upright_radps < USUAL_BIAS_RADPS
     return told and abs(force - 1.0) < REST_FORCE_SHARE
 
 
@@ -288,98 +295,6 @@ def may_be_pushed(s: RestState) -> bool:
     """Return whether what pulls may be a push: a level that is wrong pulls as well."""
     turned = s.bias_jumped == 1 or s.turn_s > LONGEST_TURN_S
     return bool(s.pushed_mps < PUSHED_MPS and not turned)
-
-
-@compiled
-def turns_steadily(s: RestState, bias_b: Vec3, bias_std: float, dt: float) -> bool:
-    """Return whether the mean rate is that of a turn, since the bias is known not to be so large.
-
-    What turns slowly on a smooth road, on water or in calm air is as quiet as rest, and would teach
-    the bias its own rate. But it turns about the vertical: about a level axis gravity would turn in
-    the body, so a rate about that is a bias that has changed.
-
-    Parameters
-    ----------
-    s : RestState
-        Changed in place.
-    bias_b : tuple of 3 floats
-        The estimator's, rad/s.
-    bias_std : float
-        Its standard deviation along an axis, rad/s.
-    dt : float
-        Time step, s.
-    """
-    rate, force = as_vec(s.gyro_lp), as_vec(s.accel_lp)
-    off = (rate[0] - bias_b[0], rate[1] - bias_b[1], rate[2] - bias_b[2])
-    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
-    if norm == 0.0:
-        s.turn_s, s.bias_jumped = 0.0, 0
-        return False
-    up = (force[0] / norm, force[1] / norm, force[2] / norm)
-    along = off[0] * up[0] + off[1] * up[1] + off[2] * up[2]
-    lean = (off[0] - along * up[0], off[1] - along * up[1], off[2] - along * up[2])
-    lean_sq, upright_sq = lean[0] * lean[0] + lean[1] * lean[1] + lean[2] * lean[2], along * along
-    most_sq = (SLOW_TURN_RADPS + TURN_SIGMA * bias_std) ** 2
-    leans = lean_sq > max(most_sq, LEAN_SQ * upright_sq)
-    turns = s.bias_shown == 1 and upright_sq > most_sq and not leans
-    s.turn_s = s.turn_s + dt if turns else 0.0
-    leans = lean_sq > max(SLOW_TURN_RADPS**2, LEAN_SQ * upright_sq)
-    known = s.bias_shown == 1 or lean_sq > USUAL_BIAS_RADPS**2
-    leans = known and leans and not is_banked_turn(lean_sq, upright_sq, norm)
-    watch_lean(s, lean, up, leans, dt)
-    return bool(turns and s.turn_s < LONGEST_TURN_S and s.bias_jumped == 0)
-
-
-@compiled
-def is_banked_turn(lean_sq: float, upright_sq: float, force_mps2: float) -> bool:
-    """Return whether the force is that of a turn with such a rate across it and along it, squared.
-
-    In a turn that is flown the force stands still in the body, across which the axis of the turn
-    leans by the bank; and it is as much stronger than gravity as that bank takes.
-    """
-    if upright_sq == 0.0:
-        return False
-    share = math.sqrt(1.0 + lean_sq / upright_sq)
-    return force_mps2 > STANDARD_GRAVITY_MPS2 * (1.0 + 0.5 * (share - 1.0))
-
-
-@compiled
-def watch_lean(s: RestState, lean: Vec3, up: Vec3, leans: bool, dt: float) -> None:
-    """Look whether what seems to turn about a level axis turns the force in the body.
-
-    If not, the bias has jumped, and what now pulls is the level that it has turned.
-
-    Parameters
-    ----------
-    s : RestState
-        Changed in place.
-    lean : tuple of 3 floats
-        What of the mean rate in body FRD, the bias out of it, is across the force, rad/s.
-    up : tuple of 3 floats
-        Direction of the mean specific force in body FRD.
-    leans : bool
-        Whether that is more than a known bias explains, and is no banked turn.
-    dt : float
-        Time step, s.
-    """
-    if s.still == 0:
-        s.bias_jumped = 0
-        fill(s.lean_b, 0.0)
-        return
-    turned_sq, changed_sq = 0.0, 0.0
-    for k in range(3):
-        s.lean_b[k] += lean[k] * dt
-        turned_sq += s.lean_b[k] ** 2
-        changed_sq += (up[k] - s.lean_force_b[k]) ** 2
-    if s.bias_jumped == 1:
-        s.bias_jumped = 1 if changed_sq < LEAN_RAD * LEAN_RAD else 0
-    elif leans and turned_sq > LEAN_RAD * LEAN_RAD:
-        s.bias_jumped = 1 if changed_sq < 0.25 * turned_sq else 0
-    elif leans:
-        return
-    if s.bias_jumped == 0:
-        fill(s.lean_b, 0.0)
-        write_vec(s.lean_force_b, up)
 
 
 @compiled

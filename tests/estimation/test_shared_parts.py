@@ -16,6 +16,7 @@ from gateway.estimation.complementary.complementary_state import (
 from gateway.estimation.complementary.errors.compass_error import compass_variance, note_field
 from gateway.estimation.complementary.intake import reported_noise
 from gateway.estimation.filtering.height_intake import is_height_told
+from gateway.estimation.filtering.steady_turn import turns_steadily
 from gateway.estimation.kernel_record import FloatArray, copy_record, filled_record, new_record
 from gateway.estimation.local_position import PlaceState, is_relocked, move_origin
 from gateway.estimation.magfield import (
@@ -28,7 +29,7 @@ from gateway.estimation.magfield import (
     is_field_told,
 )
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestSettings, turns_steadily, watch_rest
+from gateway.estimation.rest import RestSettings, watch_rest
 from gateway.estimation.sensor_faults import (
     HOLD_S,
     UNKNOWN_HOLD_S,
@@ -62,7 +63,7 @@ class TestRest:
         state = new_record(ComplementaryState)
         state.accel_lp[2] = LEVEL[2]
         for k in range(round(seconds * 100)):
-            watch_rest(state, GAINS, gyro(k / 100), accel(k / 100), moving, 0.01)
+            watch_rest(state, GAINS, gyro(k / 100), accel(k / 100), moving, math.inf, 0.01)
         return int(state.at_rest)
 
     def test_still(self) -> None:

@@ -59,6 +59,7 @@ from gateway.estimation.filtering.sample_clock import (
     unseen_variances,
 )
 from gateway.estimation.filtering.sample_loop import kernels_of
+from gateway.estimation.filtering.steady_turn import turns_steadily
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
 from gateway.estimation.kernel import Kernels
@@ -71,7 +72,7 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import is_field_told
-from gateway.estimation.rest import is_pushed, outruns, turns_steadily, watch_rest
+from gateway.estimation.rest import is_pushed, outruns, watch_rest
 from gateway.estimation.rest_bias import doubt_rest_bias, has_spun
 from gateway.estimation.sensor_faults import (
     check_sensors,
@@ -244,8 +245,9 @@ def look_for_rest(
 ) -> None:
     """Look whether the aircraft stands, and what that says of the gyroscope's bias."""
     moving, rested, bias_b = is_moving(s, p), s.at_rest == 1, as_vec(s.bias_b)
-    turning = turns_steadily(s, bias_b, bias_std(s), dt) and s.time_s - s.fix_s > FRESH_GPS_S
-    watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), dt)
+    since_fix = s.time_s - s.fix_s
+    turning = turns_steadily(s, bias_b, bias_std(s), dt) and since_fix > FRESH_GPS_S
+    watch_rest(s, p, gyro, accel, moving or turning or is_pushed_on(s, dt), since_fix, dt)
     raise_bias_variance(s, DOUBT * doubt_rest_bias(s, bias_b, rested, moving, dt))
     if has_spun(s, bias_b):
         take_rest_bias(s, p)

@@ -57,6 +57,7 @@ from gateway.estimation.filtering.sample_clock import (
     unseen_variances,
 )
 from gateway.estimation.filtering.sample_loop import kernels_of
+from gateway.estimation.filtering.steady_turn import turns_steadily
 from gateway.estimation.flagbits import FRESH_GPS_S
 from gateway.estimation.history import remember
 from gateway.estimation.kernel import Kernels
@@ -80,7 +81,6 @@ from gateway.estimation.rest import (
     is_pushed,
     may_be_pushed,
     outruns,
-    turns_steadily,
     watch_rest,
 )
 from gateway.estimation.rest_bias import BIAS_CHANGE_RADPS, doubt_rest_bias, has_spun
@@ -159,7 +159,7 @@ def look_for_rest(s: EskfState, p: EskfGains, gyro: Vec3, accel: Vec3, dt: float
     """Look whether the aircraft stands, and what that says of the gyroscope's bias."""
     moving, rested = is_moving(s, p), s.at_rest == 1
     turning, pushed = is_turning(s, dt), is_pushed_on(s, dt)
-    watch_rest(s, p, gyro, accel, moving or turning or pushed, dt)
+    watch_rest(s, p, gyro, accel, moving or turning or pushed, s.time_s - s.fix_s, dt)
     bias_b = as_vec(s.gyro_bias_b)
     raise_bias_variance(s, doubt_rest_bias(s, bias_b, rested, moving, dt))
     if has_spun(s, bias_b):

@@ -137,7 +137,7 @@ def unbiased(
     """Take off the rate what the gyroscope last showed at rest."""
     speed_sq = fix_vel[0] * fix_vel[0] + fix_vel[1] * fix_vel[1] + fix_vel[2] * fix_vel[2]
     moving = fix_age_us < STALE_GPS_US and speed_sq > p.rest_speed_mps * p.rest_speed_mps
-    watch_rest(s, p, gyro, accel, moving, dt_s)
+    watch_rest(s, p, gyro, accel, moving, fix_age_us / US_PER_S, dt_s)
     if s.at_rest == 1:
         # A mean while this rest is young, then a low-pass.
         share = dt_s / min(s.rest_s - p.rest_time_s + dt_s, BIAS_TAU_S)
