@@ -59,16 +59,14 @@ class NodeCalibration(Settings, frozen=True):
     ] = FACE_UP
     accel_bias_mps2: Annotated[
         tuple[_Accel, _Accel, _Accel],
-        setting(
-            "Accelerometer bias in sensor axes; all zero if never calibrated.",
-            "m/s2",
-        ),
+        setting("Accelerometer bias in sensor axes; all zero if never calibrated.", "m/s2"),
     ] = _NO_OFFSET
     accel_matrix: Annotated[
         _Rows, setting("Rows of the accelerometer's scale and misalignment matrix.")
     ] = IDENTITY3
     gyro_bias_radps: Annotated[
-        tuple[_Rate, _Rate, _Rate], setting("Gyroscope bias in sensor axes.", "rad/s")
+        tuple[_Rate, _Rate, _Rate],
+        setting("Gyroscope bias in sensor axes; all zero if never calibrated.", "rad/s"),
     ] = _NO_OFFSET
     mag_mounting: Annotated[
         _Rows,

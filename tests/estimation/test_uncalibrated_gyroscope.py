@@ -37,12 +37,8 @@ TURNS_S, STANDS_S = 75.0, 120.0
 
 
 @cache
-def flown(seed: int, *, fixes: bool, compass: bool) -> Flight:
+def flown(seed: int, *, fixes: bool) -> Flight:
     flight = simulated_flight(seed, calibrated=True)
-    imu = flight.log.imu.copy()
-    if not compass:
-        imu[:, MAG : MAG + 3] = math.nan
-    flight = replace(flight, log=replace(flight.log, imu=imu))
     return flight if fixes else flight.with_gps(np.zeros(len(flight.log.gps), bool))
 
 
@@ -65,7 +61,7 @@ def errors(name: str, flight: Flight, bias_degps: tuple[float, ...]) -> np.ndarr
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_found_at_rest(name: str, fixes: bool, bias_degps: tuple[float, ...]) -> None:
     for seed in SEEDS:
-        flight = flown(seed, fixes=fixes, compass=True)
+        flight = flown(seed, fixes=fixes)
         later = flight.log.imu_time_us > FOUND_S * 1e6
         usual, off = (errors(name, flight, bias) for bias in ((0.0, 0.0, 0.0), bias_degps))
         assert np.nanmax(off[~later, 0]) < 5.0, "told before it was found"
@@ -105,7 +101,7 @@ def test_it_is_found_without_a_compass(
 
 def begun_in_the_air(seed: int, bias_degps: tuple[float, ...]) -> Flight:
     """Each sample says that nobody has calibrated the gyroscope."""
-    begun = mid_air(flown(seed, fixes=True, compass=True)).flight
+    begun = mid_air(flown(seed, fixes=True)).flight
     imu, time_us = begun.log.imu.copy(), begun.log.imu_time_us
     imu[:, GYRO_UNCALIBRATED] = 1.0
     imu[:, GYRO : GYRO + 3] += np.radians(bias_degps)

@@ -7,11 +7,11 @@ nothing tells that bias from tilt: it cannot be estimated, but the tilt is told 
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.covariance import renew
+from gateway.estimation.eskf.covariance import propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import ACCEL_BIAS, TILT, EskfState
 from gateway.estimation.filtering.uncalibrated import accel_bias_std
-from gateway.estimation.kernel_record import as_quat
+from gateway.estimation.kernel_record import as_quat, fill
 from gateway.geometry.quaternion import body_axes
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -26,6 +26,21 @@ def left_bias_mps2(s: EskfState) -> float:
 
 
 @compiled
+def left_bias_var(s: EskfState, p: EskfGains) -> float:
+    """Return the variance of the bias along an axis once GPS may tell it, (m/s2)2."""
+    return max(left_bias_mps2(s) ** 2, p.accel_bias_var)
+
+
+@compiled
+def forget_accel_bias(s: EskfState, p: EskfGains) -> None:
+    """Know nothing of the bias."""
+    propagate(s, p)
+    fill(s.accel_bias_b, 0.0)
+    for k in range(ACCEL_BIAS, ACCEL_BIAS + 3):
+        renew(s, k, left_bias_var(s, p))
+
+
+@compiled
 def standing_level_var(s: EskfState) -> float:
     """Return the variance of the tilt about a level axis by a bias that nothing tells yet, rad2."""
     if s.aided_before == 1:
@@ -36,7 +51,7 @@ def standing_level_var(s: EskfState) -> float:
 @compiled
 def doubt_level(s: EskfState, p: EskfGains) -> None:
     """Look for the bias from here on, and for what it has tilted."""
-    variance = max(left_bias_mps2(s) ** 2, p.accel_bias_var)
+    variance = left_bias_var(s, p)
     axes = body_axes(as_quat(s.q_nb))
     for k in range(3):
         renew(s, ACCEL_BIAS + k, variance)

@@ -15,7 +15,6 @@ from gateway.estimation.alignment.wahba import HAND_MPS, align_by_gravity, headi
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, level_variance, propagate, renew
 from gateway.estimation.eskf.eskf_settings import EskfGains
 from gateway.estimation.eskf.eskf_state import (
-    ACCEL_BIAS,
     GYRO_BIAS,
     GYRO_SCALE,
     TILT,
@@ -23,7 +22,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.iron import forget_iron
-from gateway.estimation.eskf.level_doubt import left_bias_mps2
+from gateway.estimation.eskf.level_doubt import forget_accel_bias
 from gateway.estimation.filtering.hidden_pull import forget_level
 from gateway.estimation.filtering.uncalibrated import gyro_bias_var
 from gateway.estimation.kernel_record import as_quat, as_vec, write_quat
@@ -151,13 +150,12 @@ def review_attitude(s: EskfState, p: EskfGains, dt: float) -> None:
 @compiled
 def doubt_sensors(s: EskfState, p: EskfGains) -> None:
     """Forget what the sensors have shown with GPS by an attitude that was wrong."""
-    propagate(s, p)
+    forget_accel_bias(s, p)
+    forget_iron(s, p)
     for k in range(3):
-        s.gyro_scale_b[k], s.accel_bias_b[k] = 0.0, 0.0
+        s.gyro_scale_b[k] = 0.0
         renew(s, GYRO_BIAS + k, gyro_bias_var(s, p.gyro_bias_var))
         renew(s, GYRO_SCALE + k, p.gyro_scale_var)
-        renew(s, ACCEL_BIAS + k, left_bias_mps2(s) ** 2)
-    forget_iron(s, p)
 
 
 @compiled

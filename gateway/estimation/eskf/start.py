@@ -29,7 +29,7 @@ from gateway.estimation.eskf.eskf_state import (
     EskfState,
 )
 from gateway.estimation.eskf.iron import forget_iron, start_iron_search
-from gateway.estimation.eskf.level_doubt import doubt_level, left_bias_mps2
+from gateway.estimation.eskf.level_doubt import doubt_level, forget_accel_bias
 from gateway.estimation.eskf.measure import compass_row
 from gateway.estimation.eskf.recovery import lose_attitude, turn_heading
 from gateway.estimation.filtering.sample_clock import (
@@ -142,15 +142,6 @@ def forget_gyro_bias(s: EskfState, p: EskfGains) -> None:
     s.bias_shown = 0
     for k in range(GYRO_BIAS, GYRO_BIAS + 3):
         renew(s, k, gyro_bias_var(s, p.gyro_bias_var))
-
-
-@compiled
-def forget_accel_bias(s: EskfState, p: EskfGains) -> None:
-    """Know nothing of the accelerometer's bias."""
-    propagate(s, p)
-    fill(s.accel_bias_b, 0.0)
-    for k in range(ACCEL_BIAS, ACCEL_BIAS + 3):
-        renew(s, k, max(left_bias_mps2(s) ** 2, p.accel_bias_var))
 
 
 @compiled

@@ -63,7 +63,7 @@ UNCALIBRATED_SENSORS: Final = (
     (ImuFlags.MAG_UNCALIBRATED, "Compass"),
     (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
 )
-UNCALIBRATED: Final = int(ImuFlags.MAG_UNCALIBRATED | ImuFlags.ACCEL_UNCALIBRATED)
+UNCALIBRATED: Final = sum(int(flag) for flag, _ in UNCALIBRATED_SENSORS)
 
 LATENCY_SETTLED_US: Final = 5_000_000
 """A latency that has not moved for so long is the one that the motion shows."""
