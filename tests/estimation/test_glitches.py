@@ -118,7 +118,7 @@ def rms_of(name: str, how: str) -> tuple[float, float, float, float, float]:
     ("name", "how", "limits"),
     [
         ("eskf", "run_off", (0.8, 2.0, 1.0, 0.9)),
-        ("eskf", "swing", (1.5, 2.2, 2.0, 0.8)),
+        ("eskf", "swing", (1.5, 2.2, 2.0, 0.9)),
         ("eskf", "wild_fix", (0.5, 1.2, 0.2, 0.95)),
         ("complementary", "run_off", (2.6, 6.0, 6.0, 0.7)),
         ("complementary", "swing", (2.9, 2.6, 7.0, 0.7)),

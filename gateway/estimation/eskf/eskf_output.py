@@ -41,9 +41,12 @@ from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 LEVEL_VAR = 0.1**2
 NO_HOLD_S = 1.0
+WENT_WRONG_S = 4.0
+"""A velocity that fixes contradict may have gone wrong evenly over about this time."""
 
 
 @compiled
@@ -73,9 +76,19 @@ def write_output(s: EskfState, row: FloatArray) -> None:
         for k in range(2):
             told = row[NAV_ATTITUDE_STD + k]
             lasting = standing_level_var(s) + hidden_level_var(s) + s.force_turn_var
+            lasting += contradicted_level_var(s)
             row[NAV_ATTITUDE_STD + k] = math.sqrt(told * told + lasting)
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_place(s, row)
+
+
+@compiled
+def contradicted_level_var(s: EskfState) -> float:
+    """Return the variance of the level where fixes contradict the velocity, rad2.
+
+    A level that is off by an angle takes gravity times that for an acceleration.
+    """
+    return (s.contradiction_mps / (WENT_WRONG_S * STANDARD_GRAVITY_MPS2)) ** 2
 
 
 @compiled
@@ -104,8 +117,9 @@ def write_place(s: EskfState, row: FloatArray) -> None:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
         write_std(row, NAV_VEL_STD, s, VEL)
         write_std(row, NAV_POS_STD, s, POS)
+        off_m = math.hypot(s.contradiction_m, 0.5 * WENT_WRONG_S * s.contradiction_mps)
         for k in range(2):
-            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.contradiction_m)
+            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], off_m)
             row[NAV_VEL_STD + k] = math.hypot(row[NAV_VEL_STD + k], s.contradiction_mps)
     elif s.time_s - s.fix_s < FRESH_GPS_S:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))

@@ -59,7 +59,8 @@ def shared_by(since_s: float) -> float:
 def doubt_velocity(s: EskfState, off_mps: float, explained: float, since_s: float) -> None:
     """Doubt the velocities of fixes by what one axis is off; see `lasting_excess`.
 
-    The true velocity may be either, so the filter's own is told no surer than that.
+    The true velocity may be either, so the filter's own is told no surer than that, nor are the
+    level that may have turned it away and the place where it has led.
     """
     counts = min(abs(off_mps), MOST_MPS)
     excess = lasting_excess(counts, explained, VELOCITY_GATE_SQ, shared_by(since_s))

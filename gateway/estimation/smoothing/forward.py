@@ -228,6 +228,8 @@ def run_forward(
         begin_node(s, p, P[k], F[k])
         doubt[k], on_compass[k] = standing_field_var(s), s.compass_share
         states[1] = states[0]
+        # Whether the fixes or the velocity were wrong, the other end tells.
+        copy.contradiction_mps = 0.0
         for i in range(nodes[k], nodes[k + 1]):
             now = imu_time_us[i]
             take_earlier(s, p, now, taken, baro_time_us, baro_alt_m, gps_time_us, gps)
