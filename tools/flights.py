@@ -56,7 +56,8 @@ class Flight:
     free_heading: bool = False
     """The reference's heading holds only up to a constant."""
     truth: dict[str, np.ndarray] = field(default_factory=dict)
-    """Of a simulated flight: velocity NED and depth."""
+    """Of a simulated flight: velocity NED and depth. Of one that an estimator judges: how unsure
+    the reference is, `attitude_std` in rad and `place_std` in m; see `score_honesty.judged_by`."""
 
     def with_gps(self, keep: np.ndarray) -> "Flight":
         """Leave out fixes."""

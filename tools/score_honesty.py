@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -67,24 +68,50 @@ def consistency(run: Run, seeds: Sequence[int]) -> dict[str, Scores]:
     return found
 
 
+def judged_by(flight: Flight, out: np.ndarray) -> Flight:
+    """Take what an estimator tells of a flight for its reference, no surer than it is told."""
+    told = {
+        "attitude_std": out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3],
+        "place_std": out[:, NAV_POS_STD : NAV_POS_STD + 2],
+    }
+    return replace(
+        flight,
+        q_nb=out[:, :4],
+        pos_ne_m=north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON]),
+        free_heading=False,
+        truth=flight.truth | told,
+    )
+
+
 def two_sigma(flight: Flight, out: np.ndarray) -> dict[str, np.ndarray]:
     """Tell the share of tilt, heading and place within two sigma at each instant, (n,) by kind.
 
-    NaN where there is no reference, nothing is told, or it does not count.
+    What the reference is unsure by counts, too. NaN where there is no reference, nothing is told,
+    or it does not count.
     """
     tilt, heading, place = (np.full(len(out), np.nan) for _ in range(3))
+    sure = np.zeros((len(out), 3))
+    unsure = flight.truth.get("attitude_std", sure)
     use = flight.counts & np.isfinite(flight.q_nb[:, 0]) & np.isfinite(out[:, NAV_ATTITUDE_STD])
     if use.any() and not flight.free_heading:
         true = Rotation.from_quat(flight.q_nb[use], scalar_first=True)
         found = Rotation.from_quat(out[use, :4], scalar_first=True)
-        told = out[use, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
+        told = np.hypot(out[use, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], unsure[use])
         within = np.abs((true * found.inv()).as_rotvec()) < 2.0 * told
         tilt[use], heading[use] = within[:, :2].mean(axis=1), within[:, 2]
     off = north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON]) - flight.pos_ne_m
-    use = flight.counts & np.isfinite(off[:, 0]) & np.isfinite(out[:, NAV_POS_STD])
-    told = out[use, NAV_POS_STD : NAV_POS_STD + 2]
-    place[use] = (np.abs(off[use]) < 2.0 * told).mean(axis=1)
+    told = np.hypot(
+        out[:, NAV_POS_STD : NAV_POS_STD + 2], flight.truth.get("place_std", sure[:, :2])
+    )
+    use = flight.counts & np.isfinite(off[:, 0]) & np.isfinite(told[:, 0])
+    place[use] = (np.abs(off[use]) < 2.0 * told[use]).mean(axis=1)
     return {"tilt": tilt, "heading": heading, "place": place}
+
+
+def shares_after(flight: Flight, out: np.ndarray, since_s: float) -> dict[str, float]:
+    """Average `two_sigma` from a time on, by kind."""
+    late = flight.log.imu_time_us * 1e-6 >= since_s
+    return {kind: share(within[late]) for kind, within in two_sigma(flight, out).items()}
 
 
 def share(within: np.ndarray) -> float:

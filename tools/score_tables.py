@@ -44,8 +44,11 @@ SCORES = {
 RATES = ("samples_per_s", "singly_per_s")
 """Over a whole log at once, and sample by sample."""
 KINDS = ("tilt", "heading", "place")
-SPANS = {"2s": "", "out10": "10 s\n", "out30": "30 s\n", "alone": "no GPS\n"}
-"""With GPS, in outages of two lengths, and without GPS throughout."""
+SPANS = {
+    "2s": "", "out10": "10 s\n", "out30": "30 s\n", "spoilt": "spoilt\n", "alone": "no GPS\n",
+}  # fmt: skip
+"""With GPS, in outages of two lengths, after the disturbance where it holds least of all, and
+without GPS throughout."""
 
 
 def targets_for(flight: str, name: str, rows: dict[str, Scores]) -> Scores:
@@ -71,7 +74,10 @@ def show_scores(board: dict[str, dict[str, Scores]]) -> None:
 
 def show_honesty(board: dict[str, dict[str, Scores]]) -> None:
     """Print how often the errors lie within two standard deviations told."""
-    title = "Instants within two sigma in %: with GPS, in outages, without any GPS (and deg off)"
+    title = (
+        "Instants within two sigma in %: with GPS, in outages, after the worst disturbance, "
+        "without any GPS (and deg off)"
+    )
     heads = [f"{words}{kind}" for words in SPANS.values() for kind in KINDS]
     # Without GPS there is no place.
     table = table_of(title, (*heads[:-1], "incl.", "head."))
