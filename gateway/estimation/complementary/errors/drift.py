@@ -216,7 +216,7 @@ def carry_drift(s: ComplementaryState, p: ComplementaryGains) -> None:
         limit_variance(s.drift_cov, FORCE + k, force_bias_var(s))
         turn[0, k] = turn[1, k] = turn[2, k] = 0.0
         scaled[0, k] = scaled[1, k] = scaled[2, k] = 0.0
-    known = s.heading_known == 1 and s.level_by_gps == 1 and s.iron_doubted == 0
+    known = s.heading_known == 1 and s.level_by_gps == 1
     watch_bias_corrections(s, known, s.carried_s)
     s.carried_s = s.carried_rad = 0.0
 

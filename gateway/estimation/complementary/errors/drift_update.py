@@ -75,9 +75,17 @@ def correct_drift(
     reduce_covariance(s, spread, count)
     std = math.sqrt(spread)
     off = max(-clip, min(clip, innovation / std))
-    for k in range(3):
-        note_bias_correction(s, k, off, s.drift_gain[k] / std)
+    if s.iron_doubted == 0 or not is_of_field(s):
+        for k in range(3):
+            note_bias_correction(s, k, off, s.drift_gain[k] / std)
     apply_gain(s, p, off / std, count)
+
+
+@compiled
+def is_of_field(s: ComplementaryState) -> bool:
+    """Return whether the measurement in `drift_row` is one of the compass."""
+    row = s.drift_row
+    return bool(row[IRON] != 0.0 or row[IRON + 1] != 0.0 or row[IRON + 2] != 0.0)
 
 
 @compiled
