@@ -20,12 +20,15 @@ from gateway.estimation.columns import (
     NAV_VEL,
     NAV_VEL_STD,
 )
+from gateway.estimation.eskf.eskf_settings import EskfSettings
 from gateway.estimation.kernel import SampleLog
+from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import ALT_M, LAT_DEG
 from tests.estimation.test_receiver_noise import FIELD_N_UT
 from tests.estimation.test_without_compass import (
     FIXES_HZ,
+    REFERENCE,
     correlated,
     estimator_of,
     flight,
@@ -137,6 +140,21 @@ def test_a_glitch_spoils_neither_level_nor_heading(
 def test_a_velocity_that_fixes_contradict_is_told_as_unsure_as_that(how: str, share: float) -> None:
     """Fixes without latency, as a log may hold them, are doubted as well as late ones."""
     assert rms_of("eskf", how)[4] > share
+
+
+def test_a_velocity_that_is_given_up_is_contradicted_no_more() -> None:
+    """GPS ends in the midst of a glitch: the level rests on gravity then."""
+    for seed in SEEDS:
+        log, _, _ = spoilt(seed, "swing")
+        before = log.gps_time_us < (BEGINS_S + 0.5 * LASTS_S) * 1e6
+        eskf = EskfSettings(dead_reckoning_s=5.0)
+        settings = EstimationSettings(estimator="eskf", eskf=eskf, reference=REFERENCE)
+        alone = replace(log, gps_time_us=log.gps_time_us[before], gps=log.gps[before])
+        out = make_estimator(settings).run(alone)
+        told_deg = np.degrees(out[:, NAV_ATTITUDE_STD])
+        ended = int(np.searchsorted(log.imu_time_us, log.gps_time_us[before][-1]))
+        assert told_deg[ended] > 4.0
+        assert told_deg[-1] < 2.0
 
 
 def test_errors_that_a_receiver_tells_of_are_taken_to_last() -> None:

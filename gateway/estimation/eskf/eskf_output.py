@@ -86,8 +86,11 @@ def write_output(s: EskfState, row: FloatArray) -> None:
 def contradicted_level_var(s: EskfState) -> float:
     """Return the variance of the level where fixes contradict the velocity, rad2.
 
-    A level that is off by an angle takes gravity times that for an acceleration.
+    A level that is off by an angle takes gravity times that for an acceleration. Once the velocity
+    is given up, the level rests on gravity.
     """
+    if s.aided == 0:
+        return 0.0
     return (s.contradiction_mps / (WENT_WRONG_S * STANDARD_GRAVITY_MPS2)) ** 2
 
 
