@@ -304,10 +304,9 @@ def spoilt_scores(
             found[how] = (*off.as_told().after(since_s), off.told_share(since_s))
             if name in TELLING:
                 shares.append(shares_after(spoilt.flight, spoilt_out, spoilt.ends_s))
-    lowest = {
-        f"{kind}_spoilt": min(each[kind] for each in shares) for kind in (KINDS if shares else ())
-    }
-    return found, lowest
+    if not shares:
+        return found, {}
+    return found, {f"{kind}_spoilt": min(each[kind] for each in shares) for kind in KINDS}
 
 
 def flights_to_score(folder: Path, only: Sequence[str] | None) -> list[Flight]:

@@ -3,7 +3,7 @@
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import as_vec, write_vec
+from gateway.estimation.kernel_record import as_vec, fill, write_vec
 from gateway.estimation.rest import USUAL_BIAS_RADPS, RestState, largest_difference
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -57,6 +57,13 @@ def doubt_rest_bias(s: RestState, bias_b: Vec3, rested: bool, moving: bool, dt: 
         return BIAS_CHANGE_RADPS
     change = largest_difference(bias_b, as_vec(s.flown_bias_b))
     return min(max(change, LEAST_CHANGE_RADPS), BIAS_CHANGE_RADPS)
+
+
+@compiled
+def forget_shown_bias(s: RestState) -> None:
+    """Forget that a rest has shown the bias."""
+    fill(s.shown_bias_b, 0.0)
+    s.bias_shown = 0
 
 
 @compiled

@@ -6,13 +6,12 @@ from pathlib import Path
 import pytest
 
 from tools.flights import read_flight
-from tools.score_estimators import best_known, run_complementary, run_eskf
+from tools.score_estimators import OWN, best_known
 from tools.score_honesty import shares_after
 from tools.spoil_flight import SPOILS, applies
 
 pytestmark = pytest.mark.slow
 
-RUNS = {"eskf": run_eskf, "complementary": run_complementary}
 FLIGHTS = (
     "arduplane_testlog2",
     "broad_02_undisturbed_slow_rotation_B",
@@ -22,15 +21,13 @@ FLIGHTS = (
     "px4_f450_glitch",
     "px4_mocap_log008",
 )
-
-
 LEAST = 0.9
 """Share of the time within two standard deviations."""
 LEAST_LEANING = 0.85
 """The accelerometer's bias leans a quadrotor that hovers by 3 deg until it turns."""
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", ["eskf", "complementary"])
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_errors_are_within_what_is_told(data_dir: Path, flight: str, name: str) -> None:
     """By what the flight tells from both ends, which is not sure itself."""
@@ -38,7 +35,7 @@ def test_errors_are_within_what_is_told(data_dir: Path, flight: str, name: str) 
     low = {}
     for how in (how for how in SPOILS if applies(how, known)):
         spoilt = SPOILS[how](known)
-        shares = shares_after(spoilt.flight, RUNS[name](spoilt.flight), spoilt.ends_s)
+        shares = shares_after(spoilt.flight, OWN[name](spoilt.flight), spoilt.ends_s)
         assert math.isfinite(shares["tilt"])
         hovers = flight == "px4_f450_glitch" and how == "uncalibrated"
         least = LEAST_LEANING if hovers else LEAST

@@ -1,6 +1,7 @@
 """What the filter tells: its output row, standard deviations and flags."""
 
 import math
+from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.columns import (
@@ -43,9 +44,9 @@ from gateway.geometry.geodesy import offset_deg
 from gateway.records import NAN
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-LEVEL_VAR = 0.1**2
-NO_HOLD_S = 1.0
-WENT_WRONG_S = 4.0
+LEVEL_VAR: Final = 0.1**2
+NO_HOLD_S: Final = 1.0
+WENT_WRONG_S: Final = 4.0
 """A velocity that fixes contradict may have gone wrong evenly over about this time."""
 
 

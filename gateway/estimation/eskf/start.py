@@ -12,7 +12,6 @@ from gateway.estimation.alignment.review import (
     GAP_TILT_RATE,
 )
 from gateway.estimation.alignment.wahba import carry_frame
-from gateway.estimation.columns import ACCEL_UNCALIBRATED, GYRO_UNCALIBRATED, MAG_UNCALIBRATED
 from gateway.estimation.compass_lag import begin_lag
 from gateway.estimation.eskf.covariance import NO_HEADING_VAR, propagate, renew, update_scalar
 from gateway.estimation.eskf.eskf_settings import EskfGains
@@ -42,7 +41,7 @@ from gateway.estimation.filtering.sample_clock import (
     silent_rate,
     silent_variance,
 )
-from gateway.estimation.filtering.uncalibrated import gyro_bias_var
+from gateway.estimation.filtering.uncalibrated import gyro_bias_var, note_flags
 from gateway.estimation.kernel_record import (
     FloatArray,
     as_quat,
@@ -53,6 +52,7 @@ from gateway.estimation.kernel_record import (
 )
 from gateway.estimation.local_position import NEVER_S
 from gateway.estimation.magfield import UNCALIBRATED_IRON_UT
+from gateway.estimation.rest_bias import forget_shown_bias
 from gateway.estimation.sensor_faults import is_sound, is_start
 from gateway.geometry.quaternion import (
     from_euler,
@@ -111,26 +111,16 @@ def note_calibration(s: EskfState, p: EskfGains, row: FloatArray) -> None:
 
     Once one is calibrated, what was found of its error is out of it.
     """
-    if (row[MAG_UNCALIBRATED] != 0.0) != (s.mag_uncalibrated == 1):
-        note_compass(s, p)
-    if (row[GYRO_UNCALIBRATED] != 0.0) != (s.gyro_uncalibrated == 1):
-        s.gyro_uncalibrated = 1 - s.gyro_uncalibrated
-        forget_gyro_bias(s, p)
-    if (row[ACCEL_UNCALIBRATED] != 0.0) != (s.accel_uncalibrated == 1):
-        s.accel_uncalibrated = 1 - s.accel_uncalibrated
-        if s.aided_before == 1:
-            forget_accel_bias(s, p)
-
-
-@compiled
-def note_compass(s: EskfState, p: EskfGains) -> None:
-    """Turn what is known of the compass's calibration into the opposite."""
-    s.mag_uncalibrated = 1 - s.mag_uncalibrated
-    if s.mag_uncalibrated == 1:
+    mag, gyro, accel = note_flags(s, row)
+    if mag and s.mag_uncalibrated == 1:
         s.left_iron_ut = max(s.left_iron_ut, UNCALIBRATED_IRON_UT)
-    else:
+    elif mag:
         s.left_iron_ut = math.sqrt(p.mag_bias_var)
         forget_iron(s, p)
+    if gyro:
+        forget_gyro_bias(s, p)
+    if accel and s.aided_before == 1:
+        forget_accel_bias(s, p)
 
 
 @compiled
@@ -138,8 +128,7 @@ def forget_gyro_bias(s: EskfState, p: EskfGains) -> None:
     """Know nothing of the gyroscope's bias."""
     propagate(s, p)
     fill(s.gyro_bias_b, 0.0)
-    fill(s.shown_bias_b, 0.0)
-    s.bias_shown = 0
+    forget_shown_bias(s)
     for k in range(GYRO_BIAS, GYRO_BIAS + 3):
         renew(s, k, gyro_bias_var(s, p.gyro_bias_var))
 

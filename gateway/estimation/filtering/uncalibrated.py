@@ -3,6 +3,8 @@
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.columns import ACCEL_UNCALIBRATED, GYRO_UNCALIBRATED, MAG_UNCALIBRATED
+from gateway.estimation.kernel_record import FloatArray
 from gateway.units import RAD_PER_DEG
 
 UNCALIBRATED_GYRO_RADPS: Final = 3.0 * RAD_PER_DEG
@@ -15,12 +17,41 @@ CALIBRATED_MOST_MPS2: Final = 0.5
 
 
 class UncalibratedState:
-    """Which inertial sensors have no calibration; see `FieldState` for the compass."""
+    """Which sensors have no calibration."""
 
+    mag_uncalibrated: int
+    """See `FieldState`."""
     gyro_uncalibrated: int
     accel_uncalibrated: int
     bias_shown: int
     """See `RestState`."""
+
+
+@compiled
+def note_flags(s: UncalibratedState, row: FloatArray) -> tuple[bool, bool, bool]:
+    """Note what a sample's row says of the calibration of its sensors.
+
+    Parameters
+    ----------
+    s : UncalibratedState
+        Changed in place.
+    row : ndarray, shape (IMU_COLUMNS,)
+        See `columns`.
+
+    Returns
+    -------
+    mag, gyro, accel : bool
+        Whether that is another than before: what was found of the sensor's error is out of it then.
+    """
+    mag, gyro = row[MAG_UNCALIBRATED] != 0.0, row[GYRO_UNCALIBRATED] != 0.0
+    accel = row[ACCEL_UNCALIBRATED] != 0.0
+    changed = (
+        mag != (s.mag_uncalibrated == 1),
+        gyro != (s.gyro_uncalibrated == 1),
+        accel != (s.accel_uncalibrated == 1),
+    )
+    s.mag_uncalibrated, s.gyro_uncalibrated, s.accel_uncalibrated = int(mag), int(gyro), int(accel)
+    return changed
 
 
 @compiled

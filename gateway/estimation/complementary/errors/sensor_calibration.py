@@ -1,7 +1,6 @@
 """Whether the sensors are calibrated. Once one is, what was found of its error is out of it."""
 
 from gateway.compiled import compiled
-from gateway.estimation.columns import ACCEL_UNCALIBRATED, GYRO_UNCALIBRATED, MAG_UNCALIBRATED
 from gateway.estimation.complementary.complementary_state import (
     FORCE,
     ComplementaryGains,
@@ -14,23 +13,22 @@ from gateway.estimation.complementary.errors.drift import (
     forget_iron,
 )
 from gateway.estimation.filtering.iron_evidence import forget_strength
+from gateway.estimation.filtering.uncalibrated import note_flags
 from gateway.estimation.kernel_record import FloatArray, fill
+from gateway.estimation.rest_bias import forget_shown_bias
 
 
 @compiled
 def note_calibration(s: ComplementaryState, p: ComplementaryGains, row: FloatArray) -> None:
     """Note what a sample's row says of the calibration of its sensors."""
-    if (row[MAG_UNCALIBRATED] != 0.0) != (s.mag_uncalibrated == 1):
-        s.mag_uncalibrated = 1 - s.mag_uncalibrated
-        if s.mag_uncalibrated == 0:
-            carry_drift(s, p)
-            forget_iron(s)
-            forget_strength(s)
-    if (row[GYRO_UNCALIBRATED] != 0.0) != (s.gyro_uncalibrated == 1):
-        s.gyro_uncalibrated = 1 - s.gyro_uncalibrated
+    mag, gyro, accel = note_flags(s, row)
+    if mag and s.mag_uncalibrated == 0:
+        carry_drift(s, p)
+        forget_iron(s)
+        forget_strength(s)
+    if gyro:
         forget_gyro_bias(s, p)
-    if (row[ACCEL_UNCALIBRATED] != 0.0) != (s.accel_uncalibrated == 1):
-        s.accel_uncalibrated = 1 - s.accel_uncalibrated
+    if accel:
         forget_accel_bias(s, p)
 
 
@@ -39,8 +37,7 @@ def forget_gyro_bias(s: ComplementaryState, p: ComplementaryGains) -> None:
     """Know nothing of the gyroscope's bias."""
     carry_drift(s, p)
     fill(s.bias_b, 0.0)
-    fill(s.shown_bias_b, 0.0)
-    s.bias_shown = 0
+    forget_shown_bias(s)
     for k in range(3):
         begin_state(s, k, p.bias_initial_radps**2)
 
