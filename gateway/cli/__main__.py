@@ -13,6 +13,9 @@ def main() -> None:
     # Imports leave hardly any garbage, and collecting it takes a tenth of the start. `load_command`
     # enables the collector again.
     gc.disable()
+    # For every Python process started from here, those of multiprocessing included: the current
+    # folder, which may be one of unpacked recordings, must not be on its module path.
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         # Imported here, so that Ctrl-C works during half a second of imports.
         from gateway.cli.app import main as run

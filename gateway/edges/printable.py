@@ -1,27 +1,74 @@
-"""Text of others, from recordings and the network, as a terminal or a log may be given it."""
+"""Sanitise text from recordings and the network before a terminal or a log shows it."""
 
 import logging
 from typing import Final
 
-_CONTROLS: Final = {
-    code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
-}
-"""A terminal obeys them: they move its cursor, rename its window, type for its user."""
+_CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
+"""C0 and C1 control characters move the cursor, rename the window, or type for the user."""
+_INVISIBLE: Final = (
+    *(0xAD, 0x61C, 0x180E, 0x200B, 0x200E, 0x200F),
+    *range(0x2028, 0x202F),
+    *range(0x2060, 0x2070),
+    *(0xFEFF, *range(0xFFF9, 0xFFFC)),
+    *range(0xE0000, 0xE0080),
+)
+"""Unicode controls of direction and line breaks, and invisible format characters: a name with
+U+202E is read backwards. The joiners U+200C and U+200D are left, since scripts need them."""
+_KEPT: Final = frozenset(map(ord, "\n\t"))
+
+
+def _escape(code: int) -> str:
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def _json_escape(code: int) -> str:
+    units = chr(code).encode("utf-16-be").hex()
+    return "".join(f"\\u{units[at : at + 4]}" for at in range(0, len(units), 4))
+
+
+_ESCAPES: Final = {code: _escape(code) for code in (*_CONTROL, *_INVISIBLE) if code not in _KEPT}
+_JSON_ESCAPES: Final = {code: _json_escape(code) for code in (*_CONTROL[0x20:], *_INVISIBLE)}
+"""Characters that JSON allows unescaped in a string; it escapes those below U+0020 itself."""
 LONGEST: Final = 2000
-"""Letters of a log line; an address that a page is asked for may have 60,000."""
+"""Letters of a log line; an address requested from the panel may have 60,000."""
 
 
 def printable(text: str) -> str:
-    r"""Return a text with its control characters as `\xNN`; lines and tabs stay."""
-    return text.translate(_CONTROLS)
+    r"""Return a text with control and direction characters escaped.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        With `\xNN`, `\uNNNN` or `\UNNNNNNNN` for each such character; line feeds and tabs stay.
+    """
+    return text.translate(_ESCAPES)
+
+
+def printable_json(text: str) -> str:
+    r"""Return a JSON document with control and direction characters as `\uNNNN`."""
+    return text.translate(_JSON_ESCAPES)
 
 
 class PrintableFormatter(logging.Formatter):
-    """Formats log lines whose texts may come from others."""
+    """Format log lines that may contain text from the network."""
 
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record; what others fill it with is cut off."""
-        line = super().format(record)
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 -- of the base class
+        """Return the line of a record, cut to `LONGEST`; further lines of it are indented.
+
+        The indentation prevents a text that contains a line feed from imitating a log line.
+        """
+        line = super().formatMessage(record)
         if len(line) > LONGEST and not record.exc_info:
             line = f"{line[:LONGEST]}…"
-        return printable(line)
+        return line.replace("\n", "\n    ")
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the whole record, a traceback included, without control characters."""
+        return printable(super().format(record))

@@ -7,7 +7,6 @@ and its aircraft get system ids that no live one has.
 import asyncio
 import logging
 import os
-import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gateway.edges.disk.recordings import RecordingError, find_recording
+from gateway.edges.operator.attachment import own_command
 from gateway.edges.operator.control_socket import ControlError
 from gateway.panel.control_client import ControlClient
 from gateway.panel.recorded_aircraft import FUSED_AGAIN, RecordedAircraft, free_ids, look_into
@@ -190,8 +190,7 @@ class Playback:
         for system_id in firsts:
             arguments += ["--as", str(system_id)]
         child = self._child = await asyncio.create_subprocess_exec(
-            sys.executable,
-            *("-m", "gateway.cli", *arguments),
+            *own_command(*arguments),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,

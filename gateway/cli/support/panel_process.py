@@ -3,12 +3,13 @@
 import asyncio
 import logging
 import os
-import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
+
+from gateway.edges.operator.attachment import own_command
 
 log = logging.getLogger(__name__)
 
@@ -39,9 +40,9 @@ class PanelProcess:
     def __init__(self, config: Path | None) -> None:
         self.link = ""
         """The page's address; empty while there is none."""
-        self._arguments = ["-m", "gateway.cli", "panel", "--attached"]
+        self._command = own_command("panel", "--attached")
         if config is not None:
-            self._arguments += ["--config", str(config)]
+            self._command += ["--config", str(config)]
         self._task: asyncio.Task[None] | None = None
         self._child: asyncio.subprocess.Process | None = None
 
@@ -77,8 +78,7 @@ class PanelProcess:
         wait_s = RESTART_S
         while True:
             self._child = await asyncio.create_subprocess_exec(
-                sys.executable,
-                *self._arguments,
+                *self._command,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.STDOUT,

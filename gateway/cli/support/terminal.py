@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from gateway.edges.printable import printable
+from gateway.edges.printable import printable, printable_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from collections.abc import Iterator
+
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
     from rich.table import Table
     from rich.text import Text
 
@@ -17,8 +20,6 @@ ENDLESS: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
-_C1_IN_JSON: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
-"""Control characters that JSON may hold as they are, and terminals obey."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 
@@ -33,7 +34,14 @@ def console_of(*, stderr: bool = False) -> Console:
 
     class PrintableConsole(Console):
         def render_str(self, text: str, **how: Any) -> Text:
+            # Before the layout, so that columns stay aligned.
             return super().render_str(printable(text), **how)
+
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterator[Segment]:
+            for segment in super().render(renderable, options):
+                yield segment if segment.control else segment._replace(text=printable(segment.text))
 
     console = PrintableConsole(
         stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False
@@ -48,7 +56,7 @@ def print_json(value: object) -> None:
     # Imported late, because a service prints nothing.
     import msgspec
 
-    print(msgspec.json.encode(value).decode().translate(_C1_IN_JSON))
+    print(printable_json(msgspec.json.encode(value).decode()))
 
 
 def table_of(*columns: str, left: int = 1) -> Table:

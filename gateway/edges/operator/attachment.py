@@ -47,3 +47,21 @@ def on_end_signals(end: Callable[[], None]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             loop.add_signal_handler(number, end)
+
+
+def own_command(*words: str) -> list[str]:
+    """Return the command line that starts mavgate as a child process.
+
+    `-P` keeps the current folder off the child's module path: a `msgspec.py` among unpacked
+    recordings would be imported instead of the library.
+
+    Parameters
+    ----------
+    *words : str
+        Command and options, as after `mavgate`.
+
+    Returns
+    -------
+    list of str
+    """
+    return [sys.executable, "-P", "-m", "gateway.cli", *words]

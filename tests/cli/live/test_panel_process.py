@@ -1,6 +1,7 @@
 """The panel ends with the gateway, before the event loop does."""
 
 import asyncio
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ async def test_it_has_ended_when_it_is_closed(
 ) -> None:
     monkeypatch.setattr(panel_process, "END_S", 0.2 if begin else 60.0)
     panel = PanelProcess(None)
-    panel._arguments = ["-c", begin + SAYING]
+    panel._command = [sys.executable, "-c", begin + SAYING]
     panel.start(control_socket)
     while not panel.link:
         await asyncio.sleep(0.01)
@@ -35,7 +36,7 @@ async def test_it_has_ended_when_it_is_closed(
 @pytest.mark.io
 async def test_a_line_of_any_length_leaves_the_next_to_be_read() -> None:
     panel = PanelProcess(None)
-    panel._arguments = ["-c", "print('x' * 200_000); " + SAYING]
+    panel._command = [sys.executable, "-c", "print('x' * 200_000); " + SAYING]
     panel.start(control_socket)
     async with asyncio.timeout(60.0):
         while not panel.link:

@@ -1,0 +1,82 @@
+"""Python files in the current folder, as among unpacked recordings, are never imported."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gateway.edges.operator.attachment import own_command
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("msgspec", "typer", "numpy", "pickle", "selectors", "multiprocessing", "gateway")
+SPAWN = """
+import multiprocessing, sys
+from gateway.cli.__main__ import main
+
+def work() -> None:
+    import msgspec
+
+if __name__ == "__main__":
+    sys.argv[1:] = ["--version"]
+    try:
+        main()
+    except SystemExit:
+        pass
+    process = multiprocessing.get_context("spawn").Process(target=work)
+    process.start()
+    process.join()
+    sys.exit(process.exitcode)
+"""
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder whose modules leave a mark when they are imported."""
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    for name in NAMES:
+        (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'a').write('ran')\n")
+    return folder
+
+
+def run_in(folder: Path, *words: str) -> None:
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    assert not (folder.parent / "mark").exists(), "a file of the current folder was executed"
+    assert done.returncode == 0, done.stderr
+
+
+def test_child_process_imports_nothing_from_the_current_folder(folder: Path) -> None:
+    run_in(folder, *own_command("check-config"))
+
+
+def test_process_pool_imports_nothing_from_the_current_folder(folder: Path) -> None:
+    """`multiprocessing` starts its processes as `python -c`."""
+    script = folder.parent / "mavgate"
+    script.write_text(SPAWN)
+    run_in(folder, sys.executable, str(script))
+
+
+def test_every_python_child_is_started_with_a_safe_module_path() -> None:
+    unsafe = []
+    for path in sorted((ROOT / "gateway").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            words = getattr(node, "elts", None) or getattr(node, "args", None) or []
+            if not isinstance(words, list) or not words:
+                continue
+            first = words[0]
+            if not isinstance(first, ast.expr) or ast.unparse(first) != "sys.executable":
+                continue
+            option = words[1].value if isinstance(words[1], ast.Constant) else None
+            if option not in ("-P", "-I"):
+                unsafe.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert unsafe == []
+
+
+def test_service_runs_the_installed_script() -> None:
+    unit = (ROOT / "tools" / "mavgate.service").read_text()
+    [start] = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
+    assert start.startswith("ExecStart=/usr/bin/mavgate run")
