@@ -83,6 +83,21 @@ class RecordingSettings(Settings, frozen=True):
             le=60,
         ),
     ] = 0.5
+    unpacked_limit_mb: Annotated[
+        float,
+        setting(
+            "Maximum unpacked size of a gzipped log that is read as a whole (ULog, DataFlash, "
+            "Parquet, and a tlog to be played).",
+            "MB",
+            ge=1,
+            le=1e6,
+        ),
+    ] = 1000.0
+
+    @property
+    def unpacked_limit(self) -> int:
+        """The same in bytes."""
+        return round(self.unpacked_limit_mb * 1e6)
 
 
 class SessionState(StrEnum):

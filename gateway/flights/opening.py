@@ -87,7 +87,7 @@ def open_flights(
         flight = OpenFlight()
         if kind_of(parts[0]) is FileKind.TLOG:
             for file in parts:
-                tlog = TlogFile(file, options.progress, flight.answers)
+                tlog = TlogFile(file, options.progress, flight.answers, options.unpacked_limit)
                 opened.callback(tlog.close)
                 flight.sources.append(tlog)
         else:

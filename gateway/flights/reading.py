@@ -16,6 +16,7 @@ import numpy as np
 
 from gateway.aircraft import AircraftSettings
 from gateway.edges.disk.recording_streams import (
+    MAX_UNPACKED,
     OTHER_FORMATS,
     PARQUET,
     FileKind,
@@ -70,6 +71,8 @@ class ReadOptions:
     system_id: int | None = None
     """The vehicle of a tlog to take."""
     progress: Progress | None = None
+    unpacked_limit: int = MAX_UNPACKED
+    """Maximum unpacked size of a packed file that is read as a whole, in bytes."""
 
 
 @dataclass(slots=True)

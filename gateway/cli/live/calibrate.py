@@ -20,6 +20,7 @@ from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_aircraft,
+    read_options,
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
@@ -31,8 +32,7 @@ from gateway.edges.receiver.serial_port import (
     SerialSettings,
     open_port,
 )
-from gateway.flights.reading import ReadOptions, open_rows
-from gateway.pipeline import PipelineSettings
+from gateway.flights.reading import open_rows
 from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.procedure import (
@@ -222,7 +222,7 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
     raws, moving, fix = list[ImuRaw](), list[bool](), _Fix()
     with refusing():
         (path, *_) = files_of([path], folder_of(settings), "tables")
-        table = open_rows(path, ReadOptions(current=PipelineSettings(settings.default_aircraft)))
+        table = open_rows(path, read_options(settings))
         for row in table.plain_rows:
             if row.gps is not None and row.gps.node.vehicle_id == vehicle:
                 fix = _Fix(row.gps.time_us, _speed_mps(row.gps) > MOVING_MPS)

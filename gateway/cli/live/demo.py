@@ -33,7 +33,7 @@ from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
     or_refuse,
-    pipeline_settings,
+    read_options,
 )
 from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
@@ -41,7 +41,6 @@ from gateway.daemon import Daemon
 from gateway.edges.clock import unix_time_us
 from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import with_reference
-from gateway.flights.reading import ReadOptions
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
@@ -139,9 +138,7 @@ def recorded_line(
     with refusing():
         files = files_of([name], folder_of(settings), "tables")
     with progress_of(files) as advance, refusing():
-        options = ReadOptions(
-            pipeline_settings(settings), columns=read_column_map(columns), progress=advance
-        )
+        options = read_options(settings, columns=read_column_map(columns), progress=advance)
         flight = open_flown(files, options)
     aircraft = with_reference(settings.default_aircraft, gps_latency_s=flight.gps_latency_s)
 

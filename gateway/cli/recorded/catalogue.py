@@ -12,9 +12,8 @@ from typer.core import TyperGroup
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.named_recordings import folder_of
 from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
-from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
-from gateway.flights.reading import ReadOptions
 from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
 from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import LocalProcesses
@@ -78,7 +77,7 @@ def index(
     if not place.is_dir():
         refuse(f"{place}: is no folder")
     with refusing():
-        options = ReadOptions(pipeline_settings(settings), columns=read_column_map(columns))
+        options = read_options(settings, columns=read_column_map(columns))
     console = console_of(stderr=True)
     shown = (TextColumn("reading"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(

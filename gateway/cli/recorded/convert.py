@@ -25,11 +25,10 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
-    pipeline_settings,
+    read_options,
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.flights.reading import ReadOptions
 from gateway.flights.writing import LACKS, WRITERS, FlightToWrite
 from gateway.output import write_new
 
@@ -87,8 +86,8 @@ def convert(
         wanted: Wanted = "tlogs" if of_tlogs else "tables"
         files = files_of(files, recordings_folder(config), wanted)
     with progress_of(files) as advance, refusing():
-        options = ReadOptions(
-            current=pipeline_settings(read_settings(config)),
+        options = read_options(
+            read_settings(config),
             choice=settings,
             position=position,
             columns=read_column_map(columns),

@@ -22,7 +22,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
-    pipeline_settings,
+    read_options,
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
@@ -35,7 +35,7 @@ from gateway.flights.flight_terms import FlightError, SettingsChoice
 from gateway.flights.fused_rows import fused_lines
 from gateway.flights.joined import joined_tables
 from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
-from gateway.flights.reading import ReadOptions, RecordedTable, open_rows
+from gateway.flights.reading import RecordedTable, open_rows
 from gateway.flights.recorded_fusion import SETTLES
 from gateway.flights.row_fusion import RowFusion
 from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
@@ -93,8 +93,8 @@ def fuse_log(
     inputs = [*files, columns, config]
     with progress_of(files) as advance, refusing():
         check_output(out, inputs, overwrite=force)
-        options = ReadOptions(
-            current=pipeline_settings(current),
+        options = read_options(
+            current,
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,

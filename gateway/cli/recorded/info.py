@@ -21,7 +21,7 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     refusing,
 )
-from gateway.cli.support.settings_options import ConfigOption, pipeline_settings, read_settings
+from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import console_of, print_json, table_of
 from gateway.edges.disk.recording_streams import (
     FileKind,
@@ -88,10 +88,8 @@ def info(
 
 
 def _read_options(columns: Path | None, config: Path | None, progress: Progress) -> ReadOptions:
-    from gateway.flights.reading import ReadOptions
-
-    current = pipeline_settings(read_settings(config))
-    return ReadOptions(current, columns=read_column_map(columns), progress=progress)
+    columns_of = read_column_map(columns)
+    return read_options(read_settings(config), columns=columns_of, progress=progress)
 
 
 def recover(

@@ -34,7 +34,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
-    pipeline_settings,
+    read_options,
     read_settings,
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
@@ -53,7 +53,6 @@ from gateway.flightlog.playback import (
 )
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.opening import lay_out, open_flights
-from gateway.flights.reading import ReadOptions
 from gateway.player import (
     PlayerDaemon,
     PlayPlan,
@@ -128,8 +127,12 @@ def play(
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
         files = files_of(files, recordings_folder(config), "tlogs")
-        today = pipeline_settings(read_settings(config))
-        options = ReadOptions(today, settings, position, read_column_map(columns))
+        options = read_options(
+            read_settings(config),
+            choice=settings,
+            position=position,
+            columns=read_column_map(columns),
+        )
         with progress_of(files) as advance:
             recorded = open_flights(files, replace(options, progress=advance), opened)
             flights = lay_out(recorded, system or [], with_commands=with_commands)

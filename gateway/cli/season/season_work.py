@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.named_recordings import Wanted, files_of, recordings_folder
 from gateway.cli.support.recording_options import read_column_map, refusing
-from gateway.cli.support.settings_options import pipeline_settings, read_settings
+from gateway.cli.support.settings_options import read_options, read_settings
 from gateway.cli.support.terminal import console_of
 from gateway.edges.printable import printable
 from gateway.flights.flight_terms import SettingsChoice
@@ -138,8 +138,8 @@ def season_options(
     """Take what reads a season's flights out of the settings; nothing that must stay secret."""
     with refusing():
         return without_secrets(
-            ReadOptions(
-                pipeline_settings(read_settings(config)),
+            read_options(
+                read_settings(config),
                 choice=choice,
                 columns=read_column_map(columns),
             )

@@ -16,9 +16,7 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     refusing,
 )
-from gateway.cli.support.settings_options import (
-    pipeline_settings,
-)
+from gateway.cli.support.settings_options import read_options
 from gateway.config import GatewaySettings
 from gateway.edges.disk.recording_streams import FileKind, kind_of
 from gateway.flights.flight_terms import FlightError, SettingsChoice
@@ -100,9 +98,8 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
 
 
 def _read_options(loading: Loading, advance: Callable[[int], None]) -> ReadOptions:
-    settings = loading.settings
-    return ReadOptions(
-        current=pipeline_settings(settings),
+    return read_options(
+        loading.settings,
         choice=loading.choice,
         columns=read_column_map(loading.columns),
         system_id=loading.system,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -17,6 +17,7 @@ from gateway.cli.support.errors import refuse
 if TYPE_CHECKING:
     from gateway.aircraft import AircraftSettings
     from gateway.config import GatewaySettings
+    from gateway.flights.reading import ReadOptions
     from gateway.pipeline import PipelineSettings
 
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
@@ -63,6 +64,14 @@ def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
         return load_aircraft(settings)
     except ConfigError as error:
         refuse(str(error))
+
+
+def read_options(settings: GatewaySettings, **how: Any) -> ReadOptions:
+    """Return how flights are read: the limits of the settings, and further fields by name."""
+    from gateway.flights.reading import ReadOptions
+
+    current = pipeline_settings(settings)
+    return ReadOptions(current, unpacked_limit=settings.recording.unpacked_limit, **how)
 
 
 def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:

@@ -23,6 +23,9 @@ TAIL: Final = 1 << 14
 """Some twenty rows."""
 MAX_HEAD: Final = 4 * MAX_LINE
 """Before the first row; a few kilobytes pack any number of zeros."""
+MAX_UNPACKED: Final = 1 << 30
+"""Bytes to which a packed file may be unpacked at once, unless the settings give another limit; a
+megabyte of gzip can hold a gigabyte of zeros."""
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
 """The first bytes tell that a file is packed, whatever its name."""
@@ -149,11 +152,36 @@ def _readable(path: Path) -> Iterator[None]:
         raise
 
 
-def read_chunks(path: Path, progress: Progress | None = None) -> Iterator[bytes]:
-    """Read a file, gzipped or not, piece by piece; progress counts bytes on the disk."""
-    done = 0
+def read_chunks(
+    path: Path, progress: Progress | None = None, limit: int | None = None
+) -> Iterator[bytes]:
+    """Read a file, gzipped or not, in chunks.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    progress : callable, optional
+        Called with the number of further bytes read from the disk.
+    limit : int, optional
+        Maximum unpacked size of a packed file, in bytes. Callers that keep the content need one;
+        a caller that handles chunk by chunk does not.
+
+    Raises
+    ------
+    OSError
+        As `open_unpacked`, or if the limit is exceeded.
+    """
+    done = size = 0
     with open_unpacked(path) as (file, raw):
         while data := file.read(CHUNK):
+            size += len(data)
+            if limit is not None and file is not raw and size > limit:
+                why = (
+                    f"unpacks to more than {limit / 1e6:.0f} MB; unpack it with gzip -d, or raise "
+                    "unpacked_limit_mb in the section [recording] of the settings"
+                )
+                raise OSError(errno.EFBIG, why, str(path))
             yield data
             if progress is not None:
                 progress(raw.tell() - done)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.edges.disk.recording_streams import (
+    MAX_UNPACKED,
     Progress,
     is_packed,
     open_descriptor,
@@ -31,18 +32,24 @@ class TlogFile:
         Called with how many more bytes were indexed.
     answers : LogAnswers, optional
         Collects answers from the file.
+    unpacked_limit : int
+        Maximum unpacked size of a packed file, in bytes.
 
     Raises
     ------
     OSError
-        If it cannot be read.
+        If it cannot be read, or is too large when unpacked.
     """
 
     def __init__(
-        self, path: Path, progress: Progress | None = None, answers: LogAnswers | None = None
+        self,
+        path: Path,
+        progress: Progress | None = None,
+        answers: LogAnswers | None = None,
+        unpacked_limit: int = MAX_UNPACKED,
     ) -> None:
         self.path = path
-        self._file = _unpacked(path) if is_packed(path) else open_descriptor(path)
+        self._file = _unpacked(path, unpacked_limit) if is_packed(path) else open_descriptor(path)
         self.index = TlogIndex()
         scanner = TlogScanner()
         offset = 0
@@ -78,7 +85,7 @@ class TlogFile:
         os.close(self._file)
 
 
-def _unpacked(path: Path) -> int:
+def _unpacked(path: Path, limit: int) -> int:
     """Open a copy, since a packed file cannot be read at any position."""
-    with temporary_copy(path, read_chunks(path)) as plain:
+    with temporary_copy(path, read_chunks(path, None, limit)) as plain:
         return os.dup(plain.fileno())

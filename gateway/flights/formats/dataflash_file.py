@@ -76,7 +76,7 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
 
     pymavlink maps a log into the memory, where one that shrinks would end the process.
     """
-    content = read_chunks(path, options.progress)
+    content = read_chunks(path, options.progress, options.unpacked_limit)
     first = next(content, b"")
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text

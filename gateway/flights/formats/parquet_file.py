@@ -5,16 +5,16 @@ are in the column `comments` of the next row, written as in a CSV; settings and 
 the file's metadata. So a CSV can be restored exactly.
 """
 
-import io
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.disk.recording_streams import is_packed, read_chunks
+from gateway.edges.disk.recording_streams import is_packed, read_chunks, temporary_copy
 from gateway.flightlog.table.row import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
 from gateway.flightlog.table.table import (
     FORMAT_LINE,
@@ -140,8 +140,10 @@ def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
 
 def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
     """Yield the lines of the CSV that the file was made of, many at once."""
-    packed = io.BytesIO(b"".join(read_chunks(path))) if is_packed(path) else path
-    with pq.ParquetFile(packed, page_checksum_verification=True) as file:
+    with (
+        _plain(path, options) as plain,
+        pq.ParquetFile(plain, page_checksum_verification=True) as file,
+    ):
         known = file.schema_arrow.metadata or {}
         names = [name for name in COLUMNS if name in file.schema_arrow.names]
         if "time_us" not in names:
@@ -164,6 +166,16 @@ def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
             if options.progress is not None:
                 options.progress(size * batch.num_rows // total)
         yield (file.metadata.metadata or {}).get(END.encode(), b"")
+
+
+@contextmanager
+def _plain(path: Path, options: ReadOptions) -> Iterator[Path | IO[bytes]]:
+    """Yield a file that can be read at any position: a packed one is copied."""
+    if not is_packed(path):
+        yield path
+        return
+    with temporary_copy(path, read_chunks(path, None, options.unpacked_limit)) as copy:
+        yield copy
 
 
 def _text(cell: Any) -> str:

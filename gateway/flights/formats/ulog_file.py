@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import struct
 from collections.abc import Iterator
 from functools import cache
@@ -11,7 +12,7 @@ from typing import Any, Final
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from gateway.edges.disk.recording_streams import read_chunks
+from gateway.edges.disk.recording_streams import read_chunks, temporary_copy
 from gateway.flightlog.autopilots.px4_log import TOPICS, Px4Log
 from gateway.flightlog.table.row import RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
@@ -31,8 +32,8 @@ BROKEN: Final = (
 """What damage makes pyulog raise, beside its own error."""
 
 
-class _Content(io.BytesIO):
-    """The bytes of a log.
+class _Content(io.BufferedReader):
+    """The bytes of a log, read from a file as they are needed.
 
     pyulog steps back by as much as it has asked for. Where the log is cut that is more than it has
     got, and it would read the same bytes for ever.
@@ -41,6 +42,9 @@ class _Content(io.BytesIO):
     unread = 0
     """Bytes behind the last message that pyulog has read whole."""
     _missing = _header_at = 0
+
+    def __init__(self, name: str) -> None:
+        super().__init__(io.FileIO(name))
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size == HEADER:
@@ -55,14 +59,16 @@ class _Content(io.BytesIO):
     def close(self) -> None:
         if not self.closed:
             end = self._header_at if self._missing else self.tell()
-            self.unread = len(self.getbuffer()) - end
+            self.unread = os.fstat(self.fileno()).st_size - end
         super().close()
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a ULog as a flight; raises FlightError if there is none in it."""
-    content = b"".join(read_chunks(path, options.progress))
-    log, unread = _load(path, content)
+    with temporary_copy(
+        path, read_chunks(path, options.progress, options.unpacked_limit)
+    ) as content:
+        log, unread = _load(path, content.name)
     topics = {data.name: data.data for data in reversed(log.data_list)}
     known = log.initial_parameters.get(SYSTEM_ID, 1)
     is_id = isinstance(known, int) and 1 <= known <= 255
@@ -84,13 +90,13 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     return table
 
 
-def _load(path: Path, content: bytes) -> tuple[Any, int]:
+def _load(path: Path, copy: str) -> tuple[Any, int]:
     """Return the log, and how many bytes at its end could not be read."""
     # Damage that it prints to the terminal is reported as remarks.
     with contextlib.redirect_stdout(io.StringIO()):
         try:
-            _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
-            file = _Content(content)
+            _check_formats(ULog(_Content(copy), parse_header_only=True).message_formats)
+            file = _Content(copy)
             return ULog(file, list(TOPICS)), file.unread
         except (ULogException, *BROKEN) as error:
             raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error

@@ -3,6 +3,7 @@
 import gzip
 import os
 import struct
+import tempfile
 import tracemalloc
 from pathlib import Path
 
@@ -150,6 +151,38 @@ def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert "line 2 is longer than 1 MB" in printed
     assert peak < 32 << 20
+
+
+@pytest.mark.parametrize(
+    ("command", "head"),
+    [
+        ("info", b"ULog\x01\x12\x35\x01"),
+        ("fuse", b"\xa3\x95\x80"),
+        ("convert", b"PAR1"),
+        ("play", b"\0"),
+    ],
+)
+def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memory_nor_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, head: bytes
+) -> None:
+    path, temporary = tmp_path / "bomb.gz", tmp_path / "temporary"
+    with gzip.open(path, "wb") as file:
+        file.write(head)
+        for _ in range(128):
+            file.write(bytes(1 << 20))
+    config = tmp_path / "gateway.toml"
+    config.write_text("[recording]\nunpacked_limit_mb = 8\n")
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "convert") else []
+    tracemalloc.start()
+    printed = run(command, path, *words, "--config", config, code=2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "bomb.gz: unpacks to more than 8 MB" in printed
+    assert "unpacked_limit_mb" in printed
+    assert peak < 48 << 20
+    assert not list(temporary.iterdir())
 
 
 @pytest.mark.parametrize("end", [".kml", ".gpx"])
