@@ -37,6 +37,7 @@ from gateway.flightlog.session import SessionState
 from gateway.flightlog.table.table import TableHeader
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import (
+    RECORDED_ONLY,
     BaroRaw,
     ClientInterval,
     FusedSample,
@@ -301,11 +302,11 @@ class Daemon:
         self._budget.forget_client(client_id)
 
     def _send(self, frames: Sequence[Outgoing]) -> None:
-        self._hub.send_all(frames)
+        self._hub.send_all([each for each in frames if each.client_id != RECORDED_ONLY])
         for sent in frames:
             self._sent[sent.message_id] += 1
             frame, to = sent.frame, sent.client_id
-            if to is None or self._budget.takes(to, len(frame), self.now_us()):
+            if to in (None, RECORDED_ONLY) or self._budget.takes(to, len(frame), self.now_us()):
                 self._recorder.frame(frame)
 
     def _poll(self) -> None:

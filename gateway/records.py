@@ -20,6 +20,9 @@ Quat = tuple[float, float, float, float]
 NAN = float("nan")
 UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
+RECORDED_ONLY = -1
+"""Client id of an outgoing frame that is written to the recording and sent to nobody."""
+
 
 class ImuFlags(IntFlag):
     """State of an IMU node, one bit each; the first eight are those of the radio payload."""
@@ -320,7 +323,7 @@ class Outgoing(msgspec.Struct, frozen=True, gc=False):
     frame: bytes
     message_id: int
     client_id: int | None = None
-    """The one client it answers, or None for every client."""
+    """The one client it answers, None for every client, or `RECORDED_ONLY`."""
 
 
 class ClientInterval(msgspec.Struct, frozen=True, gc=False):

@@ -165,7 +165,7 @@ def test_a_view_is_built_on_the_page(install: Install, monkeypatch: pytest.Monke
     load_extensions()
     nicegui, context = MagicMock(), MagicMock()
     monkeypatch.setitem(sys.modules, "nicegui", nicegui)
-    context.vehicle.newest = {"RADIO_STATUS": MagicMock(rxerrors=7)}
+    context.vehicle.newest = {"SYS_STATUS": MagicMock(errors_comm=7)}
     (view,) = ADDED_VIEWS.values()
     view.build(context)
     assert view.title == "Radio"

@@ -84,7 +84,7 @@ def ftp_session(sock: socket.socket) -> int:
     parser = mavlink.MAVLink(None)
     sock.settimeout(0.1)
     while True:
-        sock.send(ftp(OPEN_FILE_RO, 0, b"/parameter.json"))
+        sock.send(ftp(OPEN_FILE_RO, 0, b"/parameter.json.xz"))
         for _ in range(50):
             try:
                 data = sock.recv(2048)

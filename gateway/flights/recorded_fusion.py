@@ -26,7 +26,7 @@ from gateway.flights.smoothed import (
     with_smoothed_estimator,
 )
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import FusionState, GpsFix, NavState, Outgoing
+from gateway.records import RECORDED_ONLY, FusionState, GpsFix, NavState, Outgoing
 from gateway.replay import InterpolatedPosition, Replay, header_for, heard_of
 
 SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
@@ -95,7 +95,7 @@ class RecordedFusion:
         stamper = Stamper(self._zero_us or 0)
         for row in self._table.rows:
             for now_us, action in self._replay.take(row):
-                if isinstance(action, Outgoing) and action.client_id is None:
+                if isinstance(action, Outgoing) and action.client_id in (None, RECORDED_ONLY):
                     yield TlogRecord(stamper.stamp(now_us), action.frame)
 
     def table(self) -> RecordedTable:

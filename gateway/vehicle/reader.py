@@ -83,7 +83,9 @@ class RequestReader:
             return "broken"
         if message.get_type().startswith("UNKNOWN"):
             return "unknown"
-        if message.get_srcSystem() == self._system_id:
+        # Only the pair is ours: a companion computer shares the system id of its vehicle.
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        if sender == (self._system_id, AUTOPILOT_COMPONENT):
             return "own id"
         return message
 

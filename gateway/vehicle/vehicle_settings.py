@@ -37,7 +37,6 @@ class RateSettings(Settings, frozen=True):
     system_time_hz: Annotated[float, _rate("SYSTEM_TIME")] = 1.0
     home_position_hz: Annotated[float, _rate("HOME_POSITION")] = 1.0
     mission_current_hz: Annotated[float, _rate("MISSION_CURRENT")] = 1.0
-    radio_status_hz: Annotated[float, _rate("RADIO_STATUS")] = 1.0
     high_latency2_hz: Annotated[
         float, _rate("HIGH_LATENCY2, only to links of less than 100 bytes/s,")
     ] = 0.2

@@ -98,7 +98,6 @@ UNKNOWN = {
         replace(STATE, flags=NavFlags(0)), 0.0
     ),
     "SYS_STATUS": lambda: Health(1, 2.0).sys_status(0),
-    "RADIO_STATUS": lambda: Health(1, 2.0).radio_status(),
     "SCALED_PRESSURE": lambda: messages.scaled_pressure(BARO),
 }
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.records import RECORDED_ONLY
 from tests.vehicle.ground_station import GroundStation
 
 ME = (1, 1)
@@ -195,14 +196,12 @@ def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
 
 
 TOLD_TO_ALL = {
-    "command/int": {"HOME_POSITION", "STATUSTEXT", "PARAM_VALUE"},
+    "command/int": {"HOME_POSITION", "STATUSTEXT"},
     "command/denied": {"STATUSTEXT"},
     "command/long-running": {"STATUSTEXT"},
     "command/set-roi": {"STATUSTEXT"},
     "command/set-mode": {"STATUSTEXT"},
-    "parameter/set-of-home": {"HOME_POSITION", "PARAM_VALUE"},
-    "parameter/set": {"PARAM_VALUE"},
-    "parameter/set-out-of-range": {"PARAM_VALUE"},
+    "parameter/set-of-home": {"HOME_POSITION"},
     "mission/set-current-none": {"STATUSTEXT"},
 }
 """What changed, and why something was refused, concerns every ground station."""
@@ -215,5 +214,5 @@ def test_it_is_given_once_and_to_the_one_who_asked(station: GroundStation, row: 
     # A list comes in tens; with home's height goes who set it.
     expected = {"parameter/list": 10, "parameter/set-of-home": 2}.get(row, 1)
     assert sum(m.get_type() == kind for m in found) == expected
-    assert {frame.client_id for frame in station.frames} <= {7, None}
+    assert {frame.client_id for frame in station.frames} <= {7, None, RECORDED_ONLY}
     assert station.broadcasts == TOLD_TO_ALL.get(row, set())

@@ -59,7 +59,7 @@ def test_bursts_of_single_bytes_for_a_crowd_are_no_more_work_than_for_one(
 ) -> None:
     clients = {each.client_id: Ftp(each) for each in crowd}
     sessions = {
-        key: client.ask(Opcode.OPEN_FILE_RO, b"/parameter.json").session
+        key: client.ask(Opcode.OPEN_FILE_RO, b"/parameter.json.xz").session
         for key, client in clients.items()
     }
     for each in crowd:
@@ -80,7 +80,7 @@ def test_a_strangers_files_close_nobody_elses(station: GroundStation) -> None:
     session = mine.ask(Opcode.OPEN_FILE_RO, b"/general.json").session
     stranger = Ftp(GroundStation(station.vehicle, station.clock, client_id=8, trusted=False))
     for _ in range(100):
-        assert stranger.ask(Opcode.OPEN_FILE_RO, b"/parameter.json").opcode == ACK
+        assert stranger.ask(Opcode.OPEN_FILE_RO, b"/parameter.json.xz").opcode == ACK
     assert mine.ask(Opcode.READ_FILE, session=session, size=9).opcode == ACK
 
 

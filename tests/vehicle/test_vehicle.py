@@ -13,6 +13,7 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.samples import (
     BARO,
+    FIX,
     GPS_NODE,
     NO_FIX,
     NOTHING,
@@ -66,7 +67,6 @@ def test_every_message_at_its_own_rate() -> None:
         "SYSTEM_TIME": 10,
         "HOME_POSITION": 10,
         "ESTIMATOR_STATUS": 10,
-        "RADIO_STATUS": 10,
     }
     assert {name: counted[name] for name in expected} == pytest.approx(expected, abs=1)
 
@@ -117,6 +117,21 @@ def test_position_goes_on_while_dead_reckoned() -> None:
     for time_us in range(2 * ONE_S, 12 * ONE_S, 5_000):
         found += vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)
     assert names(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
+
+
+def test_last_position_is_repeated_when_gps_is_lost() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    lost = replace(NO_FIX, lat_dege7=0, lon_dege7=0)
+    found = [
+        *vehicle.on_gps(replace(lost, time_us=2 * ONE_S), 2 * ONE_S),
+        *vehicle.on_gps(replace(lost, time_us=3 * ONE_S), 3 * ONE_S),
+        *vehicle.poll(9 * ONE_S),
+    ]
+    gps = [m for m in decode(found) if m.get_type() == "GPS_RAW_INT"]
+    assert [m.fix_type for m in gps][-1] == mavlink.GPS_FIX_TYPE_NO_GPS
+    assert mavlink.GPS_FIX_TYPE_NO_FIX in {m.fix_type for m in gps}
+    assert {(m.lat, m.lon) for m in gps} == {(FIX.lat_dege7, FIX.lon_dege7)}
 
 
 def test_home_is_the_first_good_fix() -> None:

@@ -1,4 +1,8 @@
-"""Which sensors are present and healthy, for SYS_STATUS, RADIO_STATUS and texts."""
+"""Which sensors are present and healthy, for SYS_STATUS and texts.
+
+RADIO_STATUS is not sent: the nRF24L01+ measures no signal strength, and ground stations show the
+value for "unknown" as -1 dBm. The losses of the radio are in SYS_STATUS.
+"""
 
 from typing import Any, Final
 
@@ -61,7 +65,6 @@ class Health:
         self._nav_flags = NavFlags(0)
         self._load_permille = 0
         self._nodes: tuple[NodeLink, ...] = ()
-        self._noise_percent: int | None = None
         self._received = 0
         self._lost = 0
         self._drop_rate = 0.0
@@ -112,7 +115,6 @@ class Health:
         fresh = max(0, received - self._received) + max(0, lost - self._lost)
         self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
         self._received, self._lost = received, lost
-        self._noise_percent = report.receiver.noise_percent if report.receiver else None
         return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
@@ -165,10 +167,11 @@ class Health:
         return present, enabled, healthy
 
     def sys_status(self, now_us: int) -> Any:
-        """Encode SYS_STATUS; the boards' supplies are in BATTERY_STATUS.
+        """Encode SYS_STATUS.
 
-        The four error counts are the nodes' bus errors, failed and repeated radio sends, and the
-        receiver's overruns.
+        The voltage is the lowest supply of the nodes; BATTERY_STATUS reports each. The four error
+        counts are the nodes' bus errors, failed and repeated radio sends, and the receiver's
+        overruns.
         """
         present, enabled, healthy = self.sensors(now_us)
         bus, failed, retries, overruns = self.boards.error_counts()
@@ -177,7 +180,7 @@ class Health:
             enabled,
             healthy,
             load=min(1000, self._load_permille),
-            voltage_battery=fields.UINT16_MAX,
+            voltage_battery=self.boards.lowest_supply_mv or fields.UINT16_MAX,
             current_battery=-1,
             battery_remaining=-1,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
@@ -186,19 +189,6 @@ class Health:
             errors_count2=failed,
             errors_count3=retries,
             errors_count4=overruns,
-        )
-
-    def radio_status(self) -> Any:
-        """Encode RADIO_STATUS: the nRF24 measures no signal strength, only a busy channel."""
-        noise = fields.UINT8_MAX if self._noise_percent is None else self._noise_percent
-        return mavlink.MAVLink_radio_status_message(
-            rssi=fields.UINT8_MAX,
-            remrssi=fields.UINT8_MAX,
-            txbuf=100,
-            noise=noise,
-            remnoise=fields.UINT8_MAX,
-            rxerrors=fields.uint16(self._lost, unknown=0),
-            fixed=0,
         )
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:

@@ -197,8 +197,16 @@ def scaled_pressure(sample: BaroSample) -> Any:
     )
 
 
-def gps_raw_int(fix: GpsFix) -> Any:
+def is_located(fix: GpsFix) -> bool:
+    """Return whether a fix has a latitude and a longitude."""
+    return fix.fix_ok and FIX_TYPES[fix.fix_type] != mavlink.GPS_FIX_TYPE_NO_FIX
+
+
+def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
     """Encode a fix.
+
+    While the receiver has no position, the last one is repeated with fix type NO_FIX, as autopilots
+    do: 0, 0 is a place.
 
     The receiver reports only the position's DOP, whose square is the sum of those of HDOP and
     VDOP; it is divided by the accuracies, which are proportional to them. An extension field that
@@ -208,18 +216,19 @@ def gps_raw_int(fix: GpsFix) -> Any:
     speed = math.hypot(north, east)
     moving = is_3d(fix) and speed >= MIN_COURSE_SPEED_MPS
     hdop, vdop = dilutions(fix)
+    position = fix if located is None or is_located(fix) else located
     return mavlink.MAVLink_gps_raw_int_message(
         time_usec=fix.time_us,
         fix_type=FIX_TYPES[fix.fix_type] if fix.fix_ok else mavlink.GPS_FIX_TYPE_NO_FIX,
-        lat=fix.lat_dege7,
-        lon=fix.lon_dege7,
-        alt=fields.int32(fix.alt_amsl_m * MM),
+        lat=position.lat_dege7,
+        lon=position.lon_dege7,
+        alt=fields.int32(position.alt_amsl_m * MM),
         eph=fields.uint16(hdop * CENTI_DOP),
         epv=fields.uint16(vdop * CENTI_DOP),
         vel=fields.uint16(speed * CM) if is_3d(fix) else fields.UINT16_MAX,
         cog=fields.compass_cdeg(math.atan2(east, north)) if moving else fields.UINT16_MAX,
         satellites_visible=fields.uint8(fix.satellites),
-        alt_ellipsoid=fields.int32(fix.alt_ellipsoid_m * MM),
+        alt_ellipsoid=fields.int32(position.alt_ellipsoid_m * MM),
         h_acc=fields.uint32(fix.h_acc_m * MM),
         v_acc=fields.uint32(fix.v_acc_m * MM),
         vel_acc=fields.uint32(fix.speed_acc_mps * MM),
@@ -235,14 +244,14 @@ def dilutions(fix: GpsFix) -> tuple[float, float]:
     return fix.pdop * fix.h_acc_m / accuracy_m, fix.pdop * fix.v_acc_m / accuracy_m
 
 
-def gps_absent(now_us: int) -> Any:
-    """Encode "no GPS", so that the last good fix of a silent node does not stay on screen."""
+def gps_absent(now_us: int, located: GpsFix | None = None) -> Any:
+    """Encode "no GPS" at the last position, so that a good fix does not stay on screen."""
     return mavlink.MAVLink_gps_raw_int_message(
         time_usec=now_us,
         fix_type=mavlink.GPS_FIX_TYPE_NO_GPS,
-        lat=0,
-        lon=0,
-        alt=0,
+        lat=0 if located is None else located.lat_dege7,
+        lon=0 if located is None else located.lon_dege7,
+        alt=0 if located is None else fields.int32(located.alt_amsl_m * MM),
         eph=fields.UINT16_MAX,
         epv=fields.UINT16_MAX,
         vel=fields.UINT16_MAX,

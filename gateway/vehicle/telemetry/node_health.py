@@ -191,6 +191,11 @@ class NodeHealth:
         bus, failed, retries, overruns = (fields.uint16(count, unknown=0) for count in counts)
         return bus, failed, retries, overruns
 
+    @property
+    def lowest_supply_mv(self) -> int | None:
+        """The lowest supply of the nodes; None if none measures it."""
+        return min((s.supply_mv for s in self.statuses if s.supply_mv), default=None)
+
     def lowest(self) -> Any:
         """Encode BATTERY_STATUS of the node with the lowest supply; None if none measures it."""
         measured = [s for s in self.statuses if s.supply_mv]

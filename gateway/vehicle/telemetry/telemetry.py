@@ -38,7 +38,6 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HOME_POSITION,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
-    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
     mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
     mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
     mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
@@ -69,6 +68,8 @@ class Telemetry:
         self._sample: ImuSample | None = None
         self._baro: BaroSample | None = None
         self.fix: GpsFix | None = None
+        self._located_fix: GpsFix | None = None
+        """The newest with a position, which is repeated while there is none."""
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
         self._batteries: dict[int, Stream] = {}
@@ -102,7 +103,6 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
-            mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda _: health.radio_status(),
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
         }
@@ -171,10 +171,12 @@ class Telemetry:
     def on_gps(self, fix: GpsFix) -> list[Any]:
         """Take in a GPS fix, return its messages if due, and set home at the first good one."""
         self.fix = fix
+        if messages.is_located(fix):
+            self._located_fix = fix
         if fix.utc_us is not None:
             self._unix_offset_us = fix.utc_us - fix.time_us
         stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
-        found = [messages.gps_raw_int(fix)] if stream.offer(fix.time_us) else []
+        found = [messages.gps_raw_int(fix, self._located_fix)] if stream.offer(fix.time_us) else []
         wanted = self.home is None or math.isnan(self._ground_alt_m)
         limits = self.settings
         if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
@@ -214,7 +216,7 @@ class Telemetry:
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
         if silent and wanted and mavlink.MAVLINK_MSG_ID_HEARTBEAT in due:
             # Nothing else carries GPS_RAW_INT while the node is silent.
-            found.append(messages.gps_absent(now_us))
+            found.append(messages.gps_absent(now_us, self._located_fix))
         return found
 
     def next_due_us(self) -> int:
@@ -253,8 +255,8 @@ class Telemetry:
 
     def _gps_raw(self, now_us: int) -> Any:
         if self.fix is None or not self.health.is_alive(GPS, now_us):
-            return messages.gps_absent(now_us)
-        return messages.gps_raw_int(self.fix)
+            return messages.gps_absent(now_us, self._located_fix)
+        return messages.gps_raw_int(self.fix, self._located_fix)
 
     def _scaled_pressure(self, _now_us: int) -> Any:
         return None if self._baro is None else messages.scaled_pressure(self._baro)

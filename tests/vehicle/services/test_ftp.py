@@ -1,6 +1,7 @@
 """MAVLink FTP as its page has it: reading, refusing, repeating; and the files that are there."""
 
 import json
+import lzma
 import struct
 from typing import Any
 
@@ -8,7 +9,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.aircraft import AircraftSettings
 from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32, decode_packet
+from gateway.vehicle.services.parameters.metadata import Metadata
+from gateway.vehicle.services.parameters.parameters import ParameterTable
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.services.parameters.test_parameters import values
 
@@ -69,6 +73,10 @@ class Ftp:
         return bytes(content)
 
 
+def described(ftp: Ftp) -> list[dict[str, Any]]:
+    return json.loads(lzma.decompress(ftp.read(b"parameter.json.xz")))["parameters"]
+
+
 @pytest.fixture
 def ftp(station: GroundStation) -> Ftp:
     return Ftp(station)
@@ -84,11 +92,11 @@ def test_the_metadata_is_found_and_describes_every_parameter(ftp: Ftp, loss: flo
     general = ftp.read(b"/general.json")
     assert crc32(general) == file_crc
     [kind] = json.loads(general)["metadataTypes"]
-    assert (kind["type"], kind["uri"]) == (1, "mftp:///parameter.json")
-    described = ftp.read(b"/parameter.json")
+    assert (kind["type"], kind["uri"]) == (1, "mftp:///parameter.json.xz")
+    described = ftp.read(b"/parameter.json.xz")
     assert crc32(described) == kind["fileCrc"]
     ftp.station.loses = lambda *_: False
-    parameters = {p["name"]: p for p in json.loads(described)["parameters"]}
+    parameters = {p["name"]: p for p in json.loads(lzma.decompress(described))["parameters"]}
     assert set(parameters) == set(values(ftp.station))
     cutoff = parameters["TUNING_CUTOFF"]
     assert (cutoff["min"], cutoff["max"], cutoff["units"]) == (0.1, 500, "Hz")
@@ -134,10 +142,29 @@ def test_every_key_of_the_metadata_is_of_the_schema(ftp: Ftp) -> None:
         "name", "type", "shortDesc", "longDesc", "units", "default", "decimalPlaces", "min", "max",
         "increment", "rebootRequired", "group", "category", "volatile", "values", "bitmask",
     }  # fmt: skip
-    for parameter in json.loads(ftp.read(b"parameter.json"))["parameters"]:
+    for parameter in described(ftp):
         assert set(parameter) <= allowed
-        assert parameter["type"] == "Float"
+        assert parameter["type"] == ("Int32" if "values" in parameter else parameter["type"])
         assert len(parameter["name"]) <= 16
+        assert len(parameter["shortDesc"]) <= 100
+        assert all(len(value["description"]) <= 100 for value in parameter.get("values", ()))
+
+
+def test_enumerations_are_integers_and_coordinates_have_seven_decimal_places(ftp: Ftp) -> None:
+    parameters = {p["name"]: p for p in described(ftp)}
+    assert {
+        parameters[name]["type"] for name in ("VEH_TYPE", "TUNING_ENABLED", "TUNING_ORDER")
+    } == {"Int32"}
+    assert [parameters[name]["decimalPlaces"] for name in ("HOME_LAT", "HOME_LON")] == [7, 7]
+    assert parameters["TUNING_CUTOFF"]["decimalPlaces"] == 4
+
+
+def test_parameter_metadata_of_the_gateway_is_small() -> None:
+    """A radio of 57600 baud carries about 140 bytes of a file in 60 ms."""
+    settings = AircraftSettings()
+    table = ParameterTable({name: getattr(settings, name) for name in settings.__struct_fields__})
+    content = Metadata(table).parameters()
+    assert len(content) < 8_000 < 30_000 < len(lzma.decompress(content))
 
 
 def test_the_crc_is_the_one_of_mavlink() -> None:
@@ -211,7 +238,7 @@ def test_reading_to_the_end_and_beyond(ftp: Ftp) -> None:
 def test_the_directory(ftp: Ftp) -> None:
     listed = ftp.ask(Opcode.LIST_DIRECTORY, b"/")
     names = [entry.split(b"\t")[0] for entry in listed.data.split(b"\0") if entry]
-    assert names == [b"Fgeneral.json", b"Fparameter.json"]
+    assert names == [b"Fgeneral.json", b"Fparameter.json.xz"]
     assert ftp.ask(Opcode.LIST_DIRECTORY, b"/", offset=2).data == bytes([FtpError.EOF])
     assert ftp.ask(Opcode.LIST_DIRECTORY, b"/etc").data == bytes([FtpError.FILE_NOT_FOUND])
     crc = ftp.ask(Opcode.CALC_FILE_CRC32, b"/general.json")
@@ -231,6 +258,6 @@ def test_clients_keep_their_own_sessions(ftp: Ftp) -> None:
 def test_sessions_left_open_do_not_shut_others_out(ftp: Ftp) -> None:
     for client_id in range(100, 200):
         client = Ftp(GroundStation(ftp.station.vehicle, ftp.station.clock, client_id=client_id))
-        client.ask(Opcode.OPEN_FILE_RO, b"/parameter.json")
+        client.ask(Opcode.OPEN_FILE_RO, b"/parameter.json.xz")
         client.send(client.packet(Opcode.BURST_READ_FILE, session=0, size=239))
     assert json.loads(ftp.read(b"/general.json"))

@@ -1,7 +1,7 @@
 import pytest
 from msgspec.structs import replace
 
-from gateway.records import ImuFlags, NavFlags, NodeId, ReceiverStatus
+from gateway.records import ImuFlags, NavFlags, NodeId
 from gateway.vehicle.telemetry.health import (
     ACCEL,
     AHRS,
@@ -98,10 +98,14 @@ def test_a_node_tells_of_its_failed_sensor() -> None:
     assert health.sensors(1_500_000)[2] & MAG
 
 
-def test_the_battery_is_absent() -> None:
-    found = healthy().sys_status(1_500_000)
+def test_sys_status_has_the_lowest_supply_of_the_nodes() -> None:
+    health = healthy()
+    found = health.sys_status(1_500_000)
     unknown = (found.voltage_battery, found.current_battery, found.battery_remaining)
     assert unknown == (65535, -1, -1)
+    health.on_node_status(status(supply_mv=3300))
+    health.on_node_status(status(GPS_NODE, supply_mv=3150))
+    assert health.sys_status(1_500_000).voltage_battery == 3150
 
 
 def test_load_is_the_share_of_the_longest_loop() -> None:
@@ -120,16 +124,6 @@ def test_losses_of_this_aircraft_only() -> None:
     assert (found.drop_rate_comm, found.errors_comm) == (round(1e4 * 100 / 1100), 100)
     health.on_link(report(link(received=1000, lost=100), link(GPS_NODE, received=110), other))
     assert health.sys_status(0).drop_rate_comm == 0
-    assert health.radio_status().rxerrors == 100
-
-
-def test_radio_status_knows_no_signal_strength() -> None:
-    health = healthy()
-    found = health.radio_status()
-    assert (found.rssi, found.remrssi, found.noise, found.remnoise) == (255,) * 4
-    receiver = ReceiverStatus(0, 0, 76, 12, 0, 0, ())
-    health.on_link(replace(report(link()), receiver=receiver))
-    assert health.radio_status().noise == 12
 
 
 def test_silent_nodes() -> None:

@@ -160,6 +160,17 @@ def test_gps_raw_int_with_unknown_accuracies() -> None:
     assert (found.vel, found.cog) == (65535, 65535)
 
 
+def test_last_position_is_repeated_without_a_fix() -> None:
+    for message, fix_type in (
+        (messages.gps_raw_int(replace(NO_FIX, lat_dege7=0, lon_dege7=0), FIX), 1),
+        (messages.gps_absent(5_000_000, FIX), 0),
+    ):
+        found = through_the_wire(message)
+        assert (found.fix_type, found.lat, found.lon) == (fix_type, 471_234_567, -87_654_321)
+        assert found.alt == 520_250
+    assert through_the_wire(messages.gps_raw_int(replace(FIX, lat_dege7=5), FIX)).lat == 5
+
+
 def test_gps_absent() -> None:
     found = through_the_wire(messages.gps_absent(5_000_000))
     assert found.fix_type == mavlink.GPS_FIX_TYPE_NO_GPS

@@ -1,4 +1,7 @@
-"""Component metadata: what each parameter means, its unit and range, as JSON for ground stations.
+"""Component metadata: the meaning, unit and range of each parameter, as JSON for ground stations.
+
+The parameters' file is compressed by xz, as the specification allows: 6 kB in place of 40 kB, which
+takes a 57600 baud radio 2 s in place of 10 s.
 
 References
 ----------
@@ -6,6 +9,7 @@ References
 """
 
 import json
+import lzma
 from functools import cache
 from typing import Any, Final
 
@@ -21,9 +25,14 @@ from gateway.vehicle.services.parameters.parameters import (
 from gateway.vehicle.telemetry.messages import boot_ms
 
 GENERAL_PATH: Final = "/general.json"
-PARAMETER_PATH: Final = "/parameter.json"
+PARAMETER_PATH: Final = "/parameter.json.xz"
 TYPE_PARAMETER: Final = 1
 """COMP_METADATA_TYPE_PARAMETER."""
+MAX_SHORT: Final = 100
+"""Length of a short description in the specification's schema."""
+POSITION_PLACES: Final = 7
+PLACES: Final = 4
+"""Decimal places shown of a latitude or longitude, and of other numbers."""
 
 
 class Metadata:
@@ -50,7 +59,10 @@ class Metadata:
 def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[bytes, bytes]:
     """Write the two files, once for all vehicles."""
     described = [_describe(parameter) for parameter in parameters_of(kinds)]
-    parameters = _json({"version": 1, "parameters": described})
+    # CRC32 is the check that every decoder of xz supports; embedded ones lack the default, CRC64.
+    parameters = lzma.compress(
+        _json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32
+    )
     general = {
         "version": 1,
         "vendorName": "mavgate",
@@ -70,31 +82,39 @@ def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[bytes, bytes]
 def _describe(parameter: Parameter) -> dict[str, Any]:
     field = parameter.field
     group = parameter.path[-2] if len(parameter.path) > 1 else parameter.section
+    is_whole = bool(field.choices) or isinstance(field.default, int)
+    default = parameter.to_number(field.default)
     described: dict[str, Any] = {
         "name": parameter.name,
-        "type": "Float",
-        "shortDesc": field.meaning.split(". ")[0].rstrip("."),
+        "type": "Int32" if is_whole else "Float",
+        "shortDesc": _shorten(field.meaning),
         "longDesc": f"{field.meaning} ({'.'.join((parameter.section, *parameter.path))})",
         "units": field.unit,
-        "default": parameter.to_number(field.default),
+        "default": int(default) if is_whole else default,
         "group": group,
         "category": parameter.section,
     }
     low, high = field.bounds
-    if field.choices:
+    names = ("off", "on") if isinstance(field.default, bool) else field.choices
+    if names:
         described["values"] = [
-            {"value": number, "description": choice} for number, choice in enumerate(field.choices)
+            {"value": number, "description": name} for number, name in enumerate(names)
         ]
-    elif isinstance(field.default, bool):
-        described["values"] = [
-            {"value": 0, "description": "off"},
-            {"value": 1, "description": "on"},
-        ]
-    else:
-        described |= {"min": low} if low is not None else {}
-        described |= {"max": high} if high is not None else {}
-        described["decimalPlaces"] = 0 if isinstance(field.default, int) else 4
+        return described
+    described |= {"min": low} if low is not None else {}
+    described |= {"max": high} if high is not None else {}
+    if not is_whole:
+        is_position = parameter.path[-1] in ("lat_deg", "lon_deg")
+        described["decimalPlaces"] = POSITION_PLACES if is_position else PLACES
     return described
+
+
+def _shorten(text: str) -> str:
+    """Return the first sentence, cut at a word where it is longer than the schema allows."""
+    sentence = text.split(". ")[0].rstrip(".")
+    if len(sentence) <= MAX_SHORT:
+        return sentence
+    return sentence[: MAX_SHORT - 3].rpartition(" ")[0].rstrip(",;:") + "..."
 
 
 def _json(content: dict[str, Any]) -> bytes:

@@ -1,8 +1,10 @@
 """The parameter protocol: list, read, set.
 
-The list goes to the client that asked, a few at a time, so that it does not overflow the client's
-receive buffer or a slow link, and to several clients in turn, to bound the gateway's load; a
-change goes to all, so that every ground station's table stays up to date.
+The list goes to the client that requested it, a few at a time, so that it does not overflow the
+client's receive buffer or a slow link, and to several clients in turn, to bound the gateway's load.
+A change goes to every client that has requested parameters before, so that its table stays up to
+date, and to no other: QGroundControl takes the first PARAM_VALUE that it receives for the beginning
+of the list, and reads the list before it has the metadata.
 """
 
 from collections.abc import Mapping
@@ -10,6 +12,7 @@ from typing import Any, Final, Protocol
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.records import RECORDED_ONLY
 from gateway.settings import Settings
 from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange
 from gateway.vehicle.services.commands import (
@@ -26,6 +29,7 @@ BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
 """Between batches of this many, for all clients together."""
 MAX_LISTENERS: Final = 512
+"""Clients that may request lists and be sent changes."""
 BY_NAME: Final = -1
 
 WRITE: Final = 1
@@ -77,6 +81,8 @@ class ParameterService:
         self._lists: dict[int, int] = {}
         """The next parameter of each list that is under way; whose turn it is comes first."""
         self._due_us = 0
+        self._listeners: dict[int, None] = {}
+        """Clients that have requested parameters, and are sent changes."""
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the request is to set one."""
@@ -92,6 +98,7 @@ class ParameterService:
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one request."""
         kind = request.message.get_type()
+        self.listen(request.client_id)
         if kind == "PARAM_SET":
             return self._set(request, now_us)
         if kind == "PARAM_REQUEST_READ":
@@ -119,8 +126,14 @@ class ParameterService:
         return self._due_us if self._lists else None
 
     def forget_client(self, client_id: int) -> None:
-        """Stop a list whose client has gone."""
+        """Stop the list and the changes for a client that has gone."""
         self._lists.pop(client_id, None)
+        self._listeners.pop(client_id, None)
+
+    def listen(self, client_id: int) -> None:
+        """Send changes to a client from now on."""
+        if len(self._listeners) < MAX_LISTENERS:
+            self._listeners[client_id] = None
 
     def store(self, command: Command, _now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_STORAGE: store, or restore the defaults.
@@ -142,13 +155,14 @@ class ParameterService:
                 answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
         return ACCEPTED, answers + self._changed_since(before)
 
-    def param_value(self, parameter: Parameter) -> Reply:
-        """Send the present value of a parameter to all."""
-        return Reply(self._value(parameter))
-
     def values(self) -> list[Answer]:
-        """Send all of them to all."""
-        return [self.param_value(parameter) for parameter in self.table.parameters]
+        """Return every parameter, for all clients."""
+        return [Reply(self._value(parameter)) for parameter in self.table.parameters]
+
+    def _changed(self, parameter: Parameter) -> list[Answer]:
+        """Send the value of a parameter to the clients that listen; record it if none does."""
+        value = self._value(parameter)
+        return [Reply(value, client_id) for client_id in self._listeners or (RECORDED_ONLY,)]
 
     def take(self, section: str, settings: Any) -> list[Answer]:
         """Apply a section that was changed elsewhere, and send what differs."""
@@ -161,7 +175,12 @@ class ParameterService:
 
     def _changed_since(self, before: list[float]) -> list[Answer]:
         changed = zip(self.table.parameters, before, self._numbers(), strict=True)
-        return [self.param_value(parameter) for parameter, old, new in changed if old != new]
+        return [
+            answer
+            for parameter, old, new in changed
+            if old != new
+            for answer in self._changed(parameter)
+        ]
 
     def _set(self, request: Request, now_us: int) -> list[Answer]:
         message = request.message
@@ -176,8 +195,8 @@ class ParameterService:
         except ValueError:
             self.table.sections[parameter.section] = before
             # The error first: a client that sees only the old value would retry.
-            return [self._error(request, BAD_VALUE), self.param_value(parameter)]
-        return [*answers, self.param_value(parameter)]
+            return [self._error(request, BAD_VALUE), request.reply(self._value(parameter))]
+        return [*answers, *self._changed(parameter)]
 
     def _carry_out(self, parameter: Parameter, settings: Settings, now_us: int) -> list[Answer]:
         path = ".".join(parameter.path)

@@ -8,6 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
+from gateway.records import RECORDED_ONLY
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, fields_of, setting
 from gateway.vehicle.actions import SaveSettings, SettingsChange
@@ -19,6 +20,7 @@ from tests.vehicle.test_start_up import load_parameters
 
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 INT32 = mavlink.MAV_PARAM_TYPE_INT32
+PARAM_VALUE = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
 ERROR = {
     "unknown": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST,
     "range": mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE,
@@ -102,17 +104,35 @@ def test_unknown_names_are_refused(station: GroundStation, name: bytes, index: i
         ("TUNING_BIAS_Y", -3.5, "bias_mps2", (0.0, -3.5, 2.0)),
     ],
 )
-def test_a_change_takes_effect_and_is_sent_to_all(
+def test_change_takes_effect_and_is_sent_to_every_client_that_requested_parameters(
     station: GroundStation, name: str, sent: float, path: str, stored: object
 ) -> None:
     other = GroundStation(station.vehicle, station.clock, client_id=8)
+    other.send(mavlink.MAVLink_param_request_read_message(1, 1, b"TUNING_ORDER", -1))
     [value] = station.send(set_message(name, sent))
     assert value.param_value == pytest.approx(sent)
-    assert station.broadcasts == {"PARAM_VALUE"}
+    assert [frame.client_id for frame in station.frames] == [8, 7]
     [change] = station.of(SettingsChange)
     assert (change.vehicle_id, change.section, change.path) == (1, "tuning", path)
     assert getattr(change.settings, path) == stored
     assert values(other)[name] == pytest.approx(sent)
+
+
+def test_change_is_only_recorded_while_no_client_has_requested_parameters(
+    station: GroundStation,
+) -> None:
+    """QGroundControl takes any PARAM_VALUE for the beginning of the list that it requested."""
+    found = station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, 8.5, 500.0)
+    assert "PARAM_VALUE" not in kinds(found)
+    pushed = [f.client_id for f in station.frames if f.message_id == PARAM_VALUE]
+    assert pushed == [RECORDED_ONLY] * 4
+
+
+def test_no_change_is_sent_to_a_client_that_has_gone(station: GroundStation) -> None:
+    station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"TUNING_ORDER", -1))
+    station.vehicle.forget_client(station.client_id)
+    changed = VehicleSettings(takeoff_speed_mps=7.0)
+    assert station.receive(station.vehicle.take_settings("vehicle", changed)) == []
 
 
 def test_a_change_in_an_inner_section(station: GroundStation) -> None:
