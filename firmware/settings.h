@@ -1,8 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// Every setting of the three programs. Each can be given on the make line instead:
+// Every setting of the three programs. Those marked * are also in the settings block of each image:
+// here is their default, and `mavgate flash` changes them without a compiler. Each can be given on
+// the make line instead:
 //     make -C firmware SETTINGS="-DVEHICLE_ID=2 -DRADIO_CHANNEL=80"
 // Radio settings must be the same on all boards that talk to one another.
 #pragma once
+
+#include "common/settings_block.h"
 
 #ifndef F_CPU
 #define F_CPU 16000000UL
@@ -10,12 +14,12 @@
 
 // --- Who this is -----------------------------------------------------------------------------
 
-// 1 to 31; the gateway's MAVLink system id.
+// * 1 to 31; the gateway's MAVLink system id.
 #ifndef VEHICLE_ID
 #define VEHICLE_ID 1
 #endif
 
-// 0 to 7, unique within the vehicle.
+// * 0 to 7, unique within the vehicle.
 #ifndef IMU_NODE_ID
 #define IMU_NODE_ID 0
 #endif
@@ -25,29 +29,29 @@
 
 // --- Radio -----------------------------------------------------------------------------------
 
-// 2400 MHz plus this. 76 lies above Wi-Fi channel 11 and inside the licence-free band, which ends
+// * 2400 MHz plus this. 76 lies above Wi-Fi channel 11 and inside the licence-free band, which ends
 // at 2483.5 MHz in most countries.
 #ifndef RADIO_CHANNEL
 #define RADIO_CHANNEL 76
 #endif
 
-// 250, 1000 or 2000 kbit/s. Each step down gains about 4 to 9 dB and costs air time: 0.2 ms, 0.4 ms
+// * 250, 1000 or 2000 kbit/s. Each step down gains about 4 to 9 dB and costs air time: 0.2 ms, 0.4 ms
 // and 1.4 ms for a full payload.
 #ifndef RADIO_KBPS
 #define RADIO_KBPS 1000
 #endif
 
-// Output: 0 = -18 dBm, 1 = -12, 2 = -6, 3 = 0 dBm.
+// * Output: 0 = -18 dBm, 1 = -12, 2 = -6, 3 = 0 dBm.
 #ifndef RADIO_POWER
 #define RADIO_POWER 3
 #endif
 
-// The upper four bytes of every pipe's address; another group of boards nearby takes another.
+// * The upper four bytes of every pipe's address; another group of boards nearby takes another.
 #ifndef RADIO_ADDRESS
 #define RADIO_ADDRESS 0xD35AC396UL
 #endif
 
-// The receiver's pipe that a node sends to: two pipes for each of three vehicles.
+// * The receiver's pipe that a node sends to: two pipes for each of three vehicles.
 #ifndef IMU_RADIO_PIPE
 #define IMU_RADIO_PIPE (((VEHICLE_ID - 1) * 2) % 6)
 #endif
@@ -62,12 +66,12 @@
 #define IMU_SAMPLE_HZ (F_CPU >= 16000000UL ? 1000 : 500)
 #endif
 
-// IMU payloads per second, 60 to 250.
+// * IMU payloads per second, 60 to 250.
 #ifndef IMU_SEND_HZ
 #define IMU_SEND_HZ 100
 #endif
 
-// 1 sends means of the readings and leaves every filter to the gateway; 0 filters on the node.
+// * 1 sends means of the readings and leaves every filter to the gateway; 0 filters on the node.
 #ifndef IMU_RAW
 #define IMU_RAW 0
 #endif
@@ -84,7 +88,7 @@
 #define GYRO_HIGHPASS_HZ 0.0
 #endif
 
-// 0 to 3: +-2, 4, 8, 16 g and +-250, 500, 1000, 2000 deg/s.
+// * 0 to 3: +-2, 4, 8, 16 g and +-250, 500, 1000, 2000 deg/s.
 #ifndef ACCEL_RANGE
 #define ACCEL_RANGE 2
 #endif
@@ -110,7 +114,7 @@
 
 // --- GPS node --------------------------------------------------------------------------------
 
-// 1 to 10; 10 needs GPS alone (no GLONASS) on an M8N.
+// * 1 to 10; 10 needs GPS alone (no GLONASS) on an M8N.
 #ifndef GPS_RATE_HZ
 #define GPS_RATE_HZ 5
 #endif
@@ -121,7 +125,7 @@
 #define GPS_BAUD (F_CPU >= 16000000UL ? 57600UL : 38400UL)
 #endif
 
-// UBX-CFG-NAV5: 6, 7 and 8 are airborne below 1, 2 and 4 g.
+// * UBX-CFG-NAV5: 6, 7 and 8 are airborne below 1, 2 and 4 g.
 #ifndef GPS_DYNAMIC_MODEL
 #define GPS_DYNAMIC_MODEL 8
 #endif
@@ -158,3 +162,14 @@ static_assert(MAG_HZ >= 1 && MAG_HZ <= 75, "the HMC5883L gives up to 75 readings
 static_assert(BARO_OVERSAMPLING >= 0 && BARO_OVERSAMPLING <= 3, "BARO_OVERSAMPLING is 0 to 3");
 static_assert(BARO_HZ >= 1 && BARO_HZ <= 30, "BARO_HZ is 1 to 30");
 static_assert(GPS_RATE_HZ >= 1 && GPS_RATE_HZ <= 10, "GPS_RATE_HZ is 1 to 10");
+
+// The settings block as built.
+constexpr SettingsBlock default_settings(SettingsProgram program, uint8_t node_id, uint8_t pipe) {
+    return SettingsBlock{
+        {'m', 'a', 'v', 'g', 'a', 't', 'e'}, SETTINGS_VERSION, program,
+        static_cast<uint8_t>(F_CPU / 1000000UL), FIRMWARE_VERSION_MAJOR, FIRMWARE_VERSION_MINOR,
+        VEHICLE_ID, node_id, pipe, RADIO_CHANNEL, RADIO_KBPS, RADIO_POWER, IMU_SEND_HZ,
+        RADIO_ADDRESS, IMU_RAW, ACCEL_RANGE, GYRO_RANGE, GPS_RATE_HZ, GPS_DYNAMIC_MODEL,
+        0, {0, 0}, 0,
+    };
+}

@@ -1,13 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/frame.h"
 
-uint16_t crc16_update(uint16_t crc, uint8_t byte) {
-    // The polynomial's taps folded over a whole byte: no table, no loop over bits.
-    uint8_t x = static_cast<uint8_t>((crc >> 8) ^ byte);
-    x = static_cast<uint8_t>(x ^ (x >> 4));
-    const uint16_t wide = x;
-    return static_cast<uint16_t>((crc << 8) ^ (wide << 12) ^ (wide << 5) ^ wide);
-}
+#include "common/crc16.h"
 
 namespace {
 

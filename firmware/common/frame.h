@@ -7,11 +7,6 @@
 constexpr uint8_t FRAME_MAX_CONTENT = 72;  // the receiver's status
 constexpr uint8_t FRAME_MAX_SIZE = FRAME_MAX_CONTENT + 2 + 1 + 1;  // CRC, COBS code, zero
 
-constexpr uint16_t CRC16_START = 0xFFFF;
-
-// CRC-16/CCITT-FALSE (polynomial 0x1021, not reflected), one more byte.
-uint16_t crc16_update(uint16_t crc, uint8_t byte);
-
 // Writes the frame of `content` (at most FRAME_MAX_CONTENT bytes) to `out`, which holds at least
 // FRAME_MAX_SIZE bytes. Returns the number of bytes written, the closing zero included.
 uint8_t frame_encode(const uint8_t *content, uint8_t size, uint8_t *out);

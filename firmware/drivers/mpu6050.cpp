@@ -4,6 +4,7 @@
 #include "common/imu_reducer.h"
 #include "common/mpu6050_math.h"
 #include "hal/board.h"
+#include "hal/stored_settings.h"
 #include "hal/twi.h"
 #include "settings.h"
 
@@ -31,7 +32,6 @@ constexpr uint8_t RANGE_SHIFT = 3;
 // Butterworth, which must not be bent by it.
 constexpr uint8_t DLPF_44_HZ = 3;
 constexpr uint8_t DLPF_184_HZ = 1;
-constexpr uint8_t DLPF = IMU_RAW ? DLPF_44_HZ : DLPF_184_HZ;
 constexpr uint8_t RATE_DIVISOR = 1000 / IMU_SAMPLE_HZ - 1;  // 1 kHz behind the low-pass
 
 // Ranges at which the factory trims are given: +-8 g, +-250 deg/s.
@@ -57,6 +57,10 @@ bool read_registers(uint8_t address, uint8_t *bytes, uint8_t size) {
 bool set_ranges(uint8_t accel, uint8_t gyro, uint8_t self_test) {
     return write_register(GYRO_CONFIG, static_cast<uint8_t>(gyro << RANGE_SHIFT | self_test)) &&
            write_register(ACCEL_CONFIG, static_cast<uint8_t>(accel << RANGE_SHIFT | self_test));
+}
+
+bool set_ranges() {
+    return set_ranges(stored_settings().accel_range, stored_settings().gyro_range, 0);
 }
 
 bool sum_readings(Sums *sums) {
@@ -102,9 +106,10 @@ bool mpu6050_reset() {
 
 bool mpu6050_set_up() {
     uint8_t who = 0;
+    const uint8_t dlpf = stored_settings().imu_raw != 0 ? DLPF_44_HZ : DLPF_184_HZ;
     return read_registers(WHO_AM_I, &who, 1) && who == MPU6050_ADDRESS &&
            write_register(PWR_MGMT_1, CLOCK_GYRO_X) && write_register(SMPLRT_DIV, RATE_DIVISOR) &&
-           write_register(CONFIG, DLPF) && set_ranges(ACCEL_RANGE, GYRO_RANGE, 0) &&
+           write_register(CONFIG, dlpf) && set_ranges() &&
            write_register(USER_CTRL, 0) && write_register(INT_PIN_CFG, BYPASS) &&
            write_register(INT_ENABLE, DATA_READY);
 }
@@ -117,7 +122,7 @@ bool mpu6050_self_test() {
                           set_ranges(TEST_ACCEL_RANGE, TEST_GYRO_RANGE, SELF_TEST_ALL) &&
                           sum_readings(&test) &&
                           read_registers(SELF_TEST_X, registers, sizeof registers);
-    if (!set_ranges(ACCEL_RANGE, GYRO_RANGE, 0) || !measured) {
+    if (!set_ranges() || !measured) {
         return false;
     }
     board_wait_ms(TEST_SETTLE_MS);  // the test's own deflection must not reach the first samples

@@ -3,7 +3,7 @@
 
 #include "hal/board.h"
 #include "hal/spi.h"
-#include "settings.h"
+#include "hal/stored_settings.h"
 
 namespace {
 
@@ -43,12 +43,20 @@ constexpr uint8_t FIFO_RX_EMPTY = 1 << 0;
 constexpr uint8_t FIFO_RX_FULL = 1 << 1;
 constexpr uint8_t CAUSES = NRF24_RECEIVED | NRF24_SENT | NRF24_GAVE_UP;
 
-constexpr uint8_t RATE_BITS = RADIO_KBPS == 250 ? 1 << 5 : RADIO_KBPS == 2000 ? 1 << 3 : 0;
-constexpr uint8_t RF_SETUP_VALUE = static_cast<uint8_t>(RATE_BITS + (RADIO_POWER << 1));
+constexpr uint8_t RATE_250_KBPS = 1 << 5;
+constexpr uint8_t RATE_2000_KBPS = 1 << 3;
 
 constexpr uint8_t POWER_UP_MS = 5;  // table 16: up to 4.5 ms for a crystal of 90 mH
 
 uint8_t config;
+
+uint8_t rf_setup() {
+    const SettingsBlock &settings = stored_settings();
+    const uint8_t rate = settings.radio_kbps == 250    ? RATE_250_KBPS
+                         : settings.radio_kbps == 2000 ? RATE_2000_KBPS
+                                                       : 0;
+    return static_cast<uint8_t>(rate | settings.radio_power << 1);
+}
 
 uint8_t command(uint8_t code, const uint8_t *out, uint8_t *in, uint8_t size) {
     spi_select_radio(true);
@@ -76,12 +84,13 @@ uint8_t read_register(uint8_t address) {
 // Pipes 1 to 5 share four bytes and differ in the lowest, which is sent first. The chosen bytes
 // are neither runs of equal bits nor like a preamble.
 void write_address(uint8_t address, uint8_t pipe) {
+    const uint32_t upper = stored_settings().radio_address;
     const uint8_t bytes[5] = {
         static_cast<uint8_t>(0x93 + 0x11 * pipe),
-        static_cast<uint8_t>(RADIO_ADDRESS),
-        static_cast<uint8_t>(RADIO_ADDRESS >> 8),
-        static_cast<uint8_t>(RADIO_ADDRESS >> 16),
-        static_cast<uint8_t>(RADIO_ADDRESS >> 24),
+        static_cast<uint8_t>(upper),
+        static_cast<uint8_t>(upper >> 8),
+        static_cast<uint8_t>(upper >> 16),
+        static_cast<uint8_t>(upper >> 24),
     };
     const bool shared = address > RX_ADDR_P0 + 1 && address < TX_ADDR;
     command(W_REGISTER | address, bytes, nullptr, shared ? 1 : sizeof bytes);
@@ -91,8 +100,8 @@ void set_up_common() {
     spi_enable_radio(false);
     write_register(CONFIG, CONFIG_CRC_16);
     write_register(SETUP_AW, ADDRESS_WIDTH_5);
-    write_register(RF_CH, RADIO_CHANNEL);
-    write_register(RF_SETUP, RF_SETUP_VALUE);
+    write_register(RF_CH, stored_settings().radio_channel);
+    write_register(RF_SETUP, rf_setup());
     write_register(FEATURE, FEATURE_DYNAMIC_LENGTH);
     command(FLUSH_TX, nullptr, nullptr, 0);
     command(FLUSH_RX, nullptr, nullptr, 0);
@@ -136,7 +145,7 @@ bool nrf24_start_receiver() {
 }
 
 bool nrf24_configured() {
-    return read_register(CONFIG) == config && read_register(RF_CH) == RADIO_CHANNEL;
+    return read_register(CONFIG) == config && read_register(RF_CH) == stored_settings().radio_channel;
 }
 
 void nrf24_send(const uint8_t *payload, uint8_t size, uint8_t pause, uint8_t retries) {

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "hal/clock.h"
+#include "hal/stored_settings.h"
 #include "hal/uart.h"
 #include "settings.h"
 
@@ -30,9 +31,8 @@ constexpr uint8_t PORT[20] = {
     0, 0, 0, 0,
 };
 constexpr uint8_t MESSAGE[3] = {0x01, 0x07, 1};  // NAV-PVT with every solution
-constexpr uint16_t PERIOD_MS = 1000 / GPS_RATE_HZ;
-constexpr uint8_t RATE[6] = {low(PERIOD_MS, 0), low(PERIOD_MS, 8), 1, 0, 1, 0};
-constexpr uint8_t MODEL[36] = {0x01, 0, GPS_DYNAMIC_MODEL};  // apply the dynamic model alone
+uint8_t rate[6] = {0, 0, 1, 0, 1, 0};  // period in ms, filled in by ublox_start
+uint8_t model[36] = {0x01, 0, 0};      // apply the dynamic model alone, filled in by ublox_start
 
 struct Setting {
     uint16_t id;
@@ -43,10 +43,10 @@ struct Setting {
 constexpr Setting SETTINGS[RUNNING] = {
     {UBX_CFG_PRT, PORT, sizeof PORT},
     {UBX_CFG_MSG, MESSAGE, sizeof MESSAGE},
-    {UBX_CFG_RATE, RATE, sizeof RATE},
-    {UBX_CFG_NAV5, MODEL, sizeof MODEL},
+    {UBX_CFG_RATE, rate, sizeof rate},
+    {UBX_CFG_NAV5, model, sizeof model},
 };
-constexpr uint8_t LONGEST_SETTING = sizeof MODEL;
+constexpr uint8_t LONGEST_SETTING = sizeof model;
 
 uint8_t tx_ring[LONGEST_SETTING + UBX_OVERHEAD + 1];
 
@@ -113,6 +113,10 @@ bool take_message(Ublox *ublox) {
 
 void ublox_start(Ublox *ublox) {
     memset(ublox, 0, sizeof *ublox);
+    const uint16_t period_ms = static_cast<uint16_t>(1000U / stored_settings().gps_rate_hz);
+    rate[0] = low(period_ms, 0);
+    rate[1] = low(period_ms, 8);
+    model[2] = stored_settings().gps_dynamic_model;
     try_speed(ublox, false);
 }
 

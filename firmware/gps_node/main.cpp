@@ -7,12 +7,16 @@
 #include "hal/clock.h"
 #include "hal/lines.h"
 #include "hal/spi.h"
+#include "hal/stored_settings.h"
 #include "hal/uart.h"
 #include "node/node_report.h"
 #include "node/radio_sender.h"
 #include "settings.h"
 
 namespace {
+
+const SettingsImage IMAGE SETTINGS_IN_FLASH =
+    settings_image(default_settings(PROGRAM_GPS_NODE, GPS_NODE_ID, GPS_RADIO_PIPE));
 
 Ublox ublox;
 RadioSender sender;
@@ -42,8 +46,9 @@ int main() {
     spi_start();
     lines_start_radio();
     board_start();
+    stored_settings_load(&IMAGE);
     ublox_start(&ublox);
-    radio_sender_start(&sender, GPS_RADIO_PIPE, wire_vehicle_node(VEHICLE_ID, GPS_NODE_ID));
+    radio_sender_start(&sender);
     report.due_us = report.loop_began_us = clock_us();
     for (;;) {
         const uint32_t now_us = node_report_wait(&report);
@@ -54,5 +59,6 @@ int main() {
             node_report_send(&report, now_us, health(), &sender);
         }
         radio_sender_poll(&sender, now_us);
+        node_report_led(now_us, !ublox_running(&ublox), &sender);
     }
 }

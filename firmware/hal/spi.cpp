@@ -10,6 +10,11 @@ constexpr uint8_t CSN = 1 << PB2;
 constexpr uint8_t MOSI = 1 << PB3;
 constexpr uint8_t SCK = 1 << PB5;
 
+constexpr uint8_t MASTER = 1 << SPE | 1 << MSTR;
+constexpr uint8_t RELEASED = 1 << MSTR;  // the port's bit drives the clock line
+
+bool idle_clock_high;
+
 }  // namespace
 
 void spi_start() {
@@ -17,15 +22,33 @@ void spi_start() {
     PORTB &= static_cast<uint8_t>(~CE);
     DDRB |= CE | CSN | MOSI | SCK;
     // The radio takes up to 10 Mbit/s.
-    SPCR = 1 << SPE | 1 << MSTR;
+    SPCR = MASTER;
     SPSR = 1 << SPI2X;
 }
 
 void spi_select_radio(bool selected) {
     if (selected) {
+        SPCR = MASTER;
         PORTB &= static_cast<uint8_t>(~CSN);
     } else {
         PORTB |= CSN;
+        if (idle_clock_high) {
+            SPCR = RELEASED;
+        }
+    }
+}
+
+void spi_set_idle_clock(bool high) {
+    if (high == idle_clock_high) {
+        return;
+    }
+    idle_clock_high = high;
+    if (high) {
+        PORTB |= SCK;
+        SPCR = RELEASED;
+    } else {
+        PORTB &= static_cast<uint8_t>(~SCK);
+        SPCR = MASTER;
     }
 }
 

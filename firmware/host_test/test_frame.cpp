@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "common/crc16.h"
 #include "common/frame.h"
 #include "common/wire.h"
 #include "host_test/check.h"

@@ -9,6 +9,7 @@
 #include "hal/clock.h"
 #include "hal/lines.h"
 #include "hal/spi.h"
+#include "hal/stored_settings.h"
 #include "hal/twi.h"
 #include "imu_node/sensors.h"
 #include "node/node_report.h"
@@ -17,14 +18,12 @@
 
 namespace {
 
-constexpr ImuReducerSettings REDUCER_SETTINGS = {
-    IMU_SAMPLE_HZ,
-    IMU_SEND_HZ,
-    IMU_RAW != 0,
-    low_pass_design(ACCEL_LOWPASS_HZ, IMU_SAMPLE_HZ),
-    high_pass_gain(GYRO_HIGHPASS_HZ, IMU_SEND_HZ),
-};
-constexpr uint8_t RANGES = wire_ranges(ACCEL_RANGE, GYRO_RANGE, MAG_GAIN);
+const SettingsImage IMAGE SETTINGS_IN_FLASH =
+    settings_image(default_settings(PROGRAM_IMU_NODE, IMU_NODE_ID, IMU_RADIO_PIPE));
+
+constexpr uint32_t GYRO_HIGHPASS_GAIN_1_HZ = high_pass_gain(GYRO_HIGHPASS_HZ, 1.0);
+
+constexpr LowPassDesign ACCEL_LOWPASS = low_pass_design(ACCEL_LOWPASS_HZ, IMU_SAMPLE_HZ);
 
 Sensors sensors;
 SensorReadings readings;
@@ -33,6 +32,13 @@ WireImu imu;
 RadioSender sender;
 NodeReport report;
 bool mag_is_new;
+
+// A value, not a variable: so the compiler folds the filters' constants into their code.
+ImuReducerSettings reducer_settings() {
+    const SettingsBlock &settings = stored_settings();
+    return ImuReducerSettings{IMU_SAMPLE_HZ, settings.imu_send_hz, settings.imu_raw != 0, ACCEL_LOWPASS,
+                              GYRO_HIGHPASS_GAIN_1_HZ / settings.imu_send_hz};
+}
 
 uint16_t flag_if(bool condition, uint16_t flag) { return condition ? flag : 0; }
 
@@ -48,7 +54,8 @@ void send_imu() {
         imu.mag[axis] = readings.mag[axis];
     }
     imu.flags |= sensor_flags();
-    imu.ranges = RANGES;
+    const SettingsBlock &settings = stored_settings();
+    imu.ranges = wire_ranges(settings.accel_range, settings.gyro_range, MAG_GAIN);
     mag_is_new = false;
     ++report.samples;
     radio_sender_push(&sender, WIRE_IMU, readings.imu_us, &imu, sizeof imu);
@@ -66,7 +73,7 @@ void poll_sensors(uint32_t now_us) {
     if ((news & SENSOR_NEWS_MAG) != 0) {
         mag_is_new = true;
     }
-    if ((news & SENSOR_NEWS_IMU) != 0 && imu_reduce(&reducer, REDUCER_SETTINGS, readings.imu, &imu)) {
+    if ((news & SENSOR_NEWS_IMU) != 0 && imu_reduce(&reducer, reducer_settings(), readings.imu, &imu)) {
         send_imu();
     }
     if ((news & SENSOR_NEWS_BARO) != 0) {
@@ -84,7 +91,8 @@ int main() {
     spi_start();
     lines_start_radio();
     board_start();
-    radio_sender_start(&sender, IMU_RADIO_PIPE, wire_vehicle_node(VEHICLE_ID, IMU_NODE_ID));
+    stored_settings_load(&IMAGE);
+    radio_sender_start(&sender);
     sensors_start(&sensors, board_started_cold());
     report.due_us = report.loop_began_us = clock_us();
     for (;;) {
@@ -94,5 +102,6 @@ int main() {
             node_report_send(&report, now_us, health(), &sender);
         }
         radio_sender_poll(&sender, now_us);
+        node_report_led(now_us, sensors_failed(&sensors), &sender);
     }
 }

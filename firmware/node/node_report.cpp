@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "node/node_report.h"
 
+#include "common/firmware_version.h"
 #include "hal/board.h"
 #include "hal/clock.h"
 #include "hal/events.h"
@@ -46,4 +47,9 @@ void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &hea
     report->loop_max_us = 0;
     report->samples = 0;
     radio_sender_push(sender, WIRE_NODE_STATUS, now_us, &status, sizeof status);
+}
+
+void node_report_led(uint32_t now_us, bool sensor_failed, const RadioSender *sender) {
+    const LedCode radio = radio_sender_led(sender);
+    led_blink(radio == LED_OFF && sensor_failed ? LED_NO_SENSOR : radio, now_us);
 }

@@ -6,9 +6,6 @@
 
 #include "node/radio_sender.h"
 
-constexpr uint8_t FIRMWARE_VERSION_MAJOR = 1;
-constexpr uint8_t FIRMWARE_VERSION_MINOR = 0;
-
 struct NodeReport {
     uint32_t due_us;
     uint32_t loop_began_us;
@@ -31,3 +28,6 @@ bool node_report_due(const NodeReport *report, uint32_t now_us);
 
 void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &health,
                       RadioSender *sender);
+
+// Shows on the LED what is wrong, the radio before the sensors.
+void node_report_led(uint32_t now_us, bool sensor_failed, const RadioSender *sender);

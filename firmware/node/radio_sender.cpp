@@ -7,7 +7,7 @@
 #include "drivers/nrf24.h"
 #include "hal/clock.h"
 #include "hal/lines.h"
-#include "settings.h"
+#include "hal/stored_settings.h"
 
 namespace {
 
@@ -19,30 +19,45 @@ constexpr uint8_t ROUNDS = 12;
 // Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
 // 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
 // the acknowledgement (section 7.4.2 of the chip's specification).
-constexpr uint8_t PAUSE_STEP = RADIO_KBPS == 250 ? 7 : RADIO_KBPS == 1000 ? 3 : 2;
+struct Pauses {
+    uint8_t step;
+    uint8_t count;
+    uint16_t round_step_us;
+};
+constexpr Pauses PAUSES_250 = {7, 3, 2000};
+constexpr Pauses PAUSES_1000 = {3, 5, 1000};
+constexpr Pauses PAUSES_2000 = {2, 5, 1000};
 constexpr uint8_t PAUSE_FIRST = 2;
-constexpr uint8_t PAUSES = RADIO_KBPS == 250 ? 3 : 5;
-static_assert(PAUSE_FIRST + PAUSE_STEP * (PAUSES - 1) <= 16, "the chip pauses up to 4 ms");
-
-constexpr uint16_t ROUND_STEP_US = RADIO_KBPS == 250 ? 2000 : 1000;
+constexpr bool fits(const Pauses &pauses) {
+    return PAUSE_FIRST + pauses.step * (pauses.count - 1) <= 16;
+}
+static_assert(fits(PAUSES_250) && fits(PAUSES_1000) && fits(PAUSES_2000),
+              "the chip pauses up to 4 ms");
 
 constexpr uint32_t LOST_US = 50000;
 constexpr uint32_t SET_UP_EVERY_US = 500000;
 
+const Pauses &pauses() {
+    const uint16_t kbps = stored_settings().radio_kbps;
+    return kbps == 250 ? PAUSES_250 : kbps == 1000 ? PAUSES_1000 : PAUSES_2000;
+}
+
 uint8_t draw_pause(RadioSender *sender) {
     sender->random = random16_next(sender->random);
-    return static_cast<uint8_t>(PAUSE_FIRST + PAUSE_STEP * ((sender->random >> 4) % PAUSES));
+    const Pauses &drawn = pauses();
+    return static_cast<uint8_t>(PAUSE_FIRST + drawn.step * ((sender->random >> 4) % drawn.count));
 }
 
 void count_lost(RadioSender *sender) {
     ++sender->failed;
+    sender->acknowledged = false;
     payload_queue_pop(&sender->queue);
     nrf24_stop_sending();
     sender->state = IDLE;
 }
 
 void set_up(RadioSender *sender) {
-    sender->state = nrf24_start_sender(sender->pipe) ? IDLE : ABSENT;
+    sender->state = nrf24_start_sender(stored_settings().radio_pipe) ? IDLE : ABSENT;
     sender->since_us = clock_us();
 }
 
@@ -71,12 +86,13 @@ void follow(RadioSender *sender, uint32_t now_us) {
     if ((causes & NRF24_SENT) != 0) {
         payload_queue_pop(&sender->queue);
         nrf24_stop_sending();
+        sender->acknowledged = true;
         sender->state = IDLE;
     } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
         // The more rounds have failed, the more nodes there may be that want the air.
         const uint8_t steps = static_cast<uint8_t>((sender->random >> 8) % (sender->rounds / 2 + 1U));
         ++sender->rounds;
-        sender->since_us = now_us + steps * ROUND_STEP_US;
+        sender->since_us = now_us + steps * pauses().round_step_us;
         sender->state = PAUSING;
     } else {
         count_lost(sender);
@@ -96,11 +112,11 @@ void resume(RadioSender *sender, uint32_t now_us) {
 
 }  // namespace
 
-void radio_sender_start(RadioSender *sender, uint8_t pipe, uint8_t vehicle_node) {
+void radio_sender_start(RadioSender *sender) {
+    const SettingsBlock &settings = stored_settings();
     memset(sender, 0, sizeof *sender);
-    sender->pipe = pipe;
-    sender->vehicle_node = vehicle_node;
-    sender->random = static_cast<uint16_t>(vehicle_node * 0x0101U);
+    sender->vehicle_node = wire_vehicle_node(settings.vehicle_id, settings.node_id);
+    sender->random = static_cast<uint16_t>(sender->vehicle_node * 0x0101U);
     set_up(sender);
 }
 
@@ -129,4 +145,11 @@ void radio_sender_poll(RadioSender *sender, uint32_t now_us) {
     if (sender->state == IDLE && payload != nullptr) {
         begin(sender, payload, now_us);
     }
+}
+
+LedCode radio_sender_led(const RadioSender *sender) {
+    if (sender->state == ABSENT) {
+        return LED_NO_RADIO;
+    }
+    return sender->acknowledged ? LED_OFF : LED_NO_LINK;
 }

@@ -19,10 +19,11 @@
 #include <stdint.h>
 
 #include "common/payload_queue.h"
+#include "hal/led.h"
 
 struct RadioSender {
     uint8_t state;
-    uint8_t pipe;
+    bool acknowledged;  // the last payload
     uint8_t vehicle_node;
     uint8_t rounds;
     uint16_t random;
@@ -33,7 +34,8 @@ struct RadioSender {
     PayloadQueue queue;
 };
 
-void radio_sender_start(RadioSender *sender, uint8_t pipe, uint8_t vehicle_node);
+// Takes vehicle, node and pipe from the stored settings.
+void radio_sender_start(RadioSender *sender);
 
 // Numbers the payload, fills its header and queues it.
 void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us, void *payload,
@@ -41,3 +43,6 @@ void radio_sender_push(RadioSender *sender, uint8_t kind, uint32_t node_time_us,
 
 // To be called at every event.
 void radio_sender_poll(RadioSender *sender, uint32_t now_us);
+
+// What the radio makes the LED show.
+LedCode radio_sender_led(const RadioSender *sender);

@@ -9,7 +9,9 @@
 #include "hal/clock.h"
 #include "hal/events.h"
 #include "hal/lines.h"
+#include "hal/led.h"
 #include "hal/spi.h"
+#include "hal/stored_settings.h"
 #include "hal/uart.h"
 #include "settings.h"
 
@@ -20,11 +22,15 @@ constexpr uint16_t TX_RING_SIZE = 512;
 
 constexpr uint32_t STATUS_EVERY_US = 1000000;
 constexpr uint32_t SET_UP_EVERY_US = 500000;
+constexpr uint32_t QUIET_US = 2000000;
 constexpr uint32_t NOISE_EVERY_US = 50000;
 // The carrier detector needs 130 us to enter reception and 40 us to measure: section 6.4.
 constexpr uint32_t NOISE_AFTER_US = 200;
 // A carrier that ends in a packet within this time was our own; the longest lasts 1.4 ms.
 constexpr uint32_t NOISE_OWN_US = 2000;
+
+const SettingsImage IMAGE SETTINGS_IN_FLASH =
+    settings_image(default_settings(PROGRAM_RECEIVER, 0, 0));
 
 enum NoiseState : uint8_t { NOISE_IDLE, NOISE_LISTENING, NOISE_HEARD };
 
@@ -38,6 +44,7 @@ struct Receiver {
     uint32_t status_due_us;
     uint32_t set_up_due_us;
     uint32_t noise_due_us;
+    uint32_t heard_us;  // the last packet
     LinkCounter link;
 };
 
@@ -60,6 +67,7 @@ void set_up_radio() {
 }
 
 void pass_on(const Nrf24Packet &packet, uint32_t arrived_us) {
+    receiver.heard_us = arrived_us;
     link_count(&receiver.link, packet.pipe, packet.payload, packet.size);
     if (packet.fifo_full) {
         link_overrun(&receiver.link, packet.pipe);
@@ -125,7 +133,7 @@ void poll_status(uint32_t now_us) {
     WireReceiverStatus status;
     status.header = WireFrameHeader{wire_version_kind(WIRE_RECEIVER_STATUS), receiver.sequence++,
                                     WIRE_NO_PIPE, now_us};
-    status.channel = RADIO_CHANNEL;
+    status.channel = stored_settings().radio_channel;
     status.noise_percent = take_noise_percent();
     status.dropped = receiver.dropped;
     status.reset_cause = board_reset_cause();
@@ -137,6 +145,17 @@ void poll_status(uint32_t now_us) {
     }
 }
 
+LedCode led_code(uint32_t now_us) {
+    if (!receiver.radio_present) {
+        return LED_NO_RADIO;
+    }
+    if (clock_passed(now_us, receiver.heard_us + QUIET_US)) {
+        receiver.heard_us = now_us - QUIET_US;  // or the wrap would make it look recent
+        return LED_NO_LINK;
+    }
+    return LED_OFF;
+}
+
 }  // namespace
 
 int main() {
@@ -144,6 +163,7 @@ int main() {
     lines_start_radio();
     uart_start(UART_BAUD, tx_ring, sizeof tx_ring);
     board_start();
+    stored_settings_load(&IMAGE);
     set_up_radio();
     receiver.status_due_us = clock_us() + STATUS_EVERY_US;
     for (;;) {
@@ -157,5 +177,6 @@ int main() {
             set_up_radio();
         }
         poll_status(now_us);
+        led_blink(led_code(now_us), now_us);
     }
 }
