@@ -17,13 +17,13 @@ import msgspec
 import tomlkit
 
 from gateway.aircraft import AircraftSettings
-from gateway.edges.receiver.serial_port import SerialSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.fleet.fleet_settings import FleetSettings
 from gateway.flightlog.session import RecordingSettings
+from gateway.hub.settings import HubSettings
+from gateway.live.serial_port import SerialSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
-from gateway.routing.hub_settings import HubSettings
 from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings

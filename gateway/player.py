@@ -9,21 +9,21 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings
-from gateway.edges.clock import GatewayClock
 from gateway.edges.disk.player_edge import PlayerEdge
-from gateway.edges.hub.hub import Hub
-from gateway.edges.operator.control_socket import ControlServer, socket_path
-from gateway.edges.operator.control_verbs import PlayerVerbs
 from gateway.flightlog.answers import VehicleAnswers
 from gateway.flightlog.moment import Moment, place_in
 from gateway.flightlog.playback import Player
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.joined import NOTHING_WITHIN
 from gateway.flights.opening import PlayedFlight
+from gateway.hub.endpoint import parse_endpoint, stays_here
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.live.control_socket import ControlServer, socket_path
+from gateway.live.control_verbs import PlayerVerbs
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.routing.endpoint import parse_endpoint, stays_here
-from gateway.routing.hub_settings import HubSettings
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, sequence_of

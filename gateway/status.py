@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from gateway.hub.client_table import ClientStats, HubCounters, ListenerStats
 from gateway.records import GpsFix, LinkReport, NavState, NodeStatus
-from gateway.routing.client_table import ClientStats, HubCounters, ListenerStats
 
 
 @dataclass(frozen=True, slots=True)

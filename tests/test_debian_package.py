@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from gateway.config import aircraft_folder, load
-from gateway.edges.operator.control_socket import GROUP, SERVICE_FOLDER
-from gateway.edges.receiver.serial_port import KNOWN_ADAPTERS
+from gateway.live.control_socket import GROUP, SERVICE_FOLDER
+from gateway.live.serial_port import KNOWN_ADAPTERS
 from tests.conftest import ROOT
 
 pytestmark = [

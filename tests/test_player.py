@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
-from gateway.edges.hub.hub import SENDS_AT_ONCE
 from gateway.flightlog.tlog.tlog import TlogRecord
 from gateway.flights.opening import lay_out, open_flights
 from gateway.flights.reading import ReadOptions
+from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.pipeline import PipelineSettings
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.records import Outgoing

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from gateway.edges.operator.control_socket import request
+from gateway.live.control_socket import request
 from gateway.wire.mavlink_splitter import message_id_of
 from tools.bench_hub import cpu_ns, resident_kib, udp_socket
 
@@ -103,9 +103,9 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))) as link:
 
 HUB = """
 import asyncio, sys
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
-from gateway.routing.hub_settings import HubSettings
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 
 async def main():
     endpoints = ("tcp-listen:127.0.0.1:0", f"udp:127.0.0.1:{sys.argv[1]}")

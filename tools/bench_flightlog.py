@@ -27,16 +27,17 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.edges.clock import GatewayClock, unix_time_us
+from gateway.clock import GatewayClock, unix_time_us
 from gateway.edges.disk.player_edge import PlayerEdge
 from gateway.edges.disk.recorder import Recorder
 from gateway.edges.disk.tlog_file import TlogFile
-from gateway.edges.hub.hub import Hub
 from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
 from gateway.flightlog.session import RecordingSettings
 from gateway.flightlog.table.table import TableHeader
 from gateway.flightlog.tlog.tlog import encode_record
 from gateway.flightlog.track import Track
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 from gateway.records import (
     FusedSample,
     ImuFlags,
@@ -47,7 +48,6 @@ from gateway.records import (
     NodeId,
     Outgoing,
 )
-from gateway.routing.hub_settings import HubSettings
 from gateway.wire.mavlink_splitter import message_id_of
 
 START_US = 1_781_187_930_000_000

@@ -19,10 +19,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.client import READ_BYTES
-from gateway.edges.hub.hub import Hub
-from gateway.routing.hub_settings import HubSettings
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.hub.transports.base import READ_BYTES
 from tools.bench_hub import source_frames, udp_socket
 from tools.turns import TurnWatch
 

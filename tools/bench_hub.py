@@ -74,9 +74,9 @@ while True:
 HUB = """
 import asyncio, sys
 OPTIONS = "%s"
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
-from gateway.routing.hub_settings import HubSettings
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 
 async def main():
     clients = tuple(f"udp:127.0.0.1:{port}{OPTIONS}" for port in sys.argv[2:])
@@ -91,9 +91,9 @@ asyncio.run(main())
 
 WEB_HUB = """
 import asyncio, sys
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
-from gateway.routing.hub_settings import HubSettings
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 
 async def main():
     endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", f"ws-listen:127.0.0.1:{sys.argv[2]}")

@@ -35,9 +35,9 @@ from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.live.run import loop_comes_first
 from gateway.cli.support.made_ahead import made_ahead
 from gateway.cli.support.warm_up import Compilation, make_ready
+from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
-from gateway.daemon import Daemon
-from gateway.edges.clock import unix_time_us
+from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
 from tools.turns import LONG_US, TurnWatch, even_turns
 

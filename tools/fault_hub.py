@@ -56,10 +56,10 @@ NEAR, FAR, FAR_PLACE, FAR_ADDRESS = "near0", "far0", "10.99.0.2", "02:00:00:00:0
 HUB = """
 import asyncio, signal, sys
 import msgspec
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
 from gateway.records import ClientInterval, Outgoing
-from gateway.routing.hub_settings import HubSettings
+from gateway.hub.settings import HubSettings
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -208,9 +208,9 @@ class FaultBench(Bench):
     def joined(self) -> Iterator[None]:
         """Have another gateway joined by two cables."""
         code = (
-            "import asyncio,sys\nfrom gateway.edges.clock import GatewayClock\n"
-            "from gateway.edges.hub.hub import Hub\n"
-            "from gateway.routing.hub_settings import HubSettings\n"
+            "import asyncio,sys\nfrom gateway.clock import GatewayClock\n"
+            "from gateway.hub.hub import Hub\n"
+            "from gateway.hub.settings import HubSettings\n"
             "async def main():\n"
             "    cables = tuple(f'udp:127.0.0.{n}:{sys.argv[1]}' for n in (1, 3))\n"
             "    Hub(HubSettings(endpoints=cables), lambda _: None, GatewayClock()).start()\n"

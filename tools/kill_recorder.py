@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.edges.clock import GatewayClock, unix_time_us
+from gateway.clock import GatewayClock, unix_time_us
 from gateway.edges.disk.recorder import Recorder
 from gateway.flightlog.session import RecordingSettings
 from gateway.flightlog.table.row import TableRow

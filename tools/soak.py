@@ -18,7 +18,7 @@ import numpy as np
 from rich.progress import Progress
 
 from gateway.config import GatewaySettings
-from gateway.daemon import Daemon
+from gateway.live.daemon import Daemon
 from gateway.records import GpsFixType, ImuFlags, LinkReport, NodeId
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame

@@ -11,9 +11,9 @@ import typer
 
 from gateway import __version__
 from gateway.cli.command_table import LazyGroup
-from gateway.edges.operator.log_limit import LogLimit
-from gateway.edges.printable import PrintableFormatter, printable
-from gateway.edges.reasons import reason_of
+from gateway.live.log_limit import LogLimit
+from gateway.printable import PrintableFormatter, printable
+from gateway.reasons import reason_of
 
 log = logging.getLogger(__name__)
 app = typer.Typer(

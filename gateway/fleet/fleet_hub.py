@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from gateway.edges.hub.client import Client
-from gateway.edges.hub.hub import Hub
 from gateway.fleet.loop_watch import LoopWatch
-from gateway.routing.hub_settings import HubSettings
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.hub.transports.base import Client
 
 
 class FleetHub(Hub):

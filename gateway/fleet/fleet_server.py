@@ -10,14 +10,7 @@ from typing import Any, Final
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.clock import GatewayClock
-from gateway.edges.operator.control_socket import (
-    ControlError,
-    ControlServer,
-    NoParams,
-    socket_path,
-)
-from gateway.edges.operator.prometheus import MetricsServer
+from gateway.clock import GatewayClock
 from gateway.fleet.fleet_hub import FleetHub
 from gateway.fleet.fleet_session import FleetSession, SessionEvents
 from gateway.fleet.fleet_settings import FleetSettings
@@ -27,8 +20,15 @@ from gateway.fleet.ids_file import IdsFile
 from gateway.fleet.loop_watch import LoopWatch
 from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.fleet.site_client import SiteClient, site_endpoint
-from gateway.routing.endpoint import SITE_NAME
-from gateway.routing.hub_settings import HubSettings
+from gateway.hub.endpoint import SITE_NAME
+from gateway.hub.settings import HubSettings
+from gateway.live.control_socket import (
+    ControlError,
+    ControlServer,
+    NoParams,
+    socket_path,
+)
+from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
 from gateway.vehicle.signing import key_from_passphrase
 
@@ -147,8 +147,8 @@ class FleetServer:
 
     def _metrics_text(self) -> Iterator[str]:
         # Not above: most fleets serve no metrics, and need not wait for the library.
-        from gateway.edges.operator.hub_metrics import hub_families, text_of
         from gateway.fleet.fleet_metrics import fleet_families
+        from gateway.live.hub_metrics import hub_families, text_of
 
         status, hub = self.status(), self._hub
         clients = tuple(status["clients"])

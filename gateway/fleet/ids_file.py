@@ -6,10 +6,10 @@ from pathlib import Path
 import msgspec
 
 from gateway.edges.disk.worker import begin_worker, done_by
-from gateway.edges.reasons import reason_of
 from gateway.fleet.id_map import LEFT_OUT, IdMap, Vehicle
+from gateway.hub.endpoint import SITE_NAME
 from gateway.output import write_new
-from gateway.routing.endpoint import SITE_NAME
+from gateway.reasons import reason_of
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from gateway.fleet.id_map import Vehicle
-from gateway.routing.routing_table import FrameMemory
+from gateway.hub.routing_table import FrameMemory
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of
 

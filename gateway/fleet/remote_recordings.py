@@ -8,14 +8,14 @@ import msgspec
 
 from gateway.edges.hub.fleet_link.recording_answers import RecordingQuery, RemoteRecording
 from gateway.edges.hub.fleet_link.site_keys import recordings_key
-from gateway.edges.operator.control_socket import ControlError, ControlServer
 from gateway.fleet.fleet_session import (
     FleetSession,
     NoAnswerError,
     QueryRefusedError,
     key_pattern,
 )
-from gateway.routing.endpoint import SITE_NAME
+from gateway.hub.endpoint import SITE_NAME
+from gateway.live.control_socket import ControlError, ControlServer
 
 log = logging.getLogger(__name__)
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import Any, Final
 
-from gateway.edges.hub.client import Client
 from gateway.edges.hub.fleet_link.site_keys import in_key
 from gateway.edges.hub.fleet_link.zenoh_session import PATIENT_IDS, Outlets
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.routing.endpoint import Endpoint
+from gateway.hub.endpoint import Endpoint
+from gateway.hub.transports.base import Client
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import SplitFault, key_of, split_datagram
 

@@ -4,8 +4,8 @@ import asyncio
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.edges.operator.control_finder import find_socket
-from gateway.edges.operator.control_socket import request
+from gateway.live.control_finder import find_socket
+from gateway.live.control_socket import request
 
 READING: Final = frozenset(
     {"status", "verbs", "clients.list", "record.status", "record.list", "play.status"}

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.panel.state.dialogue.calibration_run import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.dialogue.file_client import FileClient
 from gateway.panel.state.dialogue.parameter_client import AUTOPILOT, ListState, ParameterClient

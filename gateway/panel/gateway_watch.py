@@ -4,7 +4,7 @@ import asyncio
 from contextlib import suppress
 from typing import Any, Final
 
-from gateway.edges.operator.control_socket import ControlError
+from gateway.live.control_socket import ControlError
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.instant import Spot

@@ -7,7 +7,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.edges.disk.recordings import RecordingError
-from gateway.edges.operator.control_socket import ControlError
+from gateway.live.control_socket import ControlError
 from gateway.panel.recording_player import PlaybackError
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext

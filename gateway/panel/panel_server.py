@@ -22,8 +22,8 @@ from starlette.requests import Request
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from gateway.edges.clock import GatewayClock
-from gateway.edges.operator.attachment import on_end_signals, on_parent_gone
+from gateway.clock import GatewayClock
+from gateway.live.attachment import on_end_signals, on_parent_gone
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.doors.rest_door import RestDoor

@@ -15,13 +15,13 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
-from gateway.edges.operator.control_socket import ControlError
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.live.control_socket import ControlError
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.records import Incoming, Outgoing
-from gateway.routing.hub_settings import HubSettings
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
 

@@ -34,7 +34,7 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.panel.control_client import READING, ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.gateway_watch import GatewayWatch

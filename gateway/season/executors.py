@@ -14,7 +14,7 @@ from multiprocessing.synchronize import Event
 from typing import Any, Final, Protocol, TypeVar
 
 from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
-from gateway.edges.reasons import reason_of
+from gateway.reasons import reason_of
 
 WAITING: Final = 2
 """Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""

@@ -34,7 +34,7 @@ PROGRAM = """
 """
 
 
-@pytest.mark.parametrize("module", ["typer", "gateway.daemon"])
+@pytest.mark.parametrize("module", ["typer", "gateway.live.daemon"])
 def test_a_background_job_of_a_script_is_ended_while_it_starts(module: str) -> None:
     """Such a job ignores Ctrl-C from the start on; what `kill` sends ends it at once."""
     program = textwrap.dedent(PROGRAM).replace("SIGINT)", "SIGTERM)")

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.edges.operator.control_socket import request
 from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
+from gateway.live.control_socket import request
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.test_demo import NEAR_DEG

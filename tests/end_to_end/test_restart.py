@@ -11,8 +11,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
-from gateway.daemon import Daemon
-from gateway.routing.hub_settings import HubSettings
+from gateway.hub.settings import HubSettings
+from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
 from tests.end_to_end.processes import START_LIMIT_S, Client
 from tests.end_to_end.station import Station

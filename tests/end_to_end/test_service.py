@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.edges.operator.control_socket import ControlError, request, socket_path
+from gateway.live.control_socket import ControlError, request, socket_path
 from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway, until
 from tests.ports import free_port, free_ports
 

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
-from gateway.routing.hub_settings import HubSettings
-from tests.edges.hub.conftest import LIMIT_S, Rig, Sender, Station, rig
+from gateway.hub.settings import HubSettings
+from tests.hub.conftest import LIMIT_S, Rig, Sender, Station, rig
 from tests.ports import free_port
 
 __all__ = ["rig"]

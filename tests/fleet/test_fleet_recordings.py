@@ -23,10 +23,10 @@ from gateway.edges.hub.fleet_link.recording_answers import (
     RecordingAnswers,
     RemoteRecording,
 )
-from gateway.edges.operator.control_socket import ControlError, request
 from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
-from tests.edges.hub.conftest import LIMIT_S
+from gateway.live.control_socket import ControlError, request
 from tests.fleet.conftest import World
+from tests.hub.conftest import LIMIT_S
 
 pytestmark = pytest.mark.io
 

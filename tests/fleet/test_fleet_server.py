@@ -14,15 +14,15 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.operator.control_socket import ControlError, request
 from gateway.fleet import fleet_server, ids_file
 from gateway.fleet.fleet_server import FleetServer
 from gateway.fleet.fleet_settings import FleetSettings
 from gateway.fleet.id_map import LAST_ID
-from gateway.routing.hub_settings import HubSettings
+from gateway.hub.settings import HubSettings
+from gateway.live.control_socket import ControlError, request
 from gateway.vehicle.signing import key_from_passphrase
-from tests.edges.hub.conftest import LIMIT_S
 from tests.fleet.conftest import World, run
+from tests.hub.conftest import LIMIT_S
 
 pytestmark = pytest.mark.io
 

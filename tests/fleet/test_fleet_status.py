@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.edges.operator.control_socket import request
-from tests.edges.hub.conftest import LIMIT_S
+from gateway.live.control_socket import request
 from tests.fleet.conftest import World, run
+from tests.hub.conftest import LIMIT_S
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io

@@ -6,7 +6,7 @@ from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
 from gateway.fleet.loop_watch import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopWatch
 from gateway.wire.mavlink_splitter import origin_of
-from tests.edges.hub.conftest import Sender
+from tests.hub.conftest import Sender
 
 STEP_US = 20_000
 

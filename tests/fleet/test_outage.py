@@ -4,8 +4,8 @@ import msgspec
 import pytest
 
 from gateway.fleet.fleet_settings import FleetSettings
-from tests.edges.hub.test_fleet_link import Router, router
 from tests.fleet.conftest import World
+from tests.hub.test_fleet_link import Router, router
 
 __all__ = ["router"]
 

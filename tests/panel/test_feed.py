@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.panel.serving.feed import GRANTS, TelemetryFeed
 from gateway.panel.state.fleet_picture import FleetPicture
 from tests.panel.messages import position

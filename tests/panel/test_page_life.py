@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, expect
 
-from gateway.edges.operator.control_socket import request
+from gateway.live.control_socket import request
 from gateway.panel.serving.page_lock import hash_password
 from tests.panel.browsing import (
     CONFIG,

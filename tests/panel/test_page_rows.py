@@ -12,8 +12,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.operator.control_socket import request
 from gateway.geometry.quaternion import to_euler
+from gateway.live.control_socket import request
 from tests.panel.browsing import (
     START_LIMIT_MS,
     WAIT_MS,

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from gateway.edges.operator.control_socket import request
 from gateway.estimation.select import ESTIMATORS
+from gateway.live.control_socket import request
 from gateway.panel.estimator_trial import LEAST_S
 from gateway.units import US_PER_S
 from tests.panel.bench_receiver import RATE_HZ, BenchReceiver

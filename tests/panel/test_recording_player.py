@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateway.edges.operator.control_socket import ControlError
+from gateway.live.control_socket import ControlError
 from gateway.panel import recording_player
 from gateway.panel.recording_player import Playback
 from gateway.panel.state.fleet_picture import FleetPicture

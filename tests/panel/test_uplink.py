@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.panel import uplink as panel_uplink
 from gateway.panel.control_client import ControlClient
 from gateway.panel.state.fleet_picture import FleetPicture, Origin

@@ -24,15 +24,15 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
+from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
-from gateway.edges.clock import GatewayClock
-from gateway.edges.receiver.serial_port import (
+from gateway.flights.reading import open_rows
+from gateway.live.serial_port import (
     PortNotFoundError,
     SerialPort,
     SerialSettings,
     open_port,
 )
-from gateway.flights.reading import open_rows
 from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.procedure import (

@@ -36,11 +36,11 @@ from gateway.cli.support.settings_options import (
     read_options,
 )
 from gateway.cli.support.warm_up import make_ready
+from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
-from gateway.daemon import Daemon
-from gateway.edges.clock import unix_time_us
 from gateway.flights.flown import open_flown
 from gateway.flights.log_facts import with_reference
+from gateway.live.daemon import Daemon
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate

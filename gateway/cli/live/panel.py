@@ -14,8 +14,8 @@ from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
-from gateway.edges.printable import PrintableFormatter
-from gateway.routing.endpoint import parse_endpoint
+from gateway.hub.endpoint import parse_endpoint
+from gateway.printable import PrintableFormatter
 
 log = logging.getLogger(__name__)
 

@@ -23,14 +23,14 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.compiled.entry_point import nothing_compiled
 from gateway.config import ConfigError, GatewaySettings
-from gateway.daemon import Daemon
-from gateway.edges.operator.attachment import on_end_signals
-from gateway.edges.operator.detached_output import detached_output
-from gateway.edges.operator.keyboard import Keyboard
-from gateway.edges.operator.log_line import summary_line
+from gateway.live.attachment import on_end_signals
+from gateway.live.daemon import Daemon
+from gateway.live.detached_output import detached_output
+from gateway.live.keyboard import Keyboard
+from gateway.live.log_line import summary_line
 
 if TYPE_CHECKING:
-    from gateway.edges.operator.live_view import LiveView
+    from gateway.live.console import LiveView
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +160,7 @@ def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
 
 def _open_view() -> "LiveView":
     # Imported here: a service draws nothing.
-    from gateway.edges.operator.live_view import LiveView
+    from gateway.live.console import LiveView
 
     view = LiveView()
     logging.getLogger().handlers[:] = [view.log]

@@ -7,7 +7,7 @@ import typer
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of, table_of
-from gateway.edges.receiver.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
 
 
 def register(app: typer.Typer) -> None:
@@ -50,7 +50,7 @@ def check_config(
         load_aircraft,
         render,
     )
-    from gateway.routing.endpoint import LISTENING, parse_endpoint
+    from gateway.hub.endpoint import LISTENING, parse_endpoint
 
     if file is None:
         print(render(GatewaySettings()), end="")

@@ -40,10 +40,6 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.edges.disk.player_edge import PlayerStatus
-from gateway.edges.operator.attachment import on_end_signals, on_parent_gone
-from gateway.edges.operator.control_socket import ControlError
-from gateway.edges.operator.detached_output import detached_output
-from gateway.edges.operator.keyboard import Keyboard
 from gateway.flightlog.playback import (
     AS_FAST_AS_POSSIBLE,
     GREATEST_SPEED,
@@ -53,6 +49,10 @@ from gateway.flightlog.playback import (
 )
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.opening import lay_out, open_flights
+from gateway.live.attachment import on_end_signals, on_parent_gone
+from gateway.live.control_socket import ControlError
+from gateway.live.detached_output import detached_output
+from gateway.live.keyboard import Keyboard
 from gateway.player import (
     PlayerDaemon,
     PlayPlan,

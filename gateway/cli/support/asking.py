@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar, cast
 import typer
 
 from gateway.cli.support.errors import refuse
-from gateway.edges.operator.control_finder import find_socket, live_sockets
-from gateway.edges.operator.control_socket import ControlError, request
+from gateway.live.control_finder import find_socket, live_sockets
+from gateway.live.control_socket import ControlError, request
 
 SocketOption = Annotated[
     Path | None,

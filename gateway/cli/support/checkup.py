@@ -20,11 +20,11 @@ from gateway.cli.support.errors import how_to_add
 from gateway.cli.support.warm_up import ENTRY_POINTS, is_kept
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
 from gateway.edges.disk.part_files import free_bytes_near
-from gateway.edges.hub.web.tls_layer import valid_until_s
-from gateway.edges.operator.control_finder import live_sockets
-from gateway.edges.reasons import reason_of
-from gateway.edges.receiver.serial_port import PortNotFoundError, find_port, list_serial_ports
-from gateway.routing.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.hub.transports.tls import valid_until_s
+from gateway.live.control_finder import live_sockets
+from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.reasons import reason_of
 
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4

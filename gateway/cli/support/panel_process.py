@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.operator.attachment import own_command
+from gateway.live.attachment import own_command
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
-from gateway.edges.reasons import reason_of
 from gateway.flightlog.moment import Moment, parse_moment
 from gateway.flightlog.table.column_map import ColumnMap
 from gateway.flights.flight_terms import FlightError, Position, SettingsChoice
+from gateway.reasons import reason_of
 
 PANEL: Final = "Recordings"
 

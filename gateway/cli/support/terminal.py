@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from gateway.edges.printable import printable, printable_json
+from gateway.printable import printable, printable_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

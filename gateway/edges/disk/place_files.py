@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 from gateway.edges.disk.worker import begin_worker
-from gateway.edges.reasons import reason_of
 from gateway.output import write_new
+from gateway.reasons import reason_of
 from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
 
 log = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from typing import Annotated, Final
 import msgspec
 
 from gateway.edges.disk.worker import begin_worker
-from gateway.edges.reasons import reason_of
 from gateway.output import PRIVATE, write_new
+from gateway.reasons import reason_of
 
 log = logging.getLogger(__name__)
 

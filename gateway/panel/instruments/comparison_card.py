@@ -6,13 +6,13 @@ from typing import Final
 import numpy as np
 from nicegui import ui
 
-from gateway.edges.clock import unix_time_us
-from gateway.edges.reasons import reason_of
+from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
 from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
 from gateway.panel.instruments.strip_chart import StripChart
 from gateway.panel.state.field_history import FloatArray, IntArray
 from gateway.panel.view_context import ViewContext
+from gateway.reasons import reason_of
 
 QUANTITIES: Final = {
     "roll_deg": ("Roll", "deg", "ATTITUDE.roll", math.degrees(1.0)),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gateway.edges.clock import unix_time_us
+from gateway.clock import unix_time_us
 from gateway.panel.instruments.strip_chart import Points, StripChart
 from gateway.panel.state.field_csv import fields_csv
 from gateway.panel.view_context import ViewContext

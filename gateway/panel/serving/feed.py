@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.panel.state.fleet_picture import FleetPicture
 
 PATH: Final = "/telemetry"

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.edges.clock import unix_time_us
+from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
 from gateway.panel.state.gateway_alerts import with_status
 from gateway.panel.state.status_texts import TimedText

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import clients
 from gateway.config import load
-from gateway.edges.operator.control_socket import ControlError, ControlServer, NoParams, socket_path
+from gateway.hub.client_table import HubCounters, ListenerStats
+from gateway.live.control_socket import ControlError, ControlServer, NoParams, socket_path
 from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.routing.client_table import HubCounters, ListenerStats
 from gateway.status import AircraftStatus, Snapshot, Way
 from tests.client_stats import TABLET
 

@@ -15,7 +15,7 @@ from gateway.cli.app import app
 from gateway.cli.support import checkup
 from gateway.cli.support.checkup import Diagnosis, Grade
 from gateway.config import GatewaySettings
-from gateway.edges.operator import control_finder
+from gateway.live import control_finder
 
 pytestmark = pytest.mark.io
 

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.edges.operator.control_socket import ControlServer, socket_path
-from gateway.edges.operator.control_verbs import RecorderVerbs
+from gateway.live.control_socket import ControlServer, socket_path
+from gateway.live.control_verbs import RecorderVerbs
 from tests.conftest import ManualClock
 from tests.edges.disk.test_recorder import Bench
 from tests.flightlog.frames import make_frames

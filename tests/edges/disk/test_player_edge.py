@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.edges.disk.player_edge import BATCH, PlayerEdge
 from gateway.edges.disk.tlog_file import TlogFile
 from gateway.flightlog.playback import Player

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from gateway.edges.clock import GatewayClock
+from gateway.clock import GatewayClock
 from gateway.flightlog.tlog.stamps import JUMP_US, STEP_US, CivilClock, Stamper
 from gateway.wire.gps_time import ENOUGH
 

@@ -17,8 +17,9 @@ import websockets
 from fastapi import FastAPI
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.edges.clock import GatewayClock
-from gateway.edges.hub.hub import Hub
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 from gateway.panel.control_client import ControlClient
 from gateway.panel.doors.message_json import template
 from gateway.panel.doors.message_stream import MAX_WAITING, MessageStream
@@ -29,7 +30,6 @@ from gateway.panel.serving.page_lock import PageLock, hash_password
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.uplink import Uplink
 from gateway.records import Incoming, Outgoing
-from gateway.routing.hub_settings import HubSettings
 
 pytestmark = pytest.mark.io
 

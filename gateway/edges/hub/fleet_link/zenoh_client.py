@@ -8,7 +8,6 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from gateway.edges.hub.client import READ_BYTES, Client
 from gateway.edges.hub.fleet_link.query_answers import QueryAnswers
 from gateway.edges.hub.fleet_link.recording_answers import RecordingAnswers
 from gateway.edges.hub.fleet_link.site_keys import (
@@ -32,9 +31,10 @@ from gateway.edges.hub.fleet_link.zenoh_session import (
     session_config,
 )
 from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
-from gateway.edges.hub.listener import RETRY_US
-from gateway.routing.endpoint import RAW_KEYS, Endpoint
-from gateway.routing.outbox import Packer
+from gateway.hub.endpoint import RAW_KEYS, Endpoint
+from gateway.hub.send_queue import Packer
+from gateway.hub.transports.base import READ_BYTES, Client
+from gateway.hub.transports.listener import RETRY_US
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
 

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
-from gateway.edges.reasons import reason_of
-from gateway.routing.outbox import BULK_IDS
+from gateway.hub.send_queue import BULK_IDS
+from gateway.reasons import reason_of
 
 if TYPE_CHECKING:
     import zenoh

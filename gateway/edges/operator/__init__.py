@@ -1,1 +1,0 @@
-"""Status and control of the gateway for its operator."""

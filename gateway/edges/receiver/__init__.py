@@ -1,1 +1,0 @@
-"""The receiver's serial port, real and simulated."""

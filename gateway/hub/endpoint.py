@@ -1,0 +1,331 @@
+"""Endpoint URLs: where frames go to and come from, and what may pass.
+
+    udp:HOST:PORT            send there; answers come back to the same socket
+    udp-listen:HOST:PORT     serve every client that speaks to this port
+    udp-broadcast:HOST:PORT  send to a broadcast address, receive unicast answers
+    udp-multicast:GROUP:PORT send to a group and receive from it
+    tcp:HOST:PORT            connect, and reconnect when it breaks
+    tcp-listen:HOST:PORT     serve every client that connects
+    ws:HOST:PORT             connect by WebSocket, and reconnect when it breaks
+    ws-listen:HOST:PORT      serve every program and page that connects by WebSocket
+    wss:, wss-listen:        the same over TLS
+    zenoh:tcp/HOST:7447      a fleet, through a Zenoh router; needs ?site=NAME
+    serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
+
+IPv6 addresses are written in brackets. Options follow as in any URL:
+`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of other programs are understood too:
+`spelling.py`.
+"""
+
+import re
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+from urllib.parse import parse_qsl
+
+from gateway.hub.hosts import NULL_ORIGIN, is_group, is_loopback, is_name, is_numeric
+from gateway.hub.option_values import (
+    intervals_from,
+    messages_from,
+    name_from,
+    number_from,
+    yes_or_no,
+)
+from gateway.hub.spelling import respell
+
+BITS_PER_BYTE: Final = 10
+"""On a serial line: start bit, eight data bits, stop bit."""
+MAX_BUDGET: Final = 1_000_000_000
+MS_PER_S: Final = 1000
+MAX_WAIT_MS: Final = 1000
+MAX_PACK_BYTES: Final = 1100
+"""Routers on the way cut or drop datagrams beyond 1120 bytes."""
+MAX_PORT: Final = 65535
+DEFAULT_BAUD: Final = 57600
+MIN_BAUD: Final = 300
+MAX_BAUD: Final = 12_000_000
+"""The fastest USB adapters."""
+
+SITE_KEYS: Final = "site"
+LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
+"""How Zenoh names a place."""
+RAW_KEYS: Final = "mavlink_raw"
+SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
+"""A segment of a Zenoh key or of a path without special characters."""
+
+
+class EndpointKind(StrEnum):
+    """How an endpoint reaches its peers; the word before the URL's first colon."""
+
+    UDP = "udp"
+    UDP_LISTEN = "udp-listen"
+    UDP_BROADCAST = "udp-broadcast"
+    UDP_MULTICAST = "udp-multicast"
+    TCP = "tcp"
+    TCP_LISTEN = "tcp-listen"
+    WS = "ws"
+    WS_LISTEN = "ws-listen"
+    WSS = "wss"
+    WSS_LISTEN = "wss-listen"
+    ZENOH = "zenoh"
+    SERIAL = "serial"
+
+
+OPEN_TO_ALL: Final = frozenset(
+    {
+        EndpointKind.UDP_LISTEN,
+        EndpointKind.UDP_BROADCAST,
+        EndpointKind.UDP_MULTICAST,
+        EndpointKind.TCP_LISTEN,
+        EndpointKind.WS_LISTEN,
+        EndpointKind.WSS_LISTEN,
+    }
+)
+"""Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
+LISTENING: Final = frozenset(
+    {
+        EndpointKind.UDP_LISTEN,
+        EndpointKind.TCP_LISTEN,
+        EndpointKind.WS_LISTEN,
+        EndpointKind.WSS_LISTEN,
+    }
+)
+"""Kinds that bind to their port; to port 0 they bind to any that is free."""
+TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
+"""Kinds that use TLS."""
+COMMON_OPTIONS: Final = frozenset(
+    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted"}
+)
+OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
+    EndpointKind.WS: frozenset({"path"}),
+    EndpointKind.WSS: frozenset({"path"}),
+    EndpointKind.WS_LISTEN: frozenset({"origins"}),
+    EndpointKind.WSS_LISTEN: frozenset({"origins"}),
+    EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
+}
+"""Options that only some kinds have."""
+
+
+HOSTED: Final = frozenset(
+    {EndpointKind.UDP, EndpointKind.UDP_LISTEN, EndpointKind.TCP, EndpointKind.TCP_LISTEN}
+    | {EndpointKind.WS, EndpointKind.WS_LISTEN, EndpointKind.WSS, EndpointKind.WSS_LISTEN}
+)
+"""Kinds whose frames go to hosts by their addresses, one by one."""
+ADDED_KINDS: Final[set[str]] = set()
+"""Kinds of other packages, which parse the rest of the URL themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One parsed endpoint URL."""
+
+    url: str
+    kind: str
+    """An `EndpointKind`, or one of `ADDED_KINDS`."""
+    host: str
+    """Address or name without brackets; device of a serial port; otherwise the whole place."""
+    port: int
+    """Port number; the baud rate of a serial port; 0 of an added kind."""
+    place: str
+    """The URL in our own spelling and without options; no two endpoints share one."""
+    name: str
+    """The name given by the operator; the place by default."""
+    allow: frozenset[int] = frozenset()
+    """Only these messages pass; empty lets all pass."""
+    deny: frozenset[int] = frozenset()
+    interval_us: dict[int, int] = field(default_factory=dict)
+    """Least time between two frames of a message, by message id."""
+    pack_bytes: int = 0
+    """Gather frames into datagrams or messages of up to this size; 0 sends each on its own."""
+    pack_wait_s: float = 0.0
+    """How long the first frame waits for others; 0 sends what has come at once."""
+    budget: int = 0
+    """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
+    trusted: bool | None = None
+    """Whether its clients may change state; None: loopback and configured peers may."""
+    origins: frozenset[str] = frozenset()
+    """Pages of other machines that may connect by WebSocket, as browsers name them."""
+    path: str = "/"
+    """The path requested from a WebSocket server."""
+    site: str = ""
+    """The site's name in a fleet."""
+    keys: str = SITE_KEYS
+    """Where a fleet finds the frames: `site`, or `mavlink_raw` as mavlink-server has it."""
+    config: str = ""
+    """Zenoh's own configuration file; empty for none."""
+
+    @property
+    def address(self) -> str:
+        """Its address: `HOST:PORT`, or the device of a serial port."""
+        whole = self.kind in (EndpointKind.SERIAL, EndpointKind.ZENOH) or self.kind in ADDED_KINDS
+        return self.host if whole else host_and_port(self.host, self.port)
+
+    def name_of(self, peer: str) -> str:
+        """Return the name of a client of this port, which begins with the port's name."""
+        return peer if self.name == self.place else f"{self.name} {peer}"
+
+    def passes(self, message_id: int) -> bool:
+        """Return whether the `allow` and `deny` lists let a message out to this endpoint."""
+        return message_id not in self.deny and (not self.allow or message_id in self.allow)
+
+
+def parse_endpoint(url: str) -> Endpoint:
+    """Read one endpoint URL.
+
+    Parameters
+    ----------
+    url : str
+        As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
+        separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
+        `wait` (milliseconds), `budget` (bytes a second), `trusted` (yes or no), and of some kinds
+        `origins` (separated by commas) or `path`.
+
+    Returns
+    -------
+    Endpoint
+        The parsed form.
+
+    Raises
+    ------
+    ValueError
+        If anything in it is not understood; the text says what is allowed.
+    """
+    address, _, query = url.partition("?")
+    try:
+        kind, place = _kind_and_place(address)
+        host, port = _split_place(kind, place)
+        options = _options(kind, query)
+        return Endpoint(
+            url=url,
+            kind=kind,
+            host=host,
+            port=port,
+            place=_own_place(kind, place, options),
+            name=name_from(options.get("name", f"{kind}:{place}")),
+            allow=messages_from(options.get("allow", "")),
+            deny=messages_from(options.get("deny", "")),
+            interval_us=intervals_from(options.get("rate", "")),
+            pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
+            pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,
+            budget=_budget(kind, port, options.get("budget")),
+            trusted=yes_or_no(options.get("trusted")),
+            origins=_origins(options.get("origins", "")),
+            path=_path(options.get("path", "/")),
+            config=options.get("config", ""),
+            **_fleet_keys(kind, options),
+        )
+    except ValueError as error:
+        raise ValueError(f"endpoint {url!r}: {error}") from None
+
+
+def host_and_port(host: object, port: object) -> str:
+    """Write host and port as in a URL, an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
+
+
+def _kind_and_place(address: str) -> tuple[str, str]:
+    if not address.isprintable():
+        raise ValueError("it cannot be shown")
+    word, _, place = address.partition(":")
+    if word in ADDED_KINDS:
+        return word, place
+    word, place = respell(address)
+    if word not in set(EndpointKind):
+        raise ValueError(f"{word!r} is none of {', '.join([*EndpointKind, *sorted(ADDED_KINDS)])}")
+    return EndpointKind(word), place
+
+
+def _split_place(kind: str, place: str) -> tuple[str, int]:
+    if kind in ADDED_KINDS:
+        return place, 0
+    if kind is EndpointKind.SERIAL:
+        device, colon, baud = place.rpartition(":")
+        if not colon:
+            device, baud = place, str(DEFAULT_BAUD)
+        if not device:
+            raise ValueError(f"write {kind}:DEVICE:BAUD, as in {kind}:/dev/ttyUSB0:57600")
+        return device, number_from(baud, "baud rate", MIN_BAUD, MAX_BAUD)
+    if kind is EndpointKind.ZENOH:
+        if not LOCATOR.fullmatch(place):
+            raise ValueError(f"{place!r} is no place of a router; write {kind}:tcp/HOST:7447")
+        return place, 0
+    host, _, port = place.rpartition(":")
+    bracketed = host.startswith("[") and host.endswith("]")
+    if not host or (":" in host and not bracketed):
+        raise ValueError(f"write {kind}:HOST:PORT, an IPv6 host in [brackets]")
+    number = number_from(port, "port", 0, MAX_PORT)
+    host = host[1:-1] if bracketed else host
+    if number == 0 and kind not in LISTENING:
+        raise ValueError(f"port 0 is nowhere; name one of 1 to {MAX_PORT}")
+    _check_host(kind, host)
+    return host, number
+
+
+def _check_host(kind: str, host: str) -> None:
+    if kind in OPEN_TO_ALL and not is_numeric(host):
+        raise ValueError(f"{host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
+    if kind is EndpointKind.UDP_MULTICAST and not is_group(host):
+        raise ValueError(f"{host!r} is no multicast group, such as 239.255.145.50")
+    if not is_numeric(host) and not is_name(host):
+        raise ValueError(f"{host!r} is neither an address nor a name")
+
+
+def stays_here(endpoint: Endpoint) -> bool:
+    """Return whether nothing that goes to an endpoint can leave this machine."""
+    return endpoint.kind in HOSTED and is_loopback(endpoint.host)
+
+
+def _options(kind: str, query: str) -> dict[str, str]:
+    """Read the options; each may be given once, or their order would decide which one counts."""
+    known = COMMON_OPTIONS | OWN_OPTIONS.get(kind, frozenset())
+    options: dict[str, str] = {}
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in known:
+            raise ValueError(f"option {key!r} is none of {', '.join(sorted(known))}")
+        if key in options:
+            raise ValueError(f"option {key!r} is given twice")
+        if ";" in value:
+            raise ValueError(f"{key}={value!r}: options are joined by &")
+        options[key] = value
+    return options
+
+
+def _budget(kind: str, baud: int, text: str | None) -> int:
+    """Read the width of a link; a serial line carries no more than its baud rate."""
+    if text is not None:
+        return number_from(text, "budget", 0, MAX_BUDGET)
+    return baud // BITS_PER_BYTE if kind == EndpointKind.SERIAL else 0
+
+
+def _origins(text: str) -> frozenset[str]:
+    origins = frozenset(filter(None, text.lower().split(",")))
+    for origin in origins:
+        scheme, _, place = origin.partition("://")
+        if origin != NULL_ORIGIN and (not scheme or not place or "/" in place):
+            raise ValueError(
+                f"origin {origin!r} is not {NULL_ORIGIN} or like https://example.org:8080"
+            )
+    return origins
+
+
+def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
+    if kind != EndpointKind.ZENOH:
+        return {}
+    site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
+    if keys not in (SITE_KEYS, RAW_KEYS):
+        raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}")
+    if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
+        raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
+    return {"site": site, "keys": keys}
+
+
+def _own_place(kind: str, place: str, options: dict[str, str]) -> str:
+    """Return what no two endpoints may share: one router takes several sites of a gateway."""
+    site = options.get("site", "") if kind == EndpointKind.ZENOH else ""
+    return f"{kind}:{place}?site={site}" if site else f"{kind}:{place}"
+
+
+def _path(text: str) -> str:
+    if not text.startswith("/") or not text.isascii() or not text.isprintable() or " " in text:
+        raise ValueError(f"path {text!r} does not begin with / or has spaces")
+    return text

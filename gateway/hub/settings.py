@@ -1,0 +1,104 @@
+"""Settings of the hub."""
+
+from typing import Annotated
+
+from gateway.hub.endpoint import EndpointKind, parse_endpoint
+from gateway.settings import Settings, setting
+
+
+class HubSettings(Settings, frozen=True):
+    """Where MAVLink goes to and comes from."""
+
+    endpoints: Annotated[
+        tuple[str, ...],
+        setting(
+            "Endpoint URLs: udp:HOST:PORT, udp-listen:HOST:PORT, udp-broadcast:HOST:PORT, "
+            "udp-multicast:GROUP:PORT, tcp:HOST:PORT, tcp-listen:HOST:PORT, ws:HOST:PORT, "
+            "ws-listen:HOST:PORT (56781 is usual), wss:HOST:PORT, wss-listen:HOST:PORT, "
+            "zenoh:tcp/HOST:7447?site=NAME, "
+            "serial:DEVICE:BAUD; "
+            "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
+        ),
+    ] = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
+    max_clients: Annotated[
+        int,
+        setting("Most clients that a listening endpoint serves at once.", ge=1, le=2000),
+    ] = 32
+    idle_timeout_s: Annotated[
+        float,
+        setting(
+            "A client of a listening UDP port is dropped after this silence. Ground stations "
+            "send a heartbeat every second. A WebSocket client is dropped after so long "
+            "without an answer to the pings that it has answered before.",
+            "s",
+            ge=2,
+            le=3600,
+        ),
+    ] = 30.0
+    queue_bytes: Annotated[
+        int,
+        setting(
+            "Queue of a slow or stalled client by TCP or WebSocket; when it is full the oldest "
+            "telemetry is dropped. Small: fresh data after a stall. Large: fewer gaps.",
+            "byte",
+            ge=1024,
+            le=16_777_216,
+        ),
+    ] = 65_536
+    ping_interval_s: Annotated[
+        float,
+        setting("How often each client's round trip is measured; 0 never.", "s", ge=0, le=3600),
+    ] = 5.0
+    metrics_port: Annotated[
+        int,
+        setting("Loopback port that serves Prometheus text; 0 serves none.", ge=0, le=65535),
+    ] = 0
+    tls_certificate: Annotated[
+        str,
+        setting(
+            "PEM file with the certificate of this machine, and its chain, that "
+            "wss-listen: presents. A replaced one is used for new connections.",
+            path=True,
+        ),
+    ] = ""
+    tls_key: Annotated[
+        str,
+        setting(
+            "PEM file with the key of the certificate; empty if it is in the same file.", path=True
+        ),
+    ] = ""
+    tls_authority: Annotated[
+        str,
+        setting(
+            "PEM file with the certificates of the authorities that wss: accepts, such as your "
+            "own; empty for those of the system.",
+            path=True,
+        ),
+    ] = ""
+    realtime_priority: Annotated[
+        int,
+        setting(
+            "SCHED_RR priority of the process, which keeps latency low on a busy machine; needs "
+            "the right CAP_SYS_NICE. 0 leaves the scheduler alone.",
+            ge=0,
+            le=99,
+        ),
+    ] = 0
+
+    def __post_init__(self) -> None:
+        """Refuse wrong endpoints when the settings are read, not when they are used."""
+        places: set[str] = set()
+        errors = []
+        for url in self.endpoints:
+            try:
+                endpoint = parse_endpoint(url)
+            except ValueError as error:
+                errors.append(str(error))
+                continue
+            if endpoint.place in places:
+                errors.append(f"endpoint {endpoint.place!r} is given twice")
+            if endpoint.kind is EndpointKind.WSS_LISTEN and not self.tls_certificate:
+                errors.append(f"endpoint {endpoint.place!r} needs a tls_certificate")
+            places.add(endpoint.place)
+        if errors:
+            raise ValueError("\n".join(errors))

@@ -1,0 +1,69 @@
+"""Which transport serves which kind of endpoint."""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from gateway.edges.hub.fleet_link.zenoh_client import ZenohClient
+from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind
+from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.listener import Listener
+from gateway.hub.transports.serial_line import RadioClient
+from gateway.hub.transports.tcp import TcpClient, TcpListener
+from gateway.hub.transports.udp import UdpClient
+from gateway.hub.transports.udp_group import GroupClient
+from gateway.hub.transports.udp_listen import UdpListener
+
+ClientMaker = Callable[[HubContext, int, Endpoint], Client]
+
+
+def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
+    # Imported here: most gateways have no WebSocket, and its library is slow to import.
+    from gateway.hub.transports.websocket import WsClient
+
+    return WsClient(context, client_id, endpoint)
+
+
+def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
+    from gateway.hub.transports.websocket import WsListener
+
+    return WsListener(context, endpoint)
+
+
+CLIENTS: Final[dict[str, ClientMaker]] = {
+    EndpointKind.UDP: UdpClient,
+    EndpointKind.UDP_BROADCAST: GroupClient,
+    EndpointKind.UDP_MULTICAST: GroupClient,
+    EndpointKind.TCP: TcpClient,
+    EndpointKind.WS: _ws_client,
+    EndpointKind.WSS: _ws_client,
+    EndpointKind.ZENOH: ZenohClient,
+    EndpointKind.SERIAL: RadioClient,
+}
+LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
+    EndpointKind.UDP_LISTEN: UdpListener,
+    EndpointKind.TCP_LISTEN: TcpListener,
+    EndpointKind.WS_LISTEN: _ws_listener,
+    EndpointKind.WSS_LISTEN: _ws_listener,
+}
+
+
+def add_endpoint_kind(word: str, make: ClientMaker) -> None:
+    """Add a kind of endpoint URL.
+
+    Parameters
+    ----------
+    word : str
+        The part before the URL's first colon; what follows, up to the options, is `Endpoint.host`.
+    make : callable
+        Creates the client of one endpoint from the hub, the client's id and the endpoint; a
+        subclass of `Client` has this signature.
+
+    Raises
+    ------
+    ValueError
+        If the word is taken.
+    """
+    if word in CLIENTS or word in LISTENERS:
+        raise ValueError(f"there is an endpoint kind {word!r} already")
+    ADDED_KINDS.add(word)
+    CLIENTS[word] = make

@@ -1,0 +1,150 @@
+"""MAVLink on a serial port: a telemetry radio to the ground, or an autopilot.
+
+The line is slow, so frames wait in our queue and not in the driver's, where the attitude could not
+overtake a parameter list. pyserial opens and configures; reading and writing go to the descriptor,
+since pyserial spins on a full buffer.
+"""
+
+import asyncio
+import logging
+import os
+from typing import Final
+
+import serial
+
+from gateway.hub.bandwidth import RADIO_STATUS
+from gateway.hub.endpoint import BITS_PER_BYTE
+from gateway.hub.send_queue import Pacer
+from gateway.hub.transports.listener import RETRY_US
+from gateway.hub.transports.queued import QueuedClient
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import free_percent, message_id_of
+
+log = logging.getLogger(__name__)
+
+READ_BYTES: Final = 4096
+AHEAD_US: Final = 30_000
+"""Most in the driver's buffer: enough to keep the line busy between two wake-ups."""
+QUEUE_US: Final = US_PER_S
+"""What may wait, as time on the line; older telemetry is of no use on a radio."""
+MIN_QUEUE_BYTES: Final = 2048
+
+
+class RadioClient(QueuedClient):
+    """A peer on a serial port that may come and go."""
+
+    _port: serial.Serial | None = None
+    _retry_us = 0
+    _timer: asyncio.TimerHandle | None = None
+
+    def __post_init__(self) -> None:
+        """Start without a port."""
+        super().__post_init__()
+        self._pacer = Pacer(self.endpoint.port, AHEAD_US)
+
+    @property
+    def queue_bytes(self) -> int:
+        """The most that waits for the line."""
+        bytes_per_s = self.endpoint.port / BITS_PER_BYTE
+        return max(MIN_QUEUE_BYTES, round(bytes_per_s * QUEUE_US / US_PER_S))
+
+    def transmit(self, frame: bytes, message_id: int) -> None:
+        """Queue one frame and write what the line has room for."""
+        if self._port is None:
+            self.counters.dropped += 1
+            return
+        self.counters.sent += 1
+        self._push(frame, message_id, self._numbering.enter(frame))
+        if self._timer is None and not self._partial:
+            self._pump()
+
+    def tick(self, now_us: int) -> None:
+        """Open the port again if it is gone."""
+        if self._port is not None or now_us < self._retry_us:
+            return
+        self._retry_us = now_us + RETRY_US
+        try:
+            port = serial.Serial(
+                self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            self.become("unreachable", error)
+            return
+        self._port = port
+        self._splitter.reset()
+        self.become("open")
+        self.loop.add_reader(port.fileno(), self._on_readable, port)
+        self.context.greet(self)
+
+    def close(self) -> None:
+        """Close the port; waiting frames are lost."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._port is not None:
+            self.loop.remove_reader(self._port.fileno())
+            self.loop.remove_writer(self._port.fileno())
+            self._port.close()
+            self._port = None
+        self._drop_all()
+
+    def _broke(self, error: OSError) -> None:
+        log.warning("%s is gone: %s", self.endpoint.host, error)
+        self.close()
+        self.become("unreachable", error)
+
+    def _pump(self) -> None:
+        """Write until the line is busy for a while or nothing waits."""
+        self._timer = None
+        port = self._port
+        while port is not None and self._port is port and (self._partial or self._outbox):
+            delay_us = self._pacer.delay_us(self.context.now_us())
+            if delay_us:
+                self._timer = self.loop.call_later(delay_us / US_PER_S, self._pump)
+                return
+            if not self._write(port):
+                return
+
+    def _write(self, port: serial.Serial) -> bool:
+        """Write one frame; if the driver is full, wait for it."""
+        now_us = self.context.now_us()
+        if not self._partial:
+            self._drop(self._outbox.expire(now_us - QUEUE_US))
+            waiting = self._outbox.pop()
+            if waiting is None:
+                return False
+            self._partial = self._numbering.leave(*waiting)
+        try:
+            taken = os.write(port.fileno(), self._partial)
+        except BlockingIOError:
+            taken = 0
+        except OSError as error:
+            self._broke(error)
+            return False
+        self.counters.bytes_sent += taken
+        self._pacer.wrote(taken, now_us)
+        self._partial = self._partial[taken:]
+        if self._partial:
+            self.loop.add_writer(port.fileno(), self._on_writable, port)
+        return not self._partial
+
+    def _on_writable(self, port: serial.Serial) -> None:
+        self.loop.remove_writer(port.fileno())
+        self._pump()
+
+    def _on_readable(self, port: serial.Serial) -> None:
+        try:
+            data = os.read(port.fileno(), READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._broke(error)
+            return
+        if data:
+            events = self._splitter.feed(data)
+            for frame in events:
+                if isinstance(frame, bytes) and message_id_of(frame) == RADIO_STATUS:
+                    self.context.note_buffer(self, free_percent(frame))
+            self.receive(events, len(data), self.context.now_us())
+        else:
+            self._broke(OSError("the device hung up"))

@@ -1,0 +1,122 @@
+"""UDP broadcast and multicast: one datagram for all receivers.
+
+Two sockets. One sends and receives the unicast answers; the other has joined a multicast group and
+receives what others send there. Our own datagrams come back on the second and are recognised by
+the address of the first.
+"""
+
+import socket
+import struct
+from typing import Any, Final
+
+from gateway.hub.endpoint import EndpointKind
+from gateway.hub.transports.listener import RETRY_US
+from gateway.hub.transports.udp import MAX_DATAGRAM, READ_BUDGET, DatagramClient
+
+MULTICAST_HOPS: Final = 1
+"""The local network only."""
+
+
+class GroupClient(DatagramClient):
+    """A broadcast address or a multicast group as one client."""
+
+    _ear: socket.socket | None = None
+    _own_address = ("", 0)
+    _retry_us = 0
+
+    def tick(self, now_us: int) -> None:
+        """Open the sockets again if they failed."""
+        if now_us < self._retry_us:
+            return
+        self._retry_us = now_us + RETRY_US
+        if self.state == "unreachable":
+            self.close()
+        if self._socket is None:
+            self._open()
+
+    def close(self) -> None:
+        """Close both sockets."""
+        super().close()
+        if self._ear is not None:
+            self.loop.remove_reader(self._ear)
+            self._ear.close()
+            self._ear = None
+
+    def _open(self) -> None:
+        host, port = self.endpoint.host, self.endpoint.port
+        multicast = self.endpoint.kind is EndpointKind.UDP_MULTICAST
+        sock: socket.socket | None = None
+        try:
+            found = socket.getaddrinfo(
+                host, port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST
+            )
+            family, _, _, _, address = found[0]
+            sock = socket.socket(family, socket.SOCK_DGRAM)
+            sock.setblocking(False)
+            if multicast:
+                self._ear = _ear(family, address)
+                self.loop.add_reader(self._ear, self._on_group, self._ear)
+                _prepare_sender(sock, address)
+            else:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            host, _, *scope = _route_source(family, address)
+            sock.bind((host, 0, *scope))
+        except OSError as error:
+            if sock is not None:
+                sock.close()
+            self.close()
+            self.become("unreachable", error)
+            return
+        self._own_address = sock.getsockname()[:2]
+        opened = sock
+        self.adopt(opened, lambda data: opened.sendto(data, address))
+
+    def _on_group(self, sock: socket.socket) -> None:
+        size, most = 0, self.context.read_bytes
+        for _ in range(READ_BUDGET):
+            try:
+                data, address = sock.recvfrom(MAX_DATAGRAM)
+            except OSError:
+                break
+            if address[:2] != self._own_address:
+                size += len(data)
+                self.accept(data, self.context.now_us())
+            if size >= most:
+                break
+        self.pause_stranger(sock, self._on_group, size)
+
+
+def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:
+    """Return our socket address from which the group is reached."""
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        probe.connect(address)
+        return tuple(probe.getsockname())
+
+
+def _prepare_sender(sock: socket.socket, address: tuple[object, ...]) -> None:
+    if sock.family == socket.AF_INET6:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, MULTICAST_HOPS)
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, int(str(address[3])))
+    else:
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, MULTICAST_HOPS)
+
+
+def _ear(family: int, address: tuple[object, ...]) -> socket.socket:
+    """Open a socket that has joined the group."""
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(address)
+        group = socket.inet_pton(family, str(address[0]).partition("%")[0])
+        if family == socket.AF_INET6:
+            member = group + struct.pack("=I", address[3])
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, member)
+        else:
+            source = socket.inet_aton(_route_source(family, address)[0])
+            sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + source)
+    except OSError:
+        sock.close()
+        raise
+    return sock

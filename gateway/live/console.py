@@ -1,0 +1,325 @@
+"""The live view in the terminal: link, aircraft and clients at a glance.
+
+Tables that are wider than the terminal are split into several below each other, so that all is
+legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates are beside the aircraft. If
+there are too few rows, the end is cut off; so the most important comes first, and the message
+rates last.
+"""
+
+import logging
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+from rich.cells import cell_len
+from rich.columns import Columns
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from gateway.geometry.quaternion import to_euler
+from gateway.hub.client_table import ClientStats, ListenerStats
+from gateway.live.log_line import UNKNOWN, figure_of
+from gateway.printable import PrintableFormatter
+from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from gateway.units import US_PER_S, counted
+
+SILENT_US: Final = 2 * US_PER_S
+LOG_LINES: Final = 5
+RATE_SNAPSHOTS: Final = 11
+"""Rates are averaged over this many views: a message of 1 Hz must not flicker between 0 and 2."""
+RATE_NAME: Final = 22
+"""Letters of the longest usual name, so that names and figures are aligned."""
+
+SIDE_BY_SIDE: Final = 150
+"""Columns of a terminal from which on two halves are wide enough."""
+GAP: Final = 2
+KEYS: Final = "q quit   r record or stop   space hold the picture"
+FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")
+MB: Final = 1e6
+GB: Final = 1e9
+MV_PER_V: Final = 1e3
+
+FLAG_WORDS: Final = (
+    (NavFlags.ATTITUDE_VALID, "attitude", "green"),
+    (NavFlags.HEADING_VALID, "heading", "green"),
+    (NavFlags.POSITION_VALID, "position", "green"),
+    (NavFlags.AT_REST, "at rest", "cyan"),
+    (NavFlags.DEAD_RECKONING, "dead reckoning", "yellow"),
+    (NavFlags.GPS_REJECTED, "GPS rejected", "yellow"),
+    (NavFlags.MAG_DISTURBED, "magnetic disturbance", "yellow"),
+    (NavFlags.MAG_MISPLACED, "compass axes wrong", "red"),
+    (NavFlags.SENSOR_FAULT, "sensor fault", "red"),
+    (NavFlags.DEGRADED, "degraded", "red"),
+)
+
+
+class RecentLog(logging.Handler):
+    """Keep the newest log lines, to show them in the view."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(PrintableFormatter("%(asctime)s %(message)s", "%H:%M:%S"))
+        self.lines: deque[tuple[str, str]] = deque(maxlen=LOG_LINES)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one line and its style."""
+        style = "yellow" if record.levelno >= logging.WARNING else ""
+        self.lines.append((self.format(record), style))
+
+
+class LiveView:
+    """Draw snapshots; keeps the last ones to compute rates."""
+
+    def __init__(self) -> None:
+        self.log = RecentLog()
+        self.link = ""
+        """Address of the panel; empty without one."""
+        self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
+
+    def draw(self, snapshot: Snapshot) -> RenderableType:
+        """Build the view of one snapshot.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            The daemon's state now.
+
+        Returns
+        -------
+        RenderableType
+            To be shown by a rich `Live` or `Console`.
+        """
+        self._snapshots.append(snapshot)
+        top: list[RenderableType] = [_link_line(snapshot), *_recorder_line(snapshot.recorder)]
+        if self.link:
+            top.append(Text.assemble("panel  ", (self.link, "bold cyan")))
+        flying: list[RenderableType] = []
+        boards = {s.node: s for one in snapshot.aircraft for s in one.boards}
+        if snapshot.report.nodes:
+            flying.append(_nodes(snapshot.report, boards))
+        beside = {one.vehicle_id: one for one in snapshot.aircraft}
+        for vehicle_id, state in snapshot.states:
+            flying += [Text(), _aircraft(vehicle_id, state, beside.get(vehicle_id)), _flags(state)]
+        if not snapshot.states:
+            flying.append(Text("No aircraft heard yet.", style="dim"))
+        others: list[RenderableType] = [_clients(snapshot)]
+        others += [*_ports(snapshot), *_troubles(snapshot), Text()]
+        others += [Text(line, style=style) for line, style in self.log.lines]
+        if snapshot.sent:
+            rates = _rates(snapshot, self._snapshots[0])
+            others += [Text("MAVLink sent, Hz", style="bold italic"), rates]
+        keys = Text(KEYS, style="dim")
+        return Group(*top, keys, _Halves(Group(*flying), Group(*others)))
+
+
+class _Halves:
+    """Two parts side by side in a wide terminal, below each other otherwise."""
+
+    def __init__(self, left: RenderableType, right: RenderableType) -> None:
+        self._left, self._right = left, right
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if options.max_width < SIDE_BY_SIDE:
+            yield Group(self._left, Text(), self._right)
+            return
+        grid = Table.grid(expand=True, padding=(0, 2 * GAP, 0, 0))
+        grid.add_column(ratio=1)
+        grid.add_column(ratio=1)
+        grid.add_row(self._left, self._right)
+        yield grid
+
+
+class _Grid:
+    """A table that is split into several below each other if it is too wide.
+
+    The first column has the table's name as its heading, and is repeated in each of them.
+    """
+
+    def __init__(self, *heads: str) -> None:
+        self._heads = heads
+        self._rows: list[tuple[str | Text, ...]] = []
+
+    def add_row(self, *cells: str | Text) -> None:
+        """Add a row, one cell per column."""
+        self._rows.append(cells)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        widths = [
+            max(cell_len(str(text)) for text in column)
+            for column in zip(self._heads, *self._rows, strict=True)
+        ]
+        begin = 1
+        while begin < len(widths):
+            end, room = begin + 1, options.max_width - widths[0] - GAP - widths[begin]
+            while end < len(widths) and room >= GAP + widths[end]:
+                room -= GAP + widths[end]
+                end += 1
+            yield self._table([0, *range(begin, end)])
+            begin = end
+
+    def _table(self, columns: list[int]) -> Table:
+        table = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0))
+        for column in columns:
+            table.add_column(self._heads[column], justify="right" if column else "left")
+        for row in self._rows:
+            table.add_row(*(row[column] for column in columns))
+        return table
+
+
+def _link_line(snapshot: Snapshot) -> Text:
+    report = snapshot.report
+    up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
+    line = Text(f"mavgate  up {up}  receiver ")
+    state = ("connected", "green") if report.connected else ("not connected", "red")
+    line.append(f"{report.port} {state[0]}", style=state[1])
+    line.append(f"  {counted(report.frames, 'frame')}, {report.frames_lost} lost on the line")
+    for kind, count in report.faults:
+        line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
+    if report.receiver is not None:
+        line.append(f"  channel {report.receiver.channel}")
+        line.append(f", noise {report.receiver.noise_percent} %")
+    return line
+
+
+def _recorder_line(recorder: RecorderStatus | None) -> list[Text]:
+    if recorder is None:
+        return []
+    free = f"{recorder.free_bytes / GB:.1f} GB free"
+    if recorder.reason:
+        return [Text(f"not recorded: {recorder.reason}", style="red")]
+    if recorder.state != "recording":
+        return [Text(f"recorder {recorder.state}, {free}", style="dim")]
+    size = f"{recorder.part_bytes / MB:.1f} MB, {free}"
+    return [Text(f"recording {recorder.name}, part {recorder.part}: {size}", style="green")]
+
+
+def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
+    """Show radio, supply in V, bus errors, failed and repeated sends, overruns, firmware."""
+    heads = ("Hz", "lost", "lost %", "age s", "supply", "bus", "unsent", "resent", "over")
+    grid = _Grid("node", *heads, "restarts", "fw")
+    for node in report.nodes:
+        pipes = report.receiver.pipes if report.receiver is not None else ()
+        overruns = str(pipes[node.pipe].overruns) if node.pipe < len(pipes) else UNKNOWN
+        total = node.received + node.lost
+        grid.add_row(
+            f"{node.node.vehicle_id}.{node.node.node_id}",
+            f"{node.rate_hz:.0f}",
+            str(node.lost),
+            f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
+            _age(report.time_us, node.last_time_us),
+            *_board_cells(boards.get(node.node), overruns, node),
+        )
+    return grid
+
+
+def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tuple[str, ...]:
+    if board is None:
+        return (*(UNKNOWN,) * 4, overruns, str(node.restarts), UNKNOWN)
+    return (
+        f"{board.supply_mv / MV_PER_V:.2f}" if board.supply_mv else UNKNOWN,
+        str(board.bus_errors),
+        str(board.radio_failed),
+        str(board.radio_retries),
+        overruns,
+        str(node.restarts),
+        ".".join(map(str, board.firmware_version)),
+    )
+
+
+def _age(now_us: int, then_us: int) -> Text:
+    age_us = max(0, now_us - then_us)
+    return Text(f"{age_us / US_PER_S:.1f}", style="red" if age_us > SILENT_US else "")
+
+
+def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) -> _Grid:
+    roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
+    north, east, down = state.vel_n_mps
+    heads = ("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "m/s", "climb")
+    fixes = ("fix", "satellites", "±h m", "±v m")
+    grid = _Grid("aircraft", *heads, *fixes, "home m", "home at°", "mark m", "mark at°")
+    grid.add_row(
+        str(vehicle_id),
+        figure_of(roll, "+.1f"),
+        figure_of(pitch, "+.1f"),
+        figure_of(yaw % 360.0, ".1f"),
+        figure_of(state.lat_deg, ".6f"),
+        figure_of(state.lon_deg, ".6f"),
+        figure_of(state.alt_amsl_m, ".1f"),
+        figure_of(math.hypot(north, east), ".1f"),
+        figure_of(-down, "+.1f"),
+        *_fix_cells(known.fix if known else None),
+        *_way_cells(known.home if known else None),
+        *_way_cells(known.mark if known else None),
+    )
+    return grid
+
+
+def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
+    if fix is None:
+        return (UNKNOWN,) * 4
+    name = FIX_NAMES[fix.fix_type] if fix.fix_ok else FIX_NAMES[0]
+    return (
+        Text(name, style="" if fix.fix_ok else "red"),
+        str(fix.satellites),
+        figure_of(fix.h_acc_m, ".1f"),
+        figure_of(fix.v_acc_m, ".1f"),
+    )
+
+
+def _way_cells(way: Way | None) -> tuple[str, str]:
+    if way is None or way.distance_m is None or way.bearing_deg is None:
+        return UNKNOWN, UNKNOWN
+    return figure_of(way.distance_m, ".0f"), figure_of(way.bearing_deg, ".0f")
+
+
+def _flags(state: NavState) -> Text:
+    words = [Text(word, style=style) for flag, word, style in FLAG_WORDS if flag in state.flags]
+    return Text("  ").join(words)
+
+
+def _rates(snapshot: Snapshot, previous: Snapshot) -> Columns:
+    span_s = (snapshot.time_us - previous.time_us) / US_PER_S
+    before = dict(previous.sent)
+    rates = [
+        (_message_name(key), f"{(count - before.get(key, 0)) / span_s:.1f}" if span_s else UNKNOWN)
+        for key, count in snapshot.sent
+    ]
+    return Columns([f"{name:<{RATE_NAME}}{rate:>6}" for name, rate in rates], padding=(0, 3))
+
+
+def _message_name(message_id: int) -> str:
+    kind = mavlink.mavlink_map.get(message_id)
+    return str(message_id) if kind is None else str(kind.msgname)
+
+
+def _clients(snapshot: Snapshot) -> _Grid:
+    table = _Grid("client", "state", "sent", "dropped", "received", "heard s ago")
+    for client in snapshot.clients:
+        table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
+    return table
+
+
+def _ports(snapshot: Snapshot) -> list[Text]:
+    names = [port.name for port in snapshot.listeners if port.state == "open"]
+    return [Text(f"open to others: {', '.join(names)}", style="dim")] if names else []
+
+
+def _troubles(snapshot: Snapshot) -> list[Text]:
+    found: list[ListenerStats | ClientStats] = [*snapshot.listeners, *snapshot.clients]
+    return [Text(f"{one.name}: {one.reason}", style="red") for one in found if one.reason]
+
+
+def _client_cells(client: ClientStats) -> tuple[str, ...]:
+    figures = (client.sent, client.dropped, client.received)
+    name = client.name if client.remote in client.name else f"{client.name} {client.remote}"
+    return (name, client.state, *(str(figure) for figure in figures))
+
+
+def _heard(now_us: int, client: ClientStats) -> str:
+    if client.heard_us is None:
+        return "never"
+    return f"{max(0, now_us - client.heard_us) / US_PER_S:.1f}"

@@ -1,0 +1,334 @@
+"""The control socket, by which the command line talks to a running gateway.
+
+A Unix socket that only the user (and root) can open; a system service's, its group too. Each
+request and each reply is one line of JSON; docs/control.md describes every verb. Each verb has a
+registered handler and a parameter type, which is checked before the handler is called.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pwd
+import socket
+import struct
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
+
+if TYPE_CHECKING:
+    import asyncio
+
+log = logging.getLogger(__name__)
+
+MAX_LINE: Final = 64 << 10
+"""A request is short; a status of many clients has some thousand bytes."""
+MAX_PATH: Final = 107
+"""Bytes of `sun_path`, less the zero at its end."""
+MAX_CONNECTIONS: Final = 16
+FOLDER_RIGHTS: Final = 0o700
+SOCKET_RIGHTS: Final = 0o600
+SERVICE_SOCKET_RIGHTS: Final = 0o660
+SERVICE_FOLDER: Final = Path("/run/mavgate")
+"""Created by systemd for the unit."""
+GROUP: Final = "mavgate"
+"""Group whose members may control the service."""
+MOST_GATEWAYS: Final = 9
+"""Gateways of one user: `run.sock`, `run-2.sock`, …"""
+REQUEST_TIMEOUT_S: Final = 10.0
+STARTERS: Final = {
+    "run": "`mavgate run` or `mavgate demo`",
+    "play": "`mavgate play`",
+    "fleet": "`mavgate fleet`",
+}
+"""The command that opens each socket."""
+
+_CREDENTIALS: Final = struct.Struct("3i")
+"""Linux `struct ucred`: process, user, group."""
+
+
+class ControlError(Exception):
+    """A request that was refused, or no gateway to send it to; the text says why."""
+
+
+class NoParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The parameters of a verb that has none."""
+
+
+class _Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    verb: str
+    params: dict[str, Any] = {}
+
+
+class _Answer(msgspec.Struct, frozen=True):
+    ok: bool
+    result: Any = None
+    error: str = ""
+
+
+Params = TypeVar("Params", bound=msgspec.Struct)
+Handler = Callable[[Any], Awaitable[object] | object]
+
+
+class ControlServer:
+    """Answer requests on a Unix socket.
+
+    Parameters
+    ----------
+    path : Path
+        Where the socket is created; if another gateway listens there, with the next number.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._for_group = "RUNTIME_DIRECTORY" in os.environ
+        self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
+        self._socket: socket.socket | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._is_closed = False
+        self._writers: set[asyncio.StreamWriter] = set()
+        self.register("verbs", NoParams, lambda _: sorted(self._verbs))
+
+    def register(
+        self,
+        verb: str,
+        params: type[Params],
+        handler: Callable[[Params], Awaitable[object] | object],
+    ) -> None:
+        """Register a verb.
+
+        Parameters
+        ----------
+        verb : str
+            One or more words joined by dots: `record.start`.
+        params : type
+            A msgspec structure; should forbid unknown fields.
+        handler : callable
+            Takes the parameters and returns, or awaits, what is JSON or a msgspec structure or
+            dataclass. Raises ControlError to refuse.
+        """
+        self._verbs[verb] = (params, handler)
+
+    async def start(self) -> None:
+        """Create the socket and listen.
+
+        Raises
+        ------
+        ControlError
+            If the socket cannot be created, or `MOST_GATEWAYS` run already.
+        """
+        check_length(self.path)
+        try:
+            self.path.parent.mkdir(mode=FOLDER_RIGHTS, parents=True, exist_ok=True)
+            self.path = _first_free(self.path)
+            self._socket = self._bound()
+        except OSError as error:
+            raise ControlError(f"control socket {self.path}: {error.strerror}") from error
+        # Imported here and below: clients do not need it, and it is half of a command's start-up.
+        from gateway.hub.accepting import accept_each
+
+        accept_each(self._socket, self._on_connection, self._report)
+
+    def close(self) -> None:
+        """Stop listening and end all connections."""
+        if self._socket is None:
+            return
+        import asyncio
+
+        asyncio.get_running_loop().remove_reader(self._socket)
+        self._socket.close()
+        self._socket, self._is_closed = None, True
+        for writer in self._writers:
+            writer.close()
+        self.path.unlink(missing_ok=True)
+
+    async def answer(self, line: bytes) -> bytes:
+        """Answer one line by one line; both end with a line feed."""
+        return msgspec.json.encode(await self._answer(line), enc_hook=_plain) + b"\n"
+
+    async def _answer(self, line: bytes) -> _Answer:
+        try:
+            request = msgspec.json.decode(line, type=_Request)
+            kind, handler = self._find(request.verb)
+            result = handler(msgspec.convert(request.params, kind))
+            if isinstance(result, Awaitable):
+                result = await result
+        except (ControlError, msgspec.DecodeError, UnicodeDecodeError) as error:
+            return _Answer(ok=False, error=str(error))
+        except RecursionError:
+            return _Answer(ok=False, error="the request is nested too deeply")
+        return _Answer(ok=True, result=result)
+
+    def _find(self, verb: str) -> tuple[type[msgspec.Struct], Handler]:
+        if verb not in self._verbs:
+            known = ", ".join(sorted(self._verbs))
+            raise ControlError(f"no such verb: {verb}; there are {known}")
+        return self._verbs[verb]
+
+    def _bound(self) -> socket.socket:
+        sock = socket.socket(socket.AF_UNIX)
+        try:
+            sock.setblocking(False)
+            sock.bind(str(self.path))
+            self.path.chmod(SERVICE_SOCKET_RIGHTS if self._for_group else SOCKET_RIGHTS)
+            sock.listen(MAX_CONNECTIONS)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+
+    def _report(self, error: OSError | None) -> None:
+        if error is not None:
+            log.warning("control socket: %s; it is tried again", error.strerror)
+
+    def _on_connection(self, connection: socket.socket, _: object) -> None:
+        import asyncio
+
+        connection.setblocking(False)
+        task = asyncio.get_running_loop().create_task(self._admit(connection))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _admit(self, connection: socket.socket) -> None:
+        import asyncio
+
+        await self._serve(*await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE))
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # One that was accepted just before the end is served only after it.
+        is_refused = self._is_closed or len(self._writers) >= MAX_CONNECTIONS
+        if is_refused or not self._is_allowed(writer):
+            writer.close()
+            return
+        self._writers.add(writer)
+        try:
+            while line := await reader.readline():
+                writer.write(await self.answer(line))
+                await writer.drain()
+        except (ConnectionError, ValueError):
+            # Gone, or a line beyond the limit.
+            log.debug("Control connection ended early")
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    def _is_allowed(self, writer: asyncio.StreamWriter) -> bool:
+        """Check the peer's user; the folder's mode alone may be too permissive."""
+        user, groups = peer_of(writer)
+        is_member = self._for_group and os.getgid() in groups
+        return user in (0, os.getuid()) or is_member
+
+
+def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
+    """Return the peer's user id and group ids, from the kernel."""
+    link = writer.get_extra_info("socket")
+    data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    _, user, group = _CREDENTIALS.unpack(data)
+    try:
+        groups = os.getgrouplist(pwd.getpwuid(user).pw_name, group)
+    except KeyError:
+        groups = [group]
+    return user, tuple(groups)
+
+
+def numbered(path: Path) -> list[Path]:
+    """List the socket paths of one user's gateways."""
+    others = [path.with_stem(f"{path.stem}-{n}") for n in range(2, MOST_GATEWAYS + 1)]
+    return [path, *others]
+
+
+def _first_free(path: Path) -> Path:
+    """Find a free path, and remove the socket of a killed gateway; never that of a live one."""
+    for candidate in numbered(path):
+        if not candidate.is_socket():
+            return candidate
+        with socket.socket(socket.AF_UNIX) as probe:
+            try:
+                probe.connect(str(candidate))
+            except ConnectionRefusedError:
+                candidate.unlink(missing_ok=True)
+                return candidate
+    raise ControlError(f"control socket {path}: {MOST_GATEWAYS} gateways listen there already")
+
+
+def check_length(path: Path) -> None:
+    """Check that a path is short enough for a socket; raises ControlError if not."""
+    size = len(os.fsencode(path))
+    if size > MAX_PATH:
+        raise ControlError(
+            f"control socket {path}: the path has {size} bytes, and a socket's at most {MAX_PATH}; "
+            "let XDG_RUNTIME_DIR name a shorter folder"
+        )
+
+
+def socket_path(name: str) -> Path:
+    """Return where a kind of gateway creates its socket.
+
+    Parameters
+    ----------
+    name : str
+        `run` for the gateway, `play` for a player.
+
+    Returns
+    -------
+    Path
+        In the folder that systemd created for a service, in the user's runtime folder, or in the
+        state folder if there is none.
+    """
+    if service := os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(service.split(":")[0]) / f"{name}.sock"
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    state = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser()
+    return (Path(runtime) if runtime else state) / "mavgate" / f"{name}.sock"
+
+
+def request(
+    path: Path, verb: str, params: dict[str, Any] | None = None, *, timeout_s: float | None = None
+) -> Any:
+    """Send a request to a running gateway, and wait for its reply.
+
+    Parameters
+    ----------
+    path : Path
+        See `control_finder.find_socket`.
+    verb : str
+        What to do.
+    params : dict, optional
+        Its parameters.
+    timeout_s : float, optional
+        Longest wait; `REQUEST_TIMEOUT_S` by default.
+
+    Returns
+    -------
+    object
+        The result, decoded from JSON.
+
+    Raises
+    ------
+    ControlError
+        If no gateway listens, or the request is refused.
+    """
+    check_length(path)
+    line = msgspec.json.encode({"verb": verb, "params": params or {}}) + b"\n"
+    try:
+        with socket.socket(socket.AF_UNIX) as link:
+            link.settimeout(timeout_s or REQUEST_TIMEOUT_S)
+            link.connect(str(path))
+            link.sendall(line)
+            with link.makefile("rb") as lines:
+                answer = msgspec.json.decode(lines.readline(), type=_Answer)
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise ControlError(f"nobody listens at the socket {path}") from error
+    except (OSError, msgspec.DecodeError) as error:
+        raise ControlError(f"no answer on {path}: {error}") from error
+    if not answer.ok:
+        raise ControlError(answer.error)
+    return answer.result
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Path):
+        return str(value)
+    raise NotImplementedError(f"{type(value).__name__} is no JSON")

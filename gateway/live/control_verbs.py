@@ -1,0 +1,278 @@
+"""The verbs of the control socket; see docs/control.md."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+
+import msgspec
+
+from gateway.edges.disk.player_edge import PlayerEdge, PlayerStatus
+from gateway.edges.disk.recorder import Recorder
+from gateway.edges.disk.recordings import (
+    Recording,
+    RecordingError,
+    delete_recording,
+    find_recording,
+    list_recordings,
+)
+from gateway.flightlog.moment import parse_moment
+from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
+from gateway.flightlog.session import SessionState
+from gateway.hub.client_table import ClientStats
+from gateway.hub.hub import Hub
+from gateway.live.control_socket import ControlError, ControlServer, NoParams
+from gateway.status import RecorderStatus, Snapshot
+from gateway.vehicle.home import Place
+
+
+class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A recording by its name."""
+
+    name: str
+
+
+class Url(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An endpoint, as in the settings."""
+
+    url: str
+
+
+class MarkParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A place to mark; without latitude and longitude the mark is cleared."""
+
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    alt_amsl_m: float | None = None
+    vehicle_id: int | None = None
+    """The aircraft to mark it for; all by default."""
+
+
+class Text(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A remark."""
+
+    text: str
+
+
+class To(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A moment as text; see `parse_moment`."""
+
+    to: str
+
+
+class Steps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How many frames."""
+
+    count: int = 1
+
+
+class Speed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How fast; None for as fast as possible."""
+
+    speed: float | None
+
+
+class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """On or off."""
+
+    on: bool
+
+
+class RecorderVerbs:
+    """`record.*`.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        The object to control.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+
+    def register(self, server: ControlServer) -> None:
+        """Register the verbs on a socket."""
+        server.register("record.start", NoParams, self._start)
+        server.register("record.stop", NoParams, self._stop)
+        server.register("record.status", NoParams, self._status)
+        server.register("record.save", Named, self._save)
+        server.register("record.delete", Named, self._delete)
+        server.register("record.list", NoParams, self._list)
+        server.register("record.note", Text, self._note)
+
+    async def _start(self, _: NoParams) -> RecorderStatus:
+        self._recorder.record()
+        await self._recorder.settle()
+        return self._recorder.status()
+
+    async def _stop(self, _: NoParams) -> RecorderStatus:
+        self._recorder.stop()
+        await self._recorder.settle()
+        return self._recorder.status()
+
+    def _status(self, _: NoParams) -> RecorderStatus:
+        return self._recorder.status()
+
+    async def _save(self, params: Named) -> RecorderStatus:
+        try:
+            await self._recorder.save(params.name)
+        except (RecordingError, OSError) as error:
+            raise ControlError(str(error)) from error
+        return self._recorder.status()
+
+    # A folder of thousands of files takes long, and must not delay the telemetry.
+    async def _delete(self, params: Named) -> Recording:
+        folder = self._recorder.folder
+        try:
+            name = (await asyncio.to_thread(find_recording, folder, params.name)).name
+            now = self._recorder.status()
+            if name != now.name or now.state == SessionState.IDLE:
+                return await asyncio.to_thread(delete_recording, folder, name)
+        except (RecordingError, OSError) as error:
+            raise ControlError(str(error)) from error
+        raise ControlError(f"{name} is being recorded; stop it first")
+
+    async def _list(self, _: NoParams) -> list[Recording]:
+        return await asyncio.to_thread(list_recordings, self._recorder.folder)
+
+    def _note(self, params: Text) -> RecorderStatus:
+        if not params.text.strip():
+            raise ControlError("a remark of no words: say what happens now")
+        self._recorder.mark(params.text)
+        return self._recorder.status()
+
+
+class AircraftVerbs:
+    """`mark`.
+
+    Parameters
+    ----------
+    mark : callable
+        Marks a place for one aircraft or all, or clears the mark; raises ValueError.
+    """
+
+    def __init__(self, mark: Callable[[Place | None, int | None], None]) -> None:
+        self._mark = mark
+
+    def register(self, server: ControlServer) -> None:
+        """Register the verb on a socket."""
+        server.register("mark", MarkParams, self._put)
+
+    def _put(self, params: MarkParams) -> str:
+        place = None
+        if params.lat_deg is not None and params.lon_deg is not None:
+            alt_amsl_m = math.nan if params.alt_amsl_m is None else params.alt_amsl_m
+            place = Place(params.lat_deg, params.lon_deg, alt_amsl_m)
+        elif (params.lat_deg, params.lon_deg) != (None, None):
+            raise ControlError("a mark needs both latitude and longitude")
+        try:
+            self._mark(place, params.vehicle_id)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return "mark cleared" if place is None else "marked"
+
+
+class HubVerbs:
+    """`status`, `reload` and `clients.*`.
+
+    Parameters
+    ----------
+    hub : Hub
+        The hub.
+    snapshot : callable
+        Returns the present state of the gateway.
+    reload : callable
+        Applies changed settings and returns a text, to be awaited; raises ControlError.
+    """
+
+    def __init__(
+        self, hub: Hub, snapshot: Callable[[], Snapshot], reload: Callable[[], Awaitable[str]]
+    ) -> None:
+        self._hub = hub
+        self._snapshot = snapshot
+        self._reload = reload
+
+    def register(self, server: ControlServer) -> None:
+        """Register the verbs on a socket."""
+        server.register("status", NoParams, lambda _: self._snapshot())
+        server.register("reload", NoParams, lambda _: self._reload())
+        server.register("clients.list", NoParams, self._list)
+        server.register("clients.add", Url, self._add)
+        server.register("clients.remove", Named, self._remove)
+
+    def _list(self, _: NoParams) -> tuple[ClientStats, ...]:
+        return self._hub.clients()
+
+    def _add(self, params: Url) -> tuple[str, ...]:
+        try:
+            self._hub.add(params.url)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._hub.endpoints()
+
+    def _remove(self, params: Named) -> tuple[str, ...]:
+        try:
+            self._hub.remove(params.name)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._hub.endpoints()
+
+
+class PlayerVerbs:
+    """`play.*` and `seek`.
+
+    Parameters
+    ----------
+    player : PlayerEdge
+        The object to control.
+    """
+
+    def __init__(self, player: PlayerEdge) -> None:
+        self._player = player
+
+    def register(self, server: ControlServer) -> None:
+        """Register the verbs on a socket."""
+        server.register("seek", To, self._seek)
+        server.register("play.pause", NoParams, self._pause)
+        server.register("play.resume", NoParams, self._resume)
+        server.register("play.step", Steps, self._step)
+        server.register("play.speed", Speed, self._speed)
+        server.register("play.loop", Switch, self._loop)
+        server.register("play.status", NoParams, self._status)
+
+    def _seek(self, params: To) -> PlayerStatus:
+        try:
+            moment = parse_moment(params.to)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        if moment.time_us is not None:
+            self._player.seek_time(moment.time_us)
+        else:
+            self._player.seek(moment.offset_s or 0.0, relative=moment.relative)
+        return self._player.status()
+
+    def _pause(self, _: NoParams) -> PlayerStatus:
+        self._player.pause()
+        return self._player.status()
+
+    def _resume(self, _: NoParams) -> PlayerStatus:
+        self._player.resume()
+        return self._player.status()
+
+    def _step(self, params: Steps) -> PlayerStatus:
+        self._player.step(params.count)
+        return self._player.status()
+
+    def _speed(self, params: Speed) -> PlayerStatus:
+        speed = AS_FAST_AS_POSSIBLE if params.speed is None else params.speed
+        try:
+            self._player.set_speed(speed)
+        except ValueError as error:
+            raise ControlError(str(error)) from error
+        return self._player.status()
+
+    def _loop(self, params: Switch) -> PlayerStatus:
+        self._player.set_loop(params.on)
+        return self._player.status()
+
+    def _status(self, _: NoParams) -> PlayerStatus:
+        return self._player.status()

@@ -1,0 +1,379 @@
+"""The composition root: builds the edges, connects them to the pipeline, and shuts them down."""
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from gateway.aircraft import Action, Aircraft, AircraftSettings, SettingsChanged
+from gateway.aircraft_status import status_of
+from gateway.clock import GatewayClock, unix_time_us
+from gateway.config import (
+    ConfigError,
+    GatewaySettings,
+    aircraft_folder,
+    load_aircraft,
+    save_aircraft,
+)
+from gateway.edges.disk.place_files import PlaceFiles
+from gateway.edges.disk.recorder import Recorder
+from gateway.edges.disk.stamp_file import StampFile
+from gateway.edges.disk.worker import begin_worker
+from gateway.flightlog.recording_budget import RecordingBudget
+from gateway.flightlog.session import SessionState
+from gateway.flightlog.table.table import TableHeader
+from gateway.hub.hub import Hub
+from gateway.live.control_socket import ControlError, ControlServer, socket_path
+from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
+from gateway.live.metrics_server import MetricsServer
+from gateway.live.pty_port import PtyPort
+from gateway.live.serial_port import SerialPort
+from gateway.live.service import ServiceNotifier, set_realtime_priority
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.reasons import reason_of
+from gateway.records import (
+    RECORDED_ONLY,
+    BaroRaw,
+    ClientInterval,
+    FusedSample,
+    GpsFix,
+    Incoming,
+    NodeStatus,
+    Outgoing,
+)
+from gateway.replay import header_for
+from gateway.simulator.timed_frame import TimedFrame
+from gateway.status import Snapshot
+from gateway.units import US_PER_S
+from gateway.vehicle.actions import RecordingRequest, Request, SavePlaces, SaveSettings
+from gateway.vehicle.home import Place
+from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
+
+log = logging.getLogger(__name__)
+
+LONGEST_WAIT_S: Final = 0.1
+"""A sample may make something due sooner than was known when the timer was set."""
+SHORTEST_WAIT_S: Final = 0.001
+
+
+class Daemon:
+    """The running gateway: receiver in, MAVLink out.
+
+    Parameters
+    ----------
+    settings : GatewaySettings
+        All settings.
+    aircraft : mapping of int to AircraftSettings
+        Settings of single aircraft, by vehicle id.
+    read : callable
+        Reads the settings again, or raises ConfigError.
+    line : iterator of TimedFrame, optional
+        Frames of a simulated receiver, instead of the serial port.
+    """
+
+    def __init__(
+        self,
+        settings: GatewaySettings,
+        aircraft: Mapping[int, AircraftSettings],
+        read: Callable[[], GatewaySettings],
+        line: Iterator[TimedFrame] | None = None,
+    ) -> None:
+        self.now_us = GatewayClock()
+        self._receiver = None if line is None else PtyPort(line)
+        serial = settings.serial
+        if self._receiver is not None:
+            serial = msgspec.structs.replace(serial, port=self._receiver.path)
+        self._settings = settings
+        self._read = read
+        self._places = PlaceFiles(aircraft_folder(settings), self._announce_places)
+        self._stamps = StampFile(aircraft_folder(settings))
+        self._pipeline = self._make_pipeline(aircraft)
+        self._pipeline.disconnect(serial.port)
+        self._hub = Hub(
+            settings.hub,
+            self._on_frame,
+            self.now_us,
+            on_foreign=lambda frame: self._recorder.frame(frame),
+            on_gone=self._on_gone,
+            on_trouble=self._announce,
+            seal=partial(self._pipeline.seal, now_us=self.now_us),
+            recordings=Path(settings.recording.folder).expanduser(),
+        )
+        self._recorder = Recorder(
+            settings.recording,
+            self.now_us,
+            unix_time_us,
+            self._table_head,
+            self._announce,
+            lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
+        )
+        self._budget = RecordingBudget()
+        self._control = self._make_control()
+        self._opening: asyncio.Task[None] | None = None
+        self._files = begin_worker("settings")
+        self._metrics = MetricsServer(self._metrics_text)
+        self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
+        self._notifier = ServiceNotifier()
+        heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
+        self._serial = SerialPort(serial, *heard, self.now_us)
+        self._sent: Counter[int] = Counter()
+        self._timer: asyncio.TimerHandle | None = None
+
+    def _make_pipeline(self, aircraft: Mapping[int, AircraftSettings]) -> Pipeline:
+        places, stamps = self._places.load(), self._stamps.load()
+        self._broken_places = dict(self._places.broken)
+        at_zero_us = unix_time_us() - self.now_us()
+        default = self._settings.default_aircraft
+        return Pipeline(
+            PipelineSettings(default, aircraft, at_zero_us, places=places, stamps=stamps)
+        )
+
+    def _make_control(self) -> ControlServer:
+        control = ControlServer(socket_path("run"))
+        RecorderVerbs(self._recorder).register(control)
+        AircraftVerbs(self._mark).register(control)
+        HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(control)
+        return control
+
+    def start(self) -> None:
+        """Open everything; needs a running event loop. What is missing is retried."""
+        if self._settings.hub.realtime_priority:
+            set_realtime_priority(self._settings.hub.realtime_priority)
+        # Several, since a network that is down holds each look-up of a name for seconds.
+        asyncio.get_running_loop().set_default_executor(begin_worker("lookups", 8))
+        self._hub.start()
+        self._recorder.start()
+        self._serve_metrics()
+        self._serial.start()
+        if self._receiver is not None:
+            self._receiver.start()
+        self._opening = asyncio.get_running_loop().create_task(self._open_control())
+        self._poll()
+
+    async def control_socket(self) -> Path:
+        """Wait until the control socket listens, and return its path."""
+        if self._opening is not None:
+            await asyncio.shield(self._opening)
+        return self._control.path
+
+    async def reload(self) -> str:
+        """Apply changed settings of the hub and of signing; other clients stay connected.
+
+        Other changes apply at the next start: ground stations may have changed them meanwhile.
+
+        Returns
+        -------
+        str
+            What was done.
+
+        Raises
+        ------
+        ConfigError
+            If the settings are wrong; then nothing is changed.
+        """
+        # In a thread, as in `_save`: files take some milliseconds, or longer on a slow disk.
+        loop = asyncio.get_running_loop()
+        settings = await loop.run_in_executor(self._files, self._read)
+        passphrase = settings.vehicle.signing_passphrase
+        now = self._settings
+        vehicle = msgspec.structs.replace(now.vehicle, signing_passphrase=passphrase)
+        now = msgspec.structs.replace(now, hub=settings.hub, vehicle=vehicle)
+        aircraft = await loop.run_in_executor(self._files, load_aircraft, now)
+        own = {k: a.vehicle.signing_passphrase for k, a in aircraft.items()}
+        self._notifier.reloading()
+        if settings.hub.realtime_priority != self._settings.hub.realtime_priority:
+            set_realtime_priority(settings.hub.realtime_priority)
+        self._settings = now
+        self._hub.apply(settings.hub)
+        self._perform(self._pipeline.sign_by(passphrase, own, self.now_us()))
+        self._serve_metrics()
+        self._notifier.ready()
+        later = "; others need a new start" if settings != now else ""
+        status = f"settings of the hub and of signing applied{later}"
+        log.info(status)
+        return status
+
+    def close(self) -> None:
+        """Close everything: first the inputs, then the outputs."""
+        self._notifier.stopping()
+        if self._receiver is not None:
+            self._receiver.close()
+        self._serial.close()
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._opening is not None:
+            self._opening.cancel()
+        self._control.close()
+        self._files.shutdown()
+        self._recorder.close()
+        self._places.close()
+        self._stamps.close(self._pipeline.newest_stamps())
+        self._metrics.close()
+        self._hub.close()
+
+    def snapshot(self) -> Snapshot:
+        """Return the present state."""
+        aircraft = sorted(self._pipeline.aircraft.items())
+        return Snapshot(
+            time_us=self.now_us(),
+            report=self._pipeline.report,
+            states=tuple((key, a.state) for key, a in aircraft if a.state is not None),
+            clients=self._hub.clients(),
+            sent=tuple(sorted(self._sent.items())),
+            hub=self._hub.counters(),
+            listeners=(*self._hub.listeners(), *self._metrics.listeners()),
+            places_not_kept=self._places.failures,
+            refused=self._pipeline.refused,
+            forged=self._pipeline.forged,
+            simulated=self._receiver is not None,
+            aircraft=tuple(status_of(one) for _, one in aircraft),
+            recorder=self._recorder.status(),
+        )
+
+    def _serve_metrics(self) -> None:
+        port = self._settings.hub.metrics_port
+        if port and self._write_metrics is None:
+            # Imported here: most gateways serve no metrics. Not at the first request either:
+            # loading the library then would stop the telemetry for 0.3 s.
+            from gateway.live.metrics import prometheus_text
+
+            self._write_metrics = prometheus_text
+        self._metrics.listen(port)
+
+    def _metrics_text(self) -> Iterator[str]:
+        assert self._write_metrics is not None
+        return self._write_metrics(self.snapshot())
+
+    def announce(self, text: str) -> None:
+        """Announce an event that is not a problem to the ground stations."""
+        self._announce(False, text)
+
+    def toggle_recording(self) -> None:
+        """Start the recorder if it is idle, else stop it, whatever the settings."""
+        idle = self._recorder.status().state == SessionState.IDLE
+        (self._recorder.record if idle else self._recorder.stop)()
+
+    async def _reload_or_refuse(self) -> str:
+        try:
+            return await self.reload()
+        except ConfigError as error:
+            raise ControlError(f"settings not reloaded: {error}") from error
+
+    def _mark(self, place: Place | None, vehicle_id: int | None) -> None:
+        self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
+
+    def _announce(self, is_trouble: bool, text: str) -> None:
+        status = StatusText(WARNING if is_trouble else INFO, text)
+        self._perform(self._pipeline.say(status, self.now_us()))
+
+    async def _open_control(self) -> None:
+        try:
+            await self._control.start()
+        except ControlError as error:
+            log.warning("no orders can be taken: %s", error)
+        self._notifier.ready()
+
+    def _table_head(self, vehicle_id: int) -> TableHeader:
+        return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)
+
+    def _on_bytes(self, data: bytes, now_us: int) -> None:
+        self._perform(self._pipeline.feed(data, now_us))
+
+    def _on_frame(self, incoming: Incoming) -> None:
+        frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()
+        self._budget.note(client_id, now_us, trusted=incoming.trusted)
+        actions = self._pipeline.handle(incoming, now_us)
+        if (stamps := self._pipeline.stamps_to_keep()) is not None:
+            self._stamps.save(stamps)
+        # A ground station's broadcast comes both to us and past us; of strangers only what had an
+        # effect is recorded.
+        kept = incoming.trusted or bool(actions)
+        if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
+            self._recorder.frame(frame)
+        self._perform(actions)
+
+    def _on_gone(self, client_id: int) -> None:
+        self._pipeline.forget_client(client_id)
+        self._budget.forget_client(client_id)
+
+    def _send(self, frames: Sequence[Outgoing]) -> None:
+        self._hub.send_all([each for each in frames if each.client_id != RECORDED_ONLY])
+        for sent in frames:
+            self._sent[sent.message_id] += 1
+            frame, to = sent.frame, sent.client_id
+            if to in (None, RECORDED_ONLY) or self._budget.takes(to, len(frame), self.now_us()):
+                self._recorder.frame(frame)
+
+    def _poll(self) -> None:
+        # First, so that the next turn comes whatever happens below.
+        loop = asyncio.get_running_loop()
+        self._timer = loop.call_later(LONGEST_WAIT_S, self._poll)
+        now_us = self.now_us()
+        self._perform(self._pipeline.poll(now_us))
+        for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
+            # After its first heartbeat, before which ground stations ignore its messages.
+            self._announce_places(vehicle_id, self._broken_places.pop(vehicle_id))
+        self._recorder.set_in_flight(self._pipeline.in_flight)
+        trouble, recording = self._recorder.trouble, self._recorder.recording
+        self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
+        wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
+        wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
+        self._timer.cancel()
+        self._timer = loop.call_later(wait_s, self._poll)
+
+    def _perform(self, actions: Sequence[Action]) -> None:
+        """Carry out the actions of the pure stages, frames first."""
+        if frames := [action for action in actions if isinstance(action, Outgoing)]:
+            self._send(frames)
+        for action in actions:
+            if not isinstance(action, Outgoing):
+                self._carry_out(action)
+
+    def _carry_out(self, action: Action) -> None:
+        match action:
+            case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
+                self._recorder.flight(action)
+            case ClientInterval():
+                self._hub.set_interval(action)
+            case SaveSettings():
+                self._save(action)
+            case SavePlaces():
+                self._places.save(action.vehicle_id, action.places)
+            case RecordingRequest():
+                (self._recorder.record if action.start else self._recorder.stop)()
+            case SettingsChanged():
+                self._recorder.settings_changed(action.vehicle_id)
+
+    def _save(self, save: SaveSettings) -> None:
+        """Write an aircraft's settings to its file, and report the outcome."""
+        aircraft, loop = self._pipeline.find(save.vehicle_id), asyncio.get_running_loop()
+        what = (self._settings, save.vehicle_id, aircraft.settings)
+        saving = loop.run_in_executor(self._files, save_aircraft, *what)
+        saving.add_done_callback(partial(self._on_saved, aircraft, save.request))
+
+    def _on_saved(self, aircraft: Aircraft, request: Request, saving: asyncio.Future[Path]) -> None:
+        vehicle_id, now_us = aircraft.vehicle_id, self.now_us()
+        try:
+            text, stored = saving.result().name, True
+        except OSError as error:
+            log.warning("settings of aircraft %d cannot be saved: %s", vehicle_id, error)
+            text, stored = reason_of(error), False
+        else:
+            log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
+        told = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
+        self._perform(aircraft.perform(told, now_us))
+
+    def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
+        status = StatusText(INFO, "Mission, mark and home are kept again")
+        if trouble is not None:
+            status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
+        self._announce_for(self._pipeline.find(vehicle_id), status)
+
+    def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
+        now_us = self.now_us()
+        self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))

@@ -1,0 +1,267 @@
+"""Prometheus metrics of the gateway: each family with its meaning and what to do."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from prometheus_client.core import Metric
+
+from gateway.geometry.quaternion import to_euler
+from gateway.live.hub_metrics import Labels, counter, gauge, hub_families, text_of
+from gateway.records import GpsFix, NavFlags, NavState, NodeId, NodeLink, NodeStatus
+from gateway.status import AircraftStatus, Snapshot
+from gateway.units import RAD_PER_DEG, US_PER_S
+
+NODE: Final = ("vehicle", "node")
+FRACTION: Final = 1e-6
+
+NODE_COUNTERS: Final = (
+    ("received", "Radio payloads of a node that arrived."),
+    ("lost", "Radio payloads of a node that never came: above some percent look at the antennas."),
+    ("duplicates", "Payloads that came twice: the node did not hear that they had arrived."),
+    ("restarts", "Restarts of a node: in flight a failing supply or its watchdog."),
+)
+VALID: Final = {
+    "attitude": NavFlags.ATTITUDE_VALID,
+    "heading": NavFlags.HEADING_VALID,
+    "position": NavFlags.POSITION_VALID,
+    "velocity": NavFlags.VELOCITY_VALID,
+    "altitude": NavFlags.ALTITUDE_VALID,
+}
+VEHICLE_GAUGES: Final[tuple[tuple[str, str, Callable[[NavState], float]], ...]] = (
+    ("latitude_degrees", "Latitude; not there before it is known.", lambda s: s.lat_deg),
+    ("longitude_degrees", "Longitude; not there before it is known.", lambda s: s.lon_deg),
+    ("altitude_metres", "Height above mean sea level.", lambda s: s.alt_amsl_m),
+    (
+        "ground_speed_metres_per_second",
+        "Horizontal speed.",
+        lambda s: math.hypot(s.vel_n_mps[0], s.vel_n_mps[1]),
+    ),
+    ("climb_metres_per_second", "Speed upwards.", lambda s: -s.vel_n_mps[2]),
+    (
+        "horizontal_deviation_metres",
+        "Standard deviation of the horizontal position, by the estimator.",
+        lambda s: math.hypot(s.pos_std_m[0], s.pos_std_m[1]),
+    ),
+    (
+        "roll_degrees",
+        "Roll, right wing down positive.",
+        lambda s: to_euler(s.q_nb)[0] / RAD_PER_DEG,
+    ),
+    ("pitch_degrees", "Pitch, nose up positive.", lambda s: to_euler(s.q_nb)[1] / RAD_PER_DEG),
+    (
+        "heading_degrees",
+        "Heading from true north, once it is known.",
+        lambda s: (
+            to_euler(s.q_nb)[2] / RAD_PER_DEG % 360.0
+            if s.flags & NavFlags.HEADING_VALID
+            else math.nan
+        ),
+    ),
+)
+BOARD_GAUGES: Final[tuple[tuple[str, str, Callable[[NodeStatus], float]], ...]] = (
+    (
+        "supply_volts",
+        "Supply of a node; 0 where it does not measure it.",
+        lambda b: b.supply_mv / 1e3,
+    ),
+    (
+        "loop_max_seconds",
+        "Longest loop of a node in the last second: above its sample time samples are late.",
+        lambda b: b.loop_max_us / US_PER_S,
+    ),
+)
+BOARD_COUNTERS: Final = (
+    (
+        "bus_errors",
+        "Failed transfers with a sensor, 16 bits: a loose wire, or a bus that is too long.",
+    ),
+    ("radio_failed", "Payloads that nobody acknowledged, 16 bits: out of reach, or a weak supply."),
+    ("radio_retries", "Payloads that were sent again, 16 bits: a busy channel or a weak link."),
+)
+FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
+    (
+        "gps_fix",
+        "Type of GPS fix: 0 none, 2 is 2D, 3 is 3D; others are no fix.",
+        lambda f: float(f.fix_type),
+    ),
+    ("satellites", "Satellites in use.", lambda f: float(f.satellites)),
+    (
+        "gps_accuracy_metres",
+        "Horizontal accuracy, as the receiver reports it.",
+        lambda f: f.h_acc_m,
+    ),
+)
+
+
+def prometheus_text(snapshot: Snapshot) -> Iterator[str]:
+    """Write a snapshot in the Prometheus text format.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The daemon's state now.
+
+    Yields
+    ------
+    str
+        One family: its help and type, then one line per sample.
+    """
+    return text_of(families(snapshot))
+
+
+def families(snapshot: Snapshot) -> Iterator[Metric]:
+    """Yield the metrics of a snapshot.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+
+    Yields
+    ------
+    Metric
+        Names begin with `mavgate_`; unknown values are left out.
+    """
+    yield from _gateway(snapshot)
+    yield from _refusals(snapshot)
+    yield from _nodes(snapshot.report.nodes, snapshot.time_us)
+    yield from _boards(snapshot)
+    yield from _vehicles(snapshot.states)
+    yield from _receptions(snapshot.aircraft)
+    yield from hub_families(snapshot.hub, snapshot.listeners, snapshot.clients, snapshot.time_us)
+
+
+def _gateway(snapshot: Snapshot) -> Iterator[Metric]:
+    report = snapshot.report
+    up_s = snapshot.time_us / US_PER_S
+    yield gauge("up_seconds", "Time since the gateway started.", (), [((), up_s)])
+    yield gauge(
+        "receiver_connected",
+        "1 while the receiver's port is open; 0: unplugged, or another program has it.",
+        (),
+        [((), float(report.connected))],
+    )
+    yield counter(
+        "receiver_frames", "Frames that the receiver sent.", (), [((), float(report.frames))]
+    )
+    yield counter(
+        "receiver_frames_lost",
+        "Frames that were lost on the serial line: the computer is too busy, or the cable bad.",
+        (),
+        [((), float(report.frames_lost))],
+    )
+    yield counter(
+        "receiver_faults",
+        "Damage on the serial line by kind: a wrong baud rate, or a bad cable.",
+        ("kind",),
+        [((kind,), float(count)) for kind, count in report.faults],
+    )
+
+
+def _refusals(snapshot: Snapshot) -> Iterator[Metric]:
+    for name, count, text in (
+        (
+            "places_not_kept",
+            snapshot.places_not_kept,
+            "Missions, marks and homes that could not be written: the disk is full or read-only.",
+        ),
+        (
+            "requests_refused",
+            snapshot.refused,
+            "Requests to change something from untrusted clients: see trusted= of endpoints.",
+        ),
+        (
+            "requests_forged",
+            snapshot.forged,
+            "Requests with a wrong, old or repeated signature: another passphrase, or an attack.",
+        ),
+    ):
+        yield counter(name, text, (), [((), float(count))])
+
+
+def _nodes(nodes: tuple[NodeLink, ...], now_us: int) -> Iterator[Metric]:
+    for field, text in NODE_COUNTERS:
+        samples = [(_of(link.node), float(getattr(link, field))) for link in nodes]
+        yield counter(f"node_{field}", text, NODE, samples)
+    rates = [(_of(link.node), link.rate_hz) for link in nodes]
+    yield gauge("node_rate_hz", "Radio payloads of a node in the last second.", NODE, rates)
+    silences = [(_of(link.node), (now_us - link.last_time_us) / US_PER_S) for link in nodes]
+    yield gauge(
+        "node_silent_seconds",
+        "Time since a node's newest payload: above a second it is off or out of reach.",
+        NODE,
+        silences,
+    )
+    skews = [(_of(link.node), link.clock_skew_ppm * FRACTION) for link in nodes]
+    yield gauge(
+        "node_clock_skew_ratio",
+        "How much faster than the gateway's a node's clock runs.",
+        NODE,
+        skews,
+    )
+
+
+def _boards(snapshot: Snapshot) -> Iterator[Metric]:
+    """Yield the nodes' reports of their own boards."""
+    boards = [board for one in snapshot.aircraft for board in one.boards]
+    for name, text, value_of in BOARD_GAUGES:
+        yield gauge(f"node_{name}", text, NODE, [(_of(b.node), value_of(b)) for b in boards])
+    for field, text in BOARD_COUNTERS:
+        samples = [(_of(board.node), float(getattr(board, field))) for board in boards]
+        yield counter(f"node_{field}", text, NODE, samples)
+    versions = [((*_of(b.node), ".".join(map(str, b.firmware_version))), 1.0) for b in boards]
+    yield gauge("node_info", "Firmware of a node.", (*NODE, "firmware"), versions)
+    receiver = snapshot.report.receiver
+    pipes = receiver.pipes if receiver is not None else ()
+    yield counter(
+        "receiver_overruns",
+        "Payloads that the receiver had no room for: too many nodes, or a slow serial line.",
+        ("pipe",),
+        [((str(number),), float(pipe.overruns)) for number, pipe in enumerate(pipes)],
+    )
+
+
+def _receptions(aircraft: tuple[AircraftStatus, ...]) -> Iterator[Metric]:
+    """Yield the aircraft's GPS reception, and the distance to home."""
+    for name, text, value_of in FIX_GAUGES:
+        samples = [((str(one.vehicle_id),), value_of(one.fix)) for one in aircraft if one.fix]
+        yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
+    ways = [
+        ((str(one.vehicle_id),), one.home.distance_m)
+        for one in aircraft
+        if one.home is not None and one.home.distance_m is not None
+    ]
+    yield gauge("vehicle_home_distance_metres", "Distance over ground to home.", ("vehicle",), ways)
+
+
+def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
+    for name, text, value_of in VEHICLE_GAUGES:
+        samples = [((str(vehicle_id),), value_of(state)) for vehicle_id, state in states]
+        yield gauge(f"vehicle_{name}", text, ("vehicle",), samples)
+    yield gauge(
+        "vehicle_valid",
+        "1 where the estimate is valid, by quantity.",
+        ("vehicle", "quantity"),
+        [
+            ((str(vehicle_id), quantity), float(flag in state.flags))
+            for vehicle_id, state in states
+            for quantity, flag in VALID.items()
+        ],
+    )
+    yield gauge(
+        "vehicle_trouble",
+        "1 while GPS is rejected, or the magnetometer disturbed (iron or currents near it).",
+        ("vehicle", "kind"),
+        [
+            ((str(vehicle_id), kind), float(flag in state.flags))
+            for vehicle_id, state in states
+            for kind, flag in (
+                ("gps_rejected", NavFlags.GPS_REJECTED),
+                ("magnetometer_disturbed", NavFlags.MAG_DISTURBED),
+            )
+        ],
+    )
+
+
+def _of(node: NodeId) -> Labels:
+    return (str(node.vehicle_id), str(node.node_id))

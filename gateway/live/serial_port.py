@@ -1,0 +1,300 @@
+"""The receiver's serial port: found by name or USB id, lost and found again.
+
+| state     | what happens                   | next                                      |
+| --------- | ------------------------------ | ----------------------------------------- |
+| waiting   | the timer fires                | tries to open: `open`, or waits longer    |
+| open      | bytes are there                | passed on, with the time of reading       |
+| open      | the port fails or is pulled    | closed: `waiting`, shortest delay         |
+"""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import serial
+from serial.tools import list_ports
+
+from gateway.reasons import reason_of
+from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+FIRST_RETRY_S: Final = 0.25
+LONGEST_RETRY_S: Final = 4.0
+READ_SIZE: Final = 48
+"""A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
+of the loop, so that clients are not kept waiting until all of it is worked off."""
+BITS_PER_BYTE: Final = 10
+"""On the line, start and stop bit included."""
+
+KNOWN_ADAPTERS: Final = {
+    (0x0403, 0x6001): "FTDI FT232R",
+    (0x0403, 0x6015): "FTDI FT230X",
+    (0x067B, 0x2303): "Prolific PL2303",
+    (0x10C4, 0xEA60): "Silicon Labs CP210x",
+    (0x1A86, 0x5523): "WCH CH341",
+    (0x1A86, 0x7523): "WCH CH340",
+    (0x2341, 0x0043): "Arduino Uno",
+    (0x2341, 0x0001): "Arduino Uno",
+}
+"""USB serial chips of Arduino-class boards and programming cables."""
+
+
+class SerialSettings(Settings, frozen=True):
+    """Which port the receiver is on."""
+
+    port: Annotated[
+        str,
+        setting(
+            'Where the receiver is: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
+            'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), or "auto" for the only known USB '
+            "adapter. `mavgate ports` lists them.",
+            pattern=r"^(auto|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
+        ),
+    ] = "auto"
+    baud: Annotated[
+        int,
+        setting("Speed of the line; the receiver's firmware must match.", "baud", ge=9600, le=2e6),
+    ] = 500_000
+
+
+class PortNotFoundError(Exception):
+    """No port fits the setting, or it cannot be opened; the text says why, and what is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """One serial port of this machine."""
+
+    device: str
+    usb_id: str
+    serial_number: str
+    description: str
+    known: bool
+
+
+def list_serial_ports() -> list[Port]:
+    """List the serial ports of this machine, those on known USB adapters first."""
+    ports = [
+        Port(
+            device=p.device,
+            usb_id="" if p.vid is None else f"{p.vid:04x}:{p.pid:04x}",
+            serial_number=p.serial_number or "",
+            description=KNOWN_ADAPTERS.get((p.vid, p.pid)) or p.product or p.description or "",
+            known=(p.vid, p.pid) in KNOWN_ADAPTERS,
+        )
+        for p in list_ports.comports()
+    ]
+    return sorted(ports, key=lambda port: (not port.known, port.device))
+
+
+def find_port(wanted: str, ports: list[Port]) -> str:
+    """Choose the device for the setting `port`.
+
+    Parameters
+    ----------
+    wanted : str
+        A device, `usb:VID:PID[:SERIAL]` in hexadecimal, or `auto`.
+    ports : list of Port
+        The ports of this machine.
+
+    Returns
+    -------
+    str
+        The device to open.
+
+    Raises
+    ------
+    PortNotFoundError
+        If nothing fits, or `auto` would have to guess between several.
+    """
+    if wanted == "auto":
+        fitting = [port for port in ports if port.known]
+    elif wanted.startswith("usb:"):
+        vid, pid, *serial_number = wanted.removeprefix("usb:").lower().split(":", 2)
+        fitting = [
+            port
+            for port in ports
+            if port.usb_id == f"{vid}:{pid}"
+            and (not serial_number or port.serial_number.lower() == serial_number[0])
+        ]
+    else:
+        return wanted
+    if len(fitting) == 1 or (fitting and wanted != "auto"):
+        return fitting[0].device
+    seen = ", ".join(f"{p.device} ({p.usb_id or 'no USB'})" for p in ports) or "no port at all"
+    if fitting:
+        raise PortNotFoundError(
+            f"several USB adapters fit: {seen}; name one in [serial] port or with --port"
+        )
+    raise PortNotFoundError(f"no port fits {wanted!r}; this machine has {seen}")
+
+
+def why_not_open(error: Exception, ports: list[Port]) -> str:
+    """Return why a device cannot be opened, and under which name an adapter is found that is there.
+
+    Parameters
+    ----------
+    error : Exception
+        As pyserial raises it.
+    ports : list of Port
+        The ports of this machine.
+
+    Returns
+    -------
+    str
+    """
+    number = getattr(error, "errno", None)
+    if number == errno.EAGAIN:
+        return "another program has it open"
+    if number is None and isinstance(error, serial.SerialException):
+        return "not a serial port"
+    known = ports if number == errno.ENOENT else []
+    others = [f"{p.device} is there, always found as usb:{p.usb_id}" for p in known if p.known]
+    return "; ".join([reason_of(error), *others])
+
+
+def open_port(settings: SerialSettings) -> serial.Serial:
+    """Open the receiver's port, for this program alone.
+
+    Raises
+    ------
+    PortNotFoundError
+        If there is none, or it cannot be opened.
+    """
+    ports = list_serial_ports()
+    device = find_port(settings.port, ports)
+    try:
+        return serial.Serial(device, settings.baud, timeout=0, write_timeout=0, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise PortNotFoundError(f"receiver {device}: {why_not_open(error, ports)}") from error
+
+
+class SerialPort:
+    """Keep one serial port open and pass on its bytes.
+
+    Parameters
+    ----------
+    settings : SerialSettings
+    on_bytes : callable
+        Called with every chunk and the gateway time of its reading.
+    on_open, on_lost : callable
+        Called with the device after each opening, before the first bytes, and after each loss.
+    now_us : callable
+        The gateway clock.
+    """
+
+    def __init__(
+        self,
+        settings: SerialSettings,
+        on_bytes: Callable[[bytes, int], None],
+        on_open: Callable[[str], None],
+        on_lost: Callable[[str], None],
+        now_us: Callable[[], int],
+    ) -> None:
+        self._settings = settings
+        self._on_bytes = on_bytes
+        self._on_open = on_open
+        self._on_lost = on_lost
+        self._now_us = now_us
+        self._port: serial.Serial | None = None
+        self._retry: asyncio.TimerHandle | None = None
+        self._delay_s = FIRST_RETRY_S
+        self._last_complaint = ""
+        self._read_us = 0
+        self._left_more = False
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open."""
+        return self._port is not None
+
+    def start(self) -> None:
+        """Open the port, now or as soon as it exists."""
+        self._open()
+
+    def close(self) -> None:
+        """Close the port for good."""
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        self._release()
+
+    def apply(self, settings: SerialSettings) -> None:
+        """Move to another port or speed; nothing happens if neither changed."""
+        if settings != self._settings:
+            self.close()
+            self._settings = settings
+            self._delay_s = FIRST_RETRY_S
+            self._open()
+
+    def _open(self) -> None:
+        self._retry = None
+        try:
+            self._port = open_port(self._settings)
+        except PortNotFoundError as error:
+            self._complain(str(error))
+            self._try_later()
+            return
+        device = self._port.port
+        with contextlib.suppress(OSError, ValueError):
+            # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
+            self._port.set_low_latency_mode(True)
+        log.info("receiver on %s at %d baud", device, self._settings.baud)
+        self._delay_s = FIRST_RETRY_S
+        self._last_complaint = ""
+        self._on_open(device)
+        file = self._port.fileno()
+        asyncio.get_running_loop().add_reader(file, self._read, file)
+
+    def _read(self, file: int) -> None:
+        now_us, size = self._now_us(), READ_SIZE
+        if self._left_more:
+            # As much as the line brought since: where clients make turns long, the samples come
+            # late, but none is lost in the kernel.
+            line_bytes = (now_us - self._read_us) * self._settings.baud // BITS_PER_BYTE
+            size = max(READ_SIZE, line_bytes // US_PER_S)
+        try:
+            # pyserial's own read makes two more system calls, for every sample.
+            data = os.read(file, size)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._broke(error)
+            return
+        self._read_us, self._left_more = now_us, len(data) == size
+        if data:
+            self._on_bytes(data, now_us)
+        else:
+            self._broke(OSError("the device hung up"))
+
+    def _broke(self, error: OSError) -> None:
+        assert self._port is not None
+        device = str(self._port.port)
+        self._complain(f"receiver {device} is gone: {reason_of(error)}")
+        self._release()
+        self._on_lost(device)
+        self._try_later()
+
+    def _release(self) -> None:
+        if self._port is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._port.fileno())
+        self._port.close()
+        self._port = None
+
+    def _try_later(self) -> None:
+        self._retry = asyncio.get_running_loop().call_later(self._delay_s, self._open)
+        self._delay_s = min(2.0 * self._delay_s, LONGEST_RETRY_S)
+
+    def _complain(self, text: str) -> None:
+        """Log a problem once, however often it is repeated."""
+        if text != self._last_complaint:
+            log.warning("%s; trying again until it works", text)
+            self._last_complaint = text

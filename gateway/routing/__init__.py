@@ -1,1 +1,0 @@
-"""Who gets which MAVLink frame: endpoints, clients, filters, rates, queues; no I/O."""

@@ -1,0 +1,159 @@
+"""A hub on the manual clock, its clients on loopback sockets, and some frames."""
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.records import Incoming, Outgoing
+from gateway.wire.mavlink_signing import Seal
+from gateway.wire.mavlink_splitter import message_id_of, restamp
+from tests.ports import free_port
+
+STATION = 190
+LIMIT_S = 60.0
+"""Until a test is given up: what it waits for takes a moment, on a busy machine some seconds."""
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.us = 0
+
+    def __call__(self) -> int:
+        return self.us
+
+
+class Sender:
+    """A MAVLink system that numbers its frames."""
+
+    def __init__(self, system: int, component: int, *, signed: bool = False) -> None:
+        self.link = dialect.MAVLink(None, system, component)
+        self.is_station = component == STATION
+        if signed:
+            self.link.signing.secret_key = bytes(32)
+            self.link.signing.link_id = 1
+            self.link.signing.timestamp = 1
+            self.link.signing.sign_outgoing = True
+
+    def pack(self, message: dialect.MAVLink_message) -> bytes:
+        frame = bytes(message.pack(self.link))
+        self.link.seq = (self.link.seq + 1) % 256
+        return frame
+
+    def heartbeat(self) -> bytes:
+        kind = dialect.MAV_TYPE_GCS if self.is_station else dialect.MAV_TYPE_FIXED_WING
+        return self.pack(dialect.MAVLink_heartbeat_message(kind, 0, 0, 0, 4, 3))
+
+    def attitude(self) -> bytes:
+        return self.pack(dialect.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0))
+
+    def raw_imu(self) -> bytes:
+        return self.pack(dialect.MAVLink_raw_imu_message(5, 1, 2, 3, 4, 5, 6, 7, 8, 9))
+
+    def home(self) -> bytes:
+        quaternion = [1, 0, 0, 0]
+        return self.pack(
+            dialect.MAVLink_home_position_message(1, 2, 3, 0, 0, 0, quaternion, 0, 0, 0)
+        )
+
+    def command(self, system: int, component: int) -> bytes:
+        return self.pack(
+            dialect.MAVLink_command_long_message(system, component, 512, 0, 1, 0, 0, 0, 0, 0, 0)
+        )
+
+
+class Station:
+    """A ground station's socket, read without blocking the loop."""
+
+    def __init__(self, target: int | None, kind: socket.SocketKind) -> None:
+        self.sender = Sender(255, STATION)
+        self.socket = socket.socket(socket.AF_INET, kind)
+        self.socket.setblocking(False)
+        self.port = free_port()
+        self.socket.bind(("127.0.0.1", self.port))
+        self.target = ("127.0.0.1", target) if target else None
+
+    async def receive(self) -> bytes:
+        async with asyncio.timeout(LIMIT_S):
+            return await asyncio.get_running_loop().sock_recv(self.socket, 65535)
+
+    def is_silent(self) -> bool:
+        try:
+            self.socket.recv(65535)
+        except BlockingIOError:
+            return True
+        return False
+
+    def say(self, data: bytes) -> None:
+        assert self.target
+        self.socket.sendto(data, self.target)
+
+
+class Rig:
+    """A hub, what came in, its vehicle, and the stations; all closed at the end."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.incoming: list[Incoming] = []
+        self.foreign: list[bytes] = []
+        self.vehicle = Sender(1, 1)
+        self.closing: list[Callable[[], object]] = []
+
+    def hub(
+        self,
+        *endpoints: str,
+        seal: Seal = restamp,
+        recordings: Path | None = None,
+        **settings: object,
+    ) -> Hub:
+        wanted = HubSettings(endpoints=endpoints, **settings)  # type: ignore[arg-type]
+        taps = (self.incoming.append, self.clock, self.foreign.append)
+        hub = Hub(wanted, *taps, seal=seal, recordings=recordings)
+        self.closing.append(hub.close)
+        hub.start()
+        return hub
+
+    def station(
+        self, target: int | None = None, kind: socket.SocketKind = socket.SOCK_DGRAM
+    ) -> Station:
+        station = Station(target, kind)
+        self.closing.append(station.socket.close)
+        return station
+
+    def sender(self, system: int, component: int = 1, *, signed: bool = False) -> Sender:
+        return Sender(system, component, signed=signed)
+
+    def out(self, frame: bytes, client_id: int | None = None) -> Outgoing:
+        return Outgoing(frame, message_id_of(frame), client_id)
+
+    def tick(self, hub: Hub) -> None:
+        """Let the hub do what it does a few times a second, now."""
+        assert hub._timer
+        hub._timer.cancel()
+        hub._tick()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(LIMIT_S):
+            while not condition():
+                await asyncio.sleep(0)
+
+    async def quiet(self) -> None:
+        """Let everything go where it goes: on loopback each step takes one turn of the loop."""
+        for _ in range(200):
+            await asyncio.sleep(0)
+
+    async def until_open(self, hub: Hub) -> None:
+        await self.until(lambda: all(client.state == "open" for client in hub.clients()))
+
+
+@pytest.fixture
+async def rig() -> AsyncIterator[Rig]:
+    rig = Rig()
+    yield rig
+    for close in rig.closing:
+        close()

@@ -1,0 +1,137 @@
+"""Listening sockets at the limit of file descriptors."""
+
+import asyncio
+import logging
+import os
+import resource
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from gateway.hub import accepting
+from gateway.hub.accepting import accept_each
+from gateway.live.control_socket import ControlServer
+from gateway.live.metrics_server import MetricsServer
+from tests.ports import free_port
+
+pytestmark = pytest.mark.io
+LIMIT_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", 0.001)
+
+
+@contextmanager
+def no_descriptors() -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest_free = os.dup(0)
+    os.close(lowest_free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not condition():
+            await asyncio.sleep(0.001)
+
+
+@pytest.fixture
+async def listening() -> AsyncIterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as sock:
+        sock.setblocking(False)
+        yield sock
+        if sock.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(sock)
+
+
+async def test_a_connection_waits_for_a_descriptor_and_both_ends_are_reported_once(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[socket.socket] = []
+    said: list[str] = []
+    tries: list[float] = []
+    loop = asyncio.get_running_loop()
+    call_later = loop.call_later
+
+    def counted(wait_s: float, *work: object) -> asyncio.TimerHandle:
+        if wait_s == accepting.ACCEPT_AGAIN_S:
+            tries.append(wait_s)
+        return call_later(wait_s, *work)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loop, "call_later", counted)
+    accept_each(
+        listening,
+        lambda connection, _: taken.append(connection),
+        lambda error: said.append("" if error is None else str(error.strerror)),
+    )
+    with socket.socket() as caller:
+        with no_descriptors():
+            caller.connect(listening.getsockname())
+            await until(lambda: len(tries) > 3)
+            assert said == ["Too many open files"]
+            assert taken == []
+        await until(lambda: bool(taken))
+    assert said == ["Too many open files", ""]
+    taken.pop().close()
+
+
+async def test_a_socket_that_is_closed_meanwhile_is_left_alone(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop, later = asyncio.get_running_loop(), list[Callable[[], None]]()
+    accept_each(listening, lambda *_: None, lambda _: None)
+    monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", -1.0)
+    call_later = loop.call_later
+    monkeypatch.setattr(
+        loop,
+        "call_later",
+        lambda wait_s, *work: later.append(*work) if wait_s < 0 else call_later(wait_s, *work),
+    )
+    with socket.socket() as caller, no_descriptors():
+        caller.connect(listening.getsockname())
+        await until(lambda: bool(later))
+    listening.close()
+    (watch,) = later
+    watch()
+
+
+async def test_metrics_keep_their_port_and_say_why_nobody_is_answered() -> None:
+    server = MetricsServer(lambda: iter(["text"]))
+    server.listen(free_port())
+    port, listening = server.port, list(server._sockets)
+    assert listening
+    with socket.socket() as caller:
+        with no_descriptors():
+            caller.connect(("127.0.0.1", port))
+            await until(lambda: server.listeners()[0].reason == "Too many open files")
+            assert server.listeners()[0].state == "closed"
+        await until(lambda: server.listeners()[0].clients == 1)
+        assert (server.listeners()[0].state, server._sockets) == ("open", listening)
+    server.close()
+
+
+async def test_the_control_socket_waits_and_logs_it_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = ControlServer(tmp_path / "run.sock")
+    await server.start()
+    with socket.socket(socket.AF_UNIX) as caller:
+        caller.setblocking(False)
+        with no_descriptors():
+            caller.connect(str(server.path))
+            await until(lambda: bool(caplog.records))
+        await asyncio.get_running_loop().sock_sendall(caller, b'{"verb":"verbs"}\n')
+        async with asyncio.timeout(LIMIT_S):
+            assert await asyncio.get_running_loop().sock_recv(caller, 4096)
+    server.close()
+    told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert told == ["control socket: Too many open files; it is tried again"]

@@ -1,0 +1,501 @@
+"""A site's endpoint, with real sessions and a real router in another process."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+import zenoh
+
+from gateway.edges.hub.fleet_link import zenoh_client, zenoh_session
+from gateway.edges.hub.fleet_link.site_keys import OWN
+from gateway.edges.hub.fleet_link.zenoh_session import (
+    AT_ONCE,
+    BYTES_AT_ONCE,
+    MAX_MESSAGE,
+    MAX_WAITING,
+    Inlet,
+    Reader,
+)
+from gateway.wire.mavlink_splitter import message_id_of
+from tests.hub.conftest import LIMIT_S, Rig
+from tests.ports import free_port
+
+pytestmark = pytest.mark.io
+
+ROUTER = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+# Whoever is linked with it waits for ever for a router that has stalled.
+config.insert_json5("transport/link/tx/lease", "3600000")
+session = zenoh.open(config)
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+PATIENT = """{
+  scouting: {multicast: {enabled: false}, gossip: {enabled: false}},
+  transport: {link: {tx: {queue: {congestion_control: {block: {wait_before_close: 3600000000}}}}}},
+}"""
+"""Lets Zenoh wait an hour for a stalled link: whoever waits for it exceeds any limit of a test."""
+
+
+class Router:
+    """A router as a process that can be killed, stopped and started again at the same place."""
+
+    def __init__(self) -> None:
+        self.place = f"tcp/127.0.0.1:{free_port()}"
+        self.process: subprocess.Popen[str] | None = None
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", ROUTER, self.place],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "open\n"
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None
+
+    def signal(self, number: signal.Signals) -> None:
+        assert self.process is not None
+        self.process.send_signal(number)
+
+
+@pytest.fixture
+def router() -> Iterator[Router]:
+    router = Router()
+    yield router
+    router.kill()
+
+
+class Far:
+    """Somebody else at the router, who notes what comes."""
+
+    def __init__(self, place: str, *keys: str) -> None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([place]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+        self.got: list[tuple[str, bytes]] = []
+        self.marks: dict[str, set[bytes | None]] = defaultdict(set)
+        """What was attached, by key."""
+        self._subscribers = [self.session.declare_subscriber(key, self._note) for key in keys]
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        key, mark = str(sample.key_expr), sample.attachment
+        self.got.append((key, sample.payload.to_bytes()))
+        self.marks[key].add(mark and mark.to_bytes())
+
+    def messages(self, message_id: int) -> list[bytes]:
+        return [data for _, data in self.got if message_id_of(data) == message_id]
+
+
+@pytest.fixture
+def visit(router: Router) -> Iterator[Callable[..., Far]]:
+    visitors: list[Far] = []
+
+    def make(*keys: str) -> Far:
+        visitors.append(Far(router.place, *keys))
+        return visitors[-1]
+
+    yield make
+    for visitor in visitors:
+        visitor.session.close()
+
+
+@pytest.fixture
+def patient(tmp_path: Path) -> Path:
+    """A configuration by which Zenoh never gives a stalled link up."""
+    file = tmp_path / "patient.json5"
+    file.write_text(PATIENT)
+    return file
+
+
+async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
+    """Let the hub tick until something holds: Zenoh's own threads take their time."""
+    async with asyncio.timeout(LIMIT_S):
+        while not condition():
+            rig.clock.us += 100_000
+            rig.tick(hub)
+            await asyncio.sleep(0.01)
+
+
+async def open_site(rig: Rig, router: Router, options: str = "site=field") -> Any:
+    hub = rig.hub(f"zenoh:{router.place}?{options}")
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    await until(rig, hub, lambda: hub.clients()[0].state == "open")
+    return hub
+
+
+async def until_heard(rig: Rig, hub: Any, far: Far) -> None:
+    """Publish until the subscription has reached the site."""
+
+    def said() -> bool:
+        hub.send(rig.out(rig.vehicle.attitude()))
+        return bool(far.got)
+
+    await until(rig, hub, said)
+
+
+class TestSite:
+    async def test_both_ways(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
+        hub = await open_site(rig, router)
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        assert far.got[0][0] == "mavlink/field/1/out"
+        said = rig.sender(255, 190).command(1, 1)
+        far.session.put("mavlink/field/1/in", said)
+        await until(rig, hub, lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].trusted
+        far.session.put("mavlink/field/1/in", b"no MAVLink")
+        await until(rig, hub, lambda: hub.clients()[0].bytes_garbage == 10)
+        far.session.put("mavlink/other/1/in", said)
+        far.session.put("mavlink/field/1/in", rig.sender(255, 190).heartbeat())
+        await until(rig, hub, lambda: hub.clients()[0].received == 2)
+
+    async def test_an_autopilot_behind_it_has_keys_of_its_own_and_no_mark(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router)
+        hub.add("udp-listen:127.0.0.1:0?trusted=yes")
+        station = rig.station(hub.listening_ports()[0])
+        far = visit("mavlink/field/*/out")
+        autopilot = rig.sender(7)
+
+        def heard() -> bool:
+            station.say(autopilot.heartbeat())
+            hub.send(rig.out(rig.vehicle.command(1, 1)))
+            hub.send(rig.out(rig.vehicle.heartbeat()))
+            return far.marks.keys() >= {"mavlink/field/7/out"} and bool(far.messages(76))
+
+        await until(rig, hub, heard)
+        assert far.marks == {"mavlink/field/7/out": {None}, "mavlink/field/1/out": {OWN}}
+
+    async def test_filters_rates_and_packing(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        await until(rig, hub, lambda: not hub._clients[1]._is_gathering)
+        for _ in range(5):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.attitude()))
+        size = len(rig.vehicle.attitude())
+        await until(rig, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
+        assert not far.messages(27)
+
+    async def test_a_burst_arrives_whole_and_in_order(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        """Telemetry gives way on a congested link, never on an idle one."""
+        hub = await open_site(rig, router)
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        burst = [rig.vehicle.raw_imu() for _ in range(200)]
+        for frame in burst:
+            hub.send(rig.out(frame))
+        await until(rig, hub, lambda: far.messages(27)[-1:] == burst[-1:])
+        assert far.messages(27) == burst
+
+    async def test_untrusted(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
+        hub = await open_site(rig, router, "site=field&trusted=no")
+        far = visit()
+        far.session.put("mavlink/field/1/in", rig.sender(255, 190).command(1, 1))
+        await until(rig, hub, lambda: bool(rig.incoming))
+        assert not rig.incoming[0].trusted
+
+    async def test_the_keys_of_mavlink_server(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router, "keys=mavlink_raw")
+        far = visit("mavlink_raw/out")
+        await until_heard(rig, hub, far)
+        assert far.marks == {"mavlink_raw/out": {None}}
+        far.session.put("mavlink_raw/in", rig.sender(255, 190).command(1, 1))
+        await until(rig, hub, lambda: bool(rig.incoming))
+
+
+class TestTrouble:
+    async def test_the_router_goes_and_comes_back(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router)
+        hub.add("udp-listen:127.0.0.1:0")
+        far = visit("mavlink/field/*/out")
+        await until_heard(rig, hub, far)
+        router.kill()
+        await until(rig, hub, lambda: hub.clients()[0].state == "connecting")
+        dropped, before = hub.clients()[0].dropped, len(far.messages(27))
+        for _ in range(500):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.command(1, 1)))
+        assert hub.clients()[0].dropped == dropped + 1000
+        assert hub.clients()[0].queued == 0
+        router.start()
+        await until(rig, hub, lambda: hub.clients()[0].state == "open")
+        heard = len(far.got)
+        await until(rig, hub, lambda: said_again(rig, hub, far, heard))
+        assert len(far.messages(27)) == before, "what was old is not delivered as new"
+        assert not far.messages(76)
+        numbers = [data[4] for data in far.messages(30)]
+        assert len(set(numbers)) == len(numbers), "no frame twice"
+
+    async def test_no_router_yet(self, rig: Rig) -> None:
+        place = f"tcp/127.0.0.1:{free_port()}"
+        hub = rig.hub(f"zenoh:{place}?site=field")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert hub.clients()[0].reason == f"no router answers at {place}"
+
+    def test_where_certificates_are_used_they_may_be_the_reason(self) -> None:
+        error = zenoh.ZError("Unable to connect to any of [Single(tls/h:1)]!  at /x/y.rs:4.")
+        text = "no router answers at tls/h:1, or a certificate does not fit"
+        assert zenoh_session._words(error) == text
+
+    @pytest.mark.parametrize("name", zenoh_session.TLS_FILES)
+    async def test_a_certificate_that_is_not_there_is_named(
+        self, rig: Rig, tmp_path: Path, name: str
+    ) -> None:
+        file, missing = tmp_path / "zenoh.json5", tmp_path / "missing.pem"
+        file.write_text(json.dumps({"transport": {"link": {"tls": {name: str(missing)}}}}))
+        hub = rig.hub(f"zenoh:tls/127.0.0.1:7447?site=field&config={file}")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert hub.clients()[0].reason == f"{name} {missing}: No such file or directory"
+
+    async def test_a_router_that_stalls_holds_nobody_up(
+        self, rig: Rig, router: Router, patient: Path
+    ) -> None:
+        hub = await open_site(rig, router, f"site=field&config={patient}")
+        hub.add("udp-listen:127.0.0.1:0")
+        station = rig.station(hub.listening_ports()[0])
+        station.say(station.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 2)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        while not station.is_silent():
+            pass
+        # Blocking reads: the loop does nothing meanwhile.
+        station.socket.settimeout(LIMIT_S)
+        router.signal(signal.SIGSTOP)
+        for _ in range(5000):
+            for frame in (rig.vehicle.raw_imu(), rig.vehicle.command(1, 1)):
+                hub.send(rig.out(frame))
+                assert station.socket.recv(65535) == frame, "a local client has it at once"
+        fleet, local = hub.clients()
+        assert fleet.queued <= zenoh_session.MAX_PATIENT
+        assert fleet.dropped > 0
+        assert local.dropped == 0
+        router.signal(signal.SIGCONT)
+
+    async def test_two_sites_of_one_name_are_shown_on_both(self, rig: Rig, router: Router) -> None:
+        first, second = [await open_site(rig, router) for _ in range(2)]
+        for hub in (first, second):
+            await until(rig, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023
+        second.close()
+        await until(rig, first, lambda: first.clients()[0].reason == "")
+
+    async def test_without_zenoh_it_says_what_is_missing(
+        self, rig: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "zenoh", None)
+        hub = rig.hub("zenoh:tcp/127.0.0.1:7447?site=field")
+        await until(rig, hub, lambda: bool(hub.clients()[0].reason))
+        missing = "the extra mavgate[fleet] is not installed: see mavgate doctor"
+        assert hub.clients()[0].reason == missing
+
+    async def test_a_file_that_is_none(self, rig: Rig, tmp_path: Path) -> None:
+        file = tmp_path / "zenoh.json5"
+        file.write_text("{")
+        hub = rig.hub(f"zenoh:tcp/127.0.0.1:7447?site=field&config={file}")
+        await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
+        assert "zenoh" in hub.clients()[0].reason
+
+
+def said_again(rig: Rig, hub: Any, far: Far, heard: int) -> bool:
+    hub.send(rig.out(rig.vehicle.attitude()))
+    return len(far.got) > heard
+
+
+class TestInlet:
+    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest(self) -> None:
+        taken: list[int] = []
+        inlet = Inlet(taken.append)
+        for n in range(MAX_WAITING + 10):
+            inlet.put(n)
+        most = 0
+        while len(taken) < MAX_WAITING:
+            before = len(taken)
+            await asyncio.sleep(0)
+            most = max(most, len(taken) - before)
+        assert taken == list(range(10, MAX_WAITING + 10))
+        assert inlet.dropped == 10
+        assert most <= 2 * AT_ONCE
+        inlet.close()
+        inlet.put(0)
+        await asyncio.sleep(0)
+        assert len(taken) == MAX_WAITING
+
+    async def test_what_costs_more_is_taken_in_more_turns(self) -> None:
+        taken: list[int] = []
+        inlet = Inlet(taken.append, lambda _: 0.5)
+        for n in range(8):
+            inlet.put(n)
+        for turn in range(1, 5):
+            await asyncio.sleep(0)
+            assert taken == list(range(2 * turn))
+
+    async def test_in_a_pause_nothing_is_taken_and_nothing_is_lost(self) -> None:
+        pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
+        inlet = Inlet(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
+        inlet.put(0)
+        async with asyncio.timeout(LIMIT_S):
+            await done.wait()
+        assert not pauses_s
+
+
+class TestFlood:
+    """A site takes no more from its fleet at a time than from any other client."""
+
+    @pytest.mark.parametrize("trusted", ["yes", "no"])
+    async def test_of_one_message_only_the_beginning_is_taken(self, rig: Rig, trusted: str) -> None:
+        hub = rig.hub(f"zenoh:tcp/127.0.0.1:1?site=field&trusted={trusted}")
+        client = hub._clients[1]
+        beat = rig.sender(255, 190).heartbeat()
+        sample = MagicMock(payload=zenoh.ZBytes(beat * 1000))
+        before = hub.strangers.level
+        client._take(zenoh_session.frames_of(sample))
+        assert client.counters.received == MAX_MESSAGE // len(beat)
+        assert client.counters.bytes_garbage == MAX_MESSAGE % len(beat)
+        assert before - hub.strangers.level == (MAX_MESSAGE if trusted == "no" else 0)
+
+    def test_large_messages_are_taken_one_a_turn(self) -> None:
+        assert zenoh_client._cost(bytes(MAX_MESSAGE)) >= 1.0
+        assert zenoh_client._cost(b"") == 1 / AT_ONCE
+
+
+class TestReader:
+    async def test_large_messages_are_taken_a_few_a_turn(self) -> None:
+        waiting = [MagicMock(payload=bytes(1_000_000)) for _ in range(100)]
+        subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
+        subscriber.__iter__.return_value = iter(())
+        session = MagicMock(declare_subscriber=lambda *_: subscriber)
+        taken: list[Any] = []
+        Reader(session, "flood", taken.append)._drain()
+        assert len(taken) == BYTES_AT_ONCE // MAX_MESSAGE
+
+    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest_telemetry_of_all_alike(
+        self, router: Router, visit: Callable[..., Far], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(zenoh_session, "MAX_WAITING", 100)
+        monkeypatch.setattr(zenoh_session, "AT_ONCE", 10)
+        far, near = visit(), visit()
+        taken: list[tuple[str, bytes]] = []
+        all_sent = threading.Event()
+        reader = Reader(
+            near.session,
+            "flood/*",
+            lambda sample: taken.append((str(sample.key_expr), sample.payload.to_bytes())),
+        )
+        end = near.session.declare_subscriber("end", lambda _: all_sent.set())
+        async with asyncio.timeout(LIMIT_S):
+            while not taken:
+                far.session.put("flood/a", b"begin")
+                await asyncio.sleep(0.01)
+            far.session.put("flood/a", b"last")
+            while taken[-1][1] != b"last":
+                await asyncio.sleep(0.01)
+        high = zenoh.Priority.INTERACTIVE_HIGH
+        for number in range(3):
+            far.session.put("flood/a", b"%d" % number, priority=high)
+        for number in range(80):
+            for site in "ab":
+                far.session.put(f"flood/{site}", b"%d" % number)
+        far.session.put("end", b"")
+        assert all_sent.wait(LIMIT_S), "the loop stands still meanwhile"
+        del taken[:]
+        most = 0
+        while len(taken) < 103:
+            before = len(taken)
+            await asyncio.sleep(0)
+            most = max(most, len(taken) - before)
+        assert taken[:3] == [("flood/a", b"%d" % number) for number in range(3)]
+        newest = [(f"flood/{site}", b"%d" % number) for number in range(30, 80) for site in "ab"]
+        assert taken[3:] == newest
+        assert reader.dropped == 60
+        assert most <= 3 + 2 * 10
+        end.undeclare()
+        reader.close()
+        reader.undeclare()
+
+
+SITE = """
+import asyncio, sys
+from gateway.cli.__main__ import _leave_what_hangs
+from gateway.clock import GatewayClock
+from gateway.edges.hub.fleet_link import zenoh_session
+from gateway.hub.hub import Hub
+from gateway.records import Outgoing
+from gateway.hub.settings import HubSettings
+from tests.hub.conftest import Sender, dialect
+
+# As patient as the session's configuration.
+zenoh_session.GIVE_UP_S = 3600.0
+
+async def main():
+    hub = Hub(HubSettings(endpoints=(f"zenoh:{sys.argv[1]}?{sys.argv[2]}",)), print, GatewayClock())
+    hub.start()
+    while hub.clients()[0].state != "open":
+        await asyncio.sleep(0.01)
+    print("open", flush=True)
+    piece = dialect.MAVLink_file_transfer_protocol_message(0, 0, 0, [1] * 251)
+    if sys.stdin.readline() == "fill\\n":
+        while hub.clients()[0].queued < zenoh_session.MAX_PATIENT:
+            hub.send(Outgoing(Sender(1, 1).pack(piece), piece.get_msgId(), None))
+            await asyncio.sleep(0)
+    hub.close()
+
+try:
+    asyncio.run(main())
+    raise SystemExit(7)
+finally:
+    _leave_what_hangs()
+"""
+
+
+@pytest.mark.parametrize("stalls", [False, True])
+def test_a_process_ends_soon_when_its_session_is_closed(
+    router: Router, patient: Path, *, stalls: bool
+) -> None:
+    """Zenoh may wait for a stalled link, Python for threads and for what is still declared."""
+    words = [sys.executable, "-c", SITE, router.place, f"site=field&config={patient}"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as site:
+        assert site.stdin is not None
+        assert site.stdout is not None
+        assert site.stdout.readline() == "open\n"
+        if stalls:
+            router.signal(signal.SIGSTOP)
+        try:
+            site.communicate("fill\n" if stalls else "end\n", timeout=LIMIT_S)
+        finally:
+            site.kill()
+        assert site.returncode == 7

@@ -1,0 +1,77 @@
+"""Broadcast and multicast on the loopback interface."""
+
+import asyncio
+import socket
+import struct
+from typing import Any
+
+import pytest
+
+from tests.hub.conftest import LIMIT_S
+
+pytestmark = pytest.mark.io
+
+GROUP = "239.255.145.50"
+
+
+def member(rig: Any) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    rig.closing.append(sock.close)
+    sock.setblocking(False)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    sock.bind((GROUP, 0))
+    sock.setsockopt(
+        socket.IPPROTO_IP,
+        socket.IP_ADD_MEMBERSHIP,
+        struct.pack("=4s4s", socket.inet_aton(GROUP), socket.inet_aton(source_address())),
+    )
+    return sock
+
+
+def source_address() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((GROUP, 1))
+        except OSError:
+            pytest.skip("this machine has no route to multicast groups")
+        return str(probe.getsockname()[0])
+
+
+async def receive(sock: socket.socket) -> tuple[bytes, tuple[str, int]]:
+    return await asyncio.wait_for(asyncio.get_running_loop().sock_recvfrom(sock, 4096), LIMIT_S)
+
+
+async def test_multicast_both_ways_and_nothing_comes_back(rig: Any) -> None:
+    listener = member(rig)
+    port = listener.getsockname()[1]
+    hub = rig.hub(f"udp-multicast:{GROUP}:{port}")
+    await rig.until_open(hub)
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame))
+    data, sender = await receive(listener)
+    assert data == frame
+    answer, said = rig.sender(255, 190), []
+    for target in ((GROUP, port), sender):
+        said.append(answer.heartbeat())
+        listener.sendto(said[-1], target)
+    await rig.until(lambda: len(rig.incoming) == 2)
+    assert [incoming.frame for incoming in rig.incoming] == said
+    (client,) = hub.clients()
+    assert (client.received, client.trusted) == (2, False)
+
+
+async def test_broadcast_and_unicast_answers(rig: Any) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.setblocking(False)
+        listener.bind(("127.255.255.255", 0))
+        hub = rig.hub(f"udp-broadcast:127.255.255.255:{listener.getsockname()[1]}")
+        await rig.until_open(hub)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        data, sender = await receive(listener)
+        assert data == frame
+    station = rig.station(sender[1])
+    said = station.sender.heartbeat()
+    station.say(said)
+    await rig.until(lambda: bool(rig.incoming))
+    assert rig.incoming[0].frame == said

@@ -1,0 +1,418 @@
+"""The hub between many endpoints: routing, loops, changes at run time, round trips."""
+
+import itertools
+import os
+import resource
+import socket
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.hub import accepting
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+async def world(rig: Any) -> Any:
+    """One listening port; an autopilot, a station on each of two further clients."""
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    port = hub.listening_ports()[0]
+    rig.autopilot, rig.first, rig.second = (rig.station(port) for _ in range(3))
+    rig.autopilot.sender = rig.sender(42, 1)
+    rig.second.sender = rig.sender(254, 190)
+    rig.world = hub
+    for station in (rig.first, rig.second, rig.autopilot):
+        before = len(rig.incoming)
+        station.say(station.sender.heartbeat())
+        await rig.until(lambda count=before: len(rig.incoming) > count)
+    for station in (rig.first, rig.second):
+        assert (await station.receive())[5] == 42
+    assert rig.autopilot.is_silent()
+    return rig
+
+
+async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -> None:
+    signed = world.sender(42, 1, signed=True)
+    for frame in (world.autopilot.sender.attitude(), signed.attitude()):
+        world.autopilot.say(frame)
+        assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+        assert world.foreign[-1] == frame
+
+
+async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
+    count = len(world.incoming)
+    request = world.first.sender.command(42, 1)
+    world.first.say(request)
+    assert await world.autopilot.receive() == request
+    answer = world.autopilot.sender.command(255, 190)
+    world.autopilot.say(answer)
+    assert await world.first.receive() == answer
+    assert world.second.is_silent()
+    assert len(world.incoming) == count
+
+
+async def test_a_request_to_us_stays_here(world: Any) -> None:
+    request = world.first.sender.command(1, 1)
+    world.first.say(request)
+    await world.until(lambda: world.incoming[-1].frame == request)
+    assert world.autopilot.is_silent()
+
+
+async def test_a_request_to_nobody_goes_nowhere(world: Any) -> None:
+    world.first.say(world.first.sender.command(99, 1))
+    await world.until(lambda: world.world.counters().unroutable == 1)
+    assert world.autopilot.is_silent()
+
+
+async def test_what_a_station_says_to_all_reaches_vehicles_only(world: Any) -> None:
+    said = world.first.sender.heartbeat()
+    world.first.say(said)
+    assert await world.autopilot.receive() == said
+    assert world.second.is_silent()
+
+
+async def test_copies_and_echoes_are_dropped(world: Any) -> None:
+    hub = world.world
+    echo = world.autopilot.sender.attitude()
+    world.second.say(echo)
+    assert [await world.first.receive(), await world.autopilot.receive()] == [echo, echo]
+    frame = world.autopilot.sender.attitude()
+    world.autopilot.say(frame)
+    assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+    world.second.say(frame)
+    await world.until(lambda: hub.counters().duplicates == 1)
+    assert world.first.is_silent()
+    ours = world.vehicle.attitude()
+    world.first.say(ours)
+    await world.until(lambda: hub.counters().looped == 1)
+    assert world.second.is_silent()
+    assert world.incoming[-1].frame != ours
+
+
+async def test_a_program_started_again_and_again_is_heard_at_its_first_word(world: Any) -> None:
+    port = world.world.listening_ports()[0]
+    for _ in range(4):
+        again = world.station(port)
+        request = again.sender.command(42, 1)
+        again.say(request)
+        assert await world.autopilot.receive() == request
+        again.socket.close()
+        world.clock.us += 100_000
+    assert world.world.counters().duplicates == 0
+
+
+async def test_a_copy_goes_round_a_loop_once_at_most(world: Any) -> None:
+    """Whoever echoes from the start is heard as a second way; then its echoes end here."""
+    port = world.world.listening_ports()[0]
+    echo = world.station(port)
+    said = [world.autopilot.sender.attitude() for _ in range(5)]
+    world.autopilot.say(said[0])
+    assert await world.first.receive() == said[0]
+    world.clock.us += 1000
+    echo.say(said[0])
+    assert [await world.first.receive(), await world.autopilot.receive()] == [said[0], said[0]]
+    for count, frame in enumerate(said[1:], start=1):
+        world.clock.us += 1000
+        world.autopilot.say(frame)
+        assert [await world.first.receive(), await echo.receive()] == [frame, frame]
+        echo.say(frame)
+        await world.until(lambda count=count: world.world.counters().duplicates == count)
+    assert world.first.is_silent()
+
+
+async def test_nothing_runs_round_a_ring(rig: Any) -> None:
+    """Two hubs joined by two cables; a vehicle of its own behind each, and both ask for trips."""
+    first = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0", ping_interval_s=1.0)
+    here, there = first.listening_ports()
+    cables = (f"udp:127.0.0.1:{here}", f"udp:127.0.0.2:{there}")
+    second = rig.hub("udp-listen:127.0.0.1:0", *cables)
+    await rig.until_open(second)
+    autopilot = rig.station(second.listening_ports()[0])
+    autopilot.sender = rig.sender(42, 1)
+
+    def counted() -> tuple[int, int, int]:
+        here, there = first.counters(), second.counters()
+        return here.looped, here.forwarded, there.forwarded
+
+    counts = []
+    for turn in range(6):
+        before = counted()
+        rig.clock.us += 1_000_000
+        autopilot.say(autopilot.sender.heartbeat())
+        first.send(rig.out(rig.vehicle.heartbeat()))
+        for _ in range(10):
+            autopilot.say(autopilot.sender.attitude())
+            first.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(first)
+        if turn > 2:
+            await rig.until(lambda: all(np.subtract(counted(), before) >= (11, 11, 22)))  # noqa: B023
+        await rig.quiet()
+        found = first.counters(), second.counters()
+        counts.append(counted())
+    await rig.quiet()
+    assert [first.counters(), second.counters()] == [*found]
+    # Before both cables have been heard, copies may pass.
+    for before, after in itertools.pairwise(counts[2:]):
+        looped, passed_here, passed_there = np.subtract(after, before)
+        assert looped == 11, "each of ours comes back by the other cable, once, and ends"
+        assert (passed_here, passed_there) == (11, 22), "each of the others' passes a hub once"
+
+
+async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> None:
+    echo, other = rig.station(), rig.station()
+    hub = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
+    await rig.until_open(hub)
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame))
+    assert [await echo.receive(), await other.receive()] == [frame, frame]
+    echo.socket.sendto(frame, ("127.0.0.1", hub._clients[1]._port))
+    await rig.until(lambda: hub.counters().looped == 1)
+    assert other.is_silent()
+
+
+async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
+    trusted = rig.station()
+    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
+    await rig.until_open(hub)
+    stranger = rig.station(hub.listening_ports()[0])
+    stranger.sender = rig.sender(42, 1)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    assert await trusted.receive()
+    for frame in (stranger.sender.heartbeat(), stranger.sender.command(1, 1)):
+        stranger.say(frame)
+        await rig.until(lambda frame=frame: [i.frame for i in rig.incoming][-1:] == [frame])
+        assert not rig.incoming[-1].trusted
+    stranger.say(stranger.sender.command(255, 190))
+    await rig.until(lambda: hub.counters().unroutable == 1)
+    assert trusted.is_silent()
+    assert rig.foreign == []
+
+
+async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=5.0)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 1)
+    rig.clock.us = 5_000_000
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    assert (await station.receive())[7] == 0
+    assert (await station.receive())[7] == 0
+    reader = dialect.MAVLink(None)
+    ping, sync = [reader.parse_buffer(await station.receive())[0] for _ in range(2)]
+    rig.clock.us += 1_500
+    asker = (ping.get_srcSystem(), ping.get_srcComponent())
+    station.say(station.sender.pack(dialect.MAVLink_ping_message(ping.time_usec, ping.seq, *asker)))
+    await rig.until(lambda: hub.clients()[0].round_trip_us == 1_500)
+    rig.clock.us += 500
+    station.say(station.sender.pack(dialect.MAVLink_timesync_message(77, sync.ts1)))
+    await rig.until(lambda: hub.clients()[0].round_trip_us == 2_000)
+    assert len(rig.incoming) == 1
+
+
+class TestChangesAtRunTime:
+    async def test_add_and_remove(self, rig: Any) -> None:
+        hub, station = rig.hub(), rig.station()
+        hub.add(f"udp:127.0.0.1:{station.port}?name=tablet")
+        await rig.until_open(hub)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await station.receive() == frame
+        with pytest.raises(ValueError, match="there already"):
+            hub.add(f"udp:127.0.0.1:{station.port}")
+        hub.remove("tablet")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients() == ()
+        assert station.is_silent()
+        with pytest.raises(ValueError, match="tablet"):
+            hub.remove("tablet")
+
+    async def test_reload_drops_nobody_who_stays(self, rig: Any) -> None:
+        stays, goes, comes = (rig.station() for _ in range(3))
+        hub = rig.hub(
+            "udp-listen:127.0.0.1:0",
+            f"udp:127.0.0.1:{stays.port}",
+            f"udp:127.0.0.1:{goes.port}",
+        )
+        caller = rig.station(hub.listening_ports()[0])
+        caller.say(caller.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 3)
+        await rig.until_open(hub)
+        before = {client.remote: client.client_id for client in hub.clients()}
+        hub.apply(
+            msgspec.structs.replace(
+                hub.settings,
+                endpoints=(
+                    "udp-listen:127.0.0.1:0?deny=RAW_IMU",
+                    f"udp:127.0.0.1:{stays.port}?name=laptop&deny=ATTITUDE",
+                    f"udp:127.0.0.1:{comes.port}",
+                ),
+            )
+        )
+        await rig.until_open(hub)
+        after = {client.remote: client.client_id for client in hub.clients()}
+        assert {remote: after.get(remote) for remote in before} == before | {
+            f"127.0.0.1:{goes.port}": None
+        }
+        heard = {}
+        frames = [rig.vehicle.raw_imu(), rig.vehicle.attitude()]
+        for frame in frames:
+            hub.send(rig.out(frame))
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        for name, station in (("stays", stays), ("comes", comes), ("caller", caller)):
+            heard[name] = []
+            while message_id := (await station.receive())[7]:
+                heard[name].append(message_id)
+        assert heard == {"stays": [27], "comes": [27, 30], "caller": [30]}
+        assert goes.is_silent()
+        assert "laptop" in {client.name for client in hub.clients()}
+
+    async def test_what_was_added_by_hand_survives_a_reload(self, rig: Any) -> None:
+        hub, station = rig.hub(), rig.station()
+        hub.add(f"udp:127.0.0.1:{station.port}")
+        hub.apply(hub.settings)
+        assert len(hub.endpoints()) == 1
+
+
+class TestExpress:
+    """Telemetry that comes often takes a short way; nobody may notice."""
+
+    async def test_counts_are_right_and_everybody_gets_all(self, world: Any) -> None:
+        hub = world.world
+        frames = [world.autopilot.sender.attitude() for _ in range(50)]
+        for frame in frames:
+            world.autopilot.say(frame)
+            assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
+        assert hub.counters().forwarded == 50 + 3
+        by_remote = {client.remote: client for client in hub.clients()}
+        first = by_remote[f"127.0.0.1:{world.first.port}"]
+        assert (first.sent, first.dropped) == (51, 0)
+        assert by_remote[f"127.0.0.1:{world.autopilot.port}"].received == 51
+        assert world.foreign[-50:] == frames
+
+    async def test_a_refusal_on_the_way_is_counted_and_hurts_nobody(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert [(await s.receive())[7] for s in (world.first, world.second)] == [30, 30]
+        world.second.socket.close()
+        for _ in range(20):
+            frame = world.autopilot.sender.attitude()
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+        by_remote = {client.remote: client for client in hub.clients()}
+        gone = by_remote[f"127.0.0.1:{world.second.port}"]
+        assert gone.state == "refused"
+        assert gone.sent + gone.dropped + gone.unheard == 22
+        assert by_remote[f"127.0.0.1:{world.first.port}"].dropped == 0
+
+    async def test_changes_hold_from_the_next_frame_on(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        late = world.station()
+        hub.add(f"udp:127.0.0.1:{late.port}?deny=RAW_IMU")
+        await world.until_open(hub)
+        for frame in (world.autopilot.sender.raw_imu(), world.autopilot.sender.attitude()):
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+        assert (await late.receive())[7] == 30
+        hub.reconfigure(hub._clients[hub.clients()[-1].client_id])
+        hub.remove(f"udp:127.0.0.1:{late.port}")
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        assert late.is_silent()
+
+    async def test_a_second_way_ends_it(self, world: Any) -> None:
+        hub = world.world
+        world.autopilot.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        other = world.station(hub.listening_ports()[0])
+        other.say(world.autopilot.sender.attitude())
+        assert (await world.first.receive())[7] == 30
+        for _ in range(5):
+            frame = world.autopilot.sender.attitude()
+            world.autopilot.say(frame)
+            assert await world.first.receive() == frame
+            other.say(frame)
+        await world.until(lambda: hub.counters().duplicates == 5)
+        assert world.first.is_silent()
+
+
+class TestListeningPorts:
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_taken_port_is_shown_and_opens_when_it_is_free(
+        self, rig: Any, kind: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        taken = rig.station(kind=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        if kind == "tcp":
+            taken.socket.listen()
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:{taken.port}?name=here")
+        for tick in range(4):
+            rig.clock.us = tick * 2_000_000
+            rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("closed", "Address already in use", 0)
+        assert caplog.text.count("Address already in use; trying again") == 1
+        taken.socket.close()
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        (port,) = hub.listeners()
+        assert (port.state, port.reason, port.port) == ("open", "", taken.port)
+
+    async def test_clients_without_room_are_counted(self, rig: Any) -> None:
+        hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=1)
+        for turned_away in (0, 1, 2):
+            caller = rig.station(hub.listening_ports()[0])
+            caller.say(caller.sender.heartbeat())
+            await rig.until(lambda n=turned_away: hub.listeners()[0].turned_away == n)
+            await rig.until(lambda: hub.listeners()[0].clients == 1)
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", 0.001)
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        (place,) = hub.listening_ports()
+        caller = rig.station(place, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(os.dup(0), soft), hard))
+        try:
+            if kind == "tcp":
+                caller.socket.connect_ex(caller.target)
+            else:
+                caller.say(caller.sender.heartbeat())
+            await rig.until(lambda: hub.listeners()[0].reason == "Too many open files")
+            rig.tick(hub)
+            assert hub.listeners()[0].reason == "Too many open files", "no tick hides it"
+            assert hub.clients() == ()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        if kind == "udp":
+            caller.say(caller.sender.heartbeat())
+        await rig.until(lambda: len(hub.clients()) == 1)
+        assert hub.listeners()[0].state == "open"
+
+
+async def test_reports_and_round_trips_take_turns(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them takes as long as several frames."""
+    hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=1.0)
+    done: list[tuple[str, int]] = []
+    for name in ("_report_trouble", "_ask_round_trips"):
+        monkeypatch.setattr(hub, name, lambda now_us, name=name: done.append((name, now_us)))
+    for _ in range(40):
+        rig.clock.us += 250_000
+        rig.tick(hub)
+    moments = [now_us for _, now_us in done]
+    assert len(set(moments)) == len(moments)
+    for name in ("_report_trouble", "_ask_round_trips"):
+        assert sum(1 for named, _ in done if named == name) >= 9

@@ -1,0 +1,139 @@
+"""Much at once: over how many turns of the loop it goes, and in which order."""
+
+import asyncio
+import itertools
+import socket
+from typing import Any
+
+import pytest
+
+from gateway.hub.hub import LEAST_READ_BYTES, MAX_WAITING, SENDS_AT_ONCE
+from gateway.hub.transports.base import READ_BYTES
+from gateway.records import Incoming
+
+pytestmark = pytest.mark.io
+
+STATIONS = 4
+FRAMES_A_TURN = SENDS_AT_ONCE // STATIONS
+
+
+@pytest.fixture
+async def crowd(rig: Any) -> Any:
+    """Some stations that hear every frame."""
+    rig.stations = [rig.station() for _ in range(STATIONS)]
+    rig.world = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in rig.stations))
+    await rig.until_open(rig.world)
+    return rig
+
+
+def burst(rig: Any, count: int) -> list[bytes]:
+    return [rig.vehicle.attitude() for _ in range(count)]
+
+
+async def test_a_burst_goes_in_its_order_a_few_frames_a_turn(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 3 * FRAMES_A_TURN + 1)
+    sent = []
+    hub.send_all(map(crowd.out, frames))
+    while not sent or sent[-1] < len(frames):
+        sent.append(hub.counters().published)
+        await asyncio.sleep(0)
+    assert sent == [FRAMES_A_TURN, 2 * FRAMES_A_TURN, 3 * FRAMES_A_TURN, len(frames)]
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_answers_to_one_client_are_counted_once(crowd: Any) -> None:
+    hub, asker = crowd.world, crowd.world.clients()[0].client_id
+    hub.send_all(crowd.out(frame, asker) for frame in burst(crowd, SENDS_AT_ONCE + 1))
+    assert hub.counters().published == SENDS_AT_ONCE
+    await asyncio.sleep(0)
+    assert hub.counters().published == SENDS_AT_ONCE + 1
+
+
+async def test_what_comes_behind_a_burst_does_not_overtake_it(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 2 * FRAMES_A_TURN)
+    hub.send_all(map(crowd.out, frames[:-1]))
+    hub.send_all([crowd.out(frames[-1])])
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_a_loop_that_is_too_slow_holds_no_more_than_so_many(crowd: Any) -> None:
+    hub = crowd.world
+    hub.send_all(map(crowd.out, burst(crowd, 2 * MAX_WAITING)))
+    assert hub.counters().published == MAX_WAITING
+
+
+async def test_a_burst_ends_before_the_hub_closes(crowd: Any) -> None:
+    hub, frames = crowd.world, burst(crowd, 2 * FRAMES_A_TURN)
+    hub.send_all(map(crowd.out, frames))
+    hub.close()
+    for station in crowd.stations:
+        assert [await station.receive() for _ in frames] == frames
+
+
+async def test_a_burst_is_charged_to_the_client_that_caused_it(
+    crowd: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its frames are for all and leave long after its request was served."""
+    hub, router = crowd.world, crowd.world._router
+    charged: list[tuple[int, int]] = []
+    monkeypatch.setattr(
+        router._requests, "charge", lambda payer, size: charged.append((payer, size))
+    )
+    frames = burst(crowd, 2 * FRAMES_A_TURN)
+    router._on_frame = lambda _: hub.send_all(map(crowd.out, frames))
+    asker = hub.clients()[0].client_id
+    router._requests.offer(Incoming(asker, frames[0], True), 0)
+    router._serve()
+    assert charged == [(asker, STATIONS * len(frame)) for frame in frames]
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp", "ws"])
+async def test_those_who_come_at_once_are_admitted_one_a_turn(rig: Any, kind: str) -> None:
+    hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+    port = hub.listening_ports()[0]
+    for _ in range(STATIONS):
+        if kind == "udp":
+            station = rig.station(port)
+            station.say(station.sender.heartbeat())
+        else:
+            rig.closing.append(socket.create_connection(("127.0.0.1", port)).close)
+    (listener,) = hub._endpoints.values()
+    seen = [0]
+
+    def are_all_in() -> bool:
+        seen.append(len(listener._clients) + len(getattr(listener, "_callers", ())))
+        return seen[-1] == STATIONS
+
+    await rig.until(are_all_in)
+    assert all(after - before <= 1 for before, after in itertools.pairwise(seen))
+
+
+@pytest.mark.parametrize(("stations", "most"), [(1, READ_BYTES), (15, 768), (80, LEAST_READ_BYTES)])
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+async def test_a_flood_is_passed_on_over_many_turns(
+    rig: Any, kind: str, stations: int, most: int
+) -> None:
+    takers = [rig.station() for _ in range(stations)]
+    hub = rig.hub(f"{kind}-listen:127.0.0.1:0", *(f"udp:127.0.0.1:{t.port}" for t in takers))
+    await rig.until_open(hub)
+    source = socket.socket(type=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+    rig.closing.append(source.close)
+    source.connect(("127.0.0.1", hub.listening_ports()[0]))
+    vehicle = rig.sender(7)
+    source.send(vehicle.attitude())
+    await rig.until(lambda: hub.counters().forwarded == 1)
+    frames = [vehicle.attitude() for _ in range(200)]
+    for frame in frames:
+        source.send(frame)
+    passed = [1]
+
+    def are_all_through() -> bool:
+        passed.append(hub.counters().forwarded)
+        return passed[-1] == 1 + len(frames)
+
+    await rig.until(are_all_through)
+    in_a_turn = most // len(frames[0]) + 1
+    assert all(after - before <= in_a_turn for before, after in itertools.pairwise(passed))
+    assert rig.foreign[1:] == frames

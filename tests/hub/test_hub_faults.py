@@ -1,0 +1,337 @@
+"""Whatever happens to one client, the others lose nothing."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from typing import Any
+
+import msgspec
+import pytest
+from fastcrc.crc16 import mcrf4xx
+
+from gateway.hub.hub import VISITS_IN_FULL
+from gateway.hub.log_rate_limiter import WINDOW_US
+from gateway.wire.mavlink_messages import CRC_EXTRA
+
+pytestmark = pytest.mark.io
+
+FRAMES = 2000
+
+TCP_CLIENT = """
+import socket, sys
+link = socket.socket()
+# Little room, which is soon full.
+link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+link.connect(("127.0.0.1", int(sys.argv[1])))
+print("up", flush=True)
+while link.recv(4096):
+    pass
+"""
+
+
+class Healthy:
+    """Clients to which nothing happens: two configured, one that called."""
+
+    def __init__(self, rig: Any, *endpoints: str, **settings: object) -> None:
+        self.rig = rig
+        self.stations = [rig.station() for _ in range(2)]
+        configured = [f"udp:127.0.0.1:{station.port}" for station in self.stations]
+        self.hub = rig.hub("udp-listen:127.0.0.1:0", *configured, *endpoints, **settings)
+        self.stations.append(rig.station(self.hub.listening_ports()[0]))
+        self.sent: list[bytes] = []
+        self.heard: list[list[int]] = [[] for _ in self.stations]
+
+    async def start(self) -> None:
+        caller = self.stations[-1]
+        caller.say(caller.sender.heartbeat())
+        await self.rig.until(lambda: len(self.hub.clients()) >= 3)
+        await self.rig.until(lambda: all(c.state == "open" for c in self.hub.clients()[:2]))
+
+    async def fly(self, frames: int) -> None:
+        """Publish frames, letting the loop and the clients run between them."""
+        for _ in range(frames):
+            frame = self.rig.vehicle.attitude()
+            self.sent.append(frame)
+            self.hub.send(self.rig.out(frame))
+            await asyncio.sleep(0)
+            self.listen()
+
+    def listen(self) -> bool:
+        """Read what has come to the clients; tell whether that is all."""
+        for station, heard in zip(self.stations, self.heard, strict=True):
+            heard += _sequences(station.socket)
+        return all(len(heard) >= len(self.sent) for heard in self.heard)
+
+    async def lost(self) -> int:
+        """Count the clients that did not get every frame in order."""
+        with contextlib.suppress(TimeoutError):
+            await self.rig.until(self.listen)
+        whole = [frame[4] for frame in self.sent]
+        return sum(heard != whole for heard in self.heard)
+
+
+def _sequences(sock: socket.socket) -> list[int]:
+    found = []
+    while True:
+        try:
+            found.append(sock.recv(4096)[4])
+        except BlockingIOError:
+            return found
+
+
+async def test_a_client_is_killed(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    victim = rig.station(flight.hub.listening_ports()[0])
+    victim.say(rig.sender(200, 190).heartbeat())
+    await rig.until(lambda: len(flight.hub.clients()) == 4)
+    await flight.fly(FRAMES // 2)
+    victim.socket.close()
+    await flight.fly(FRAMES // 2)
+    assert await flight.lost() == 0
+    assert flight.hub.clients()[-1].state == "refused"
+
+
+async def test_a_client_is_stopped_with_tcp_open_and_goes_on(rig: Any) -> None:
+    flight = Healthy(rig, "tcp-listen:127.0.0.1:0", queue_bytes=2048)
+    await flight.start()
+    port = flight.hub.listening_ports()[1]
+    with subprocess.Popen(
+        [sys.executable, "-c", TCP_CLIENT, str(port)], stdout=subprocess.PIPE
+    ) as client:
+        assert client.stdout
+        try:
+            assert await asyncio.to_thread(client.stdout.readline) == b"up\n"
+            await rig.until(lambda: len(flight.hub.clients()) == 4)
+            os.kill(client.pid, signal.SIGSTOP)
+            while not flight.hub.clients()[-1].dropped:
+                await flight.fly(500)
+                assert len(flight.sent) < 2_000_000
+            assert await flight.lost() == 0
+            os.kill(client.pid, signal.SIGCONT)
+            await rig.until(lambda: flight.hub.clients()[-1].queued == 0)
+            before = flight.hub.clients()[-1]
+            await flight.fly(50)
+            after = flight.hub.clients()[-1]
+            assert (after.sent, after.dropped) == (before.sent + 50, before.dropped)
+        finally:
+            client.kill()
+
+
+async def test_a_port_is_refused_and_a_name_unknown(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = rig.station()
+    closed.socket.close()
+    flight = Healthy(rig, f"udp:127.0.0.1:{closed.port}", f"tcp:127.0.0.1:{closed.port}")
+    await flight.start()
+    await flight.fly(FRAMES)
+    assert await flight.lost() == 0
+    assert {client.state for client in flight.hub.clients()} == {"open", "refused"}
+
+
+async def test_odd_datagrams_rain(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    caller, stranger = flight.stations[-1], rig.station(flight.hub.listening_ports()[0])
+    for _ in range(20):
+        for data in (b"", b"\xfe" * 65507, b"\xfd" * 65507, bytes(65507)):
+            caller.say(data)
+            stranger.say(data)
+        await flight.fly(20)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) == 3
+
+
+@pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
+async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
+    flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
+    await flight.start()
+    with socket.create_connection(("127.0.0.1", flight.hub.listening_ports()[1])) as rude:
+        await rig.until(lambda: len(flight.hub.clients()) == 4)
+        rude.setblocking(False)
+        for _ in range(50):
+            with contextlib.suppress(BlockingIOError):
+                rude.send(garbage * (20_000 // len(garbage)))
+            with contextlib.suppress(BlockingIOError):
+                rude.recv(1 << 20)
+            await flight.fly(20)
+        assert await flight.lost() == 0
+        client = flight.hub.clients()[-1]
+        assert client.bytes_garbage > 100_000
+        assert client.received == 0
+        said = rig.sender(200, 190).heartbeat()
+        while not flight.hub.clients()[-1].received:
+            # What looks like the head of a frame swallows the first ones.
+            with contextlib.suppress(BlockingIOError):
+                rude.send(said)
+            await flight.fly(1)
+
+
+@pytest.mark.parametrize("room", [16, 100])
+async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
+    flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
+    await flight.start()
+    target = ("127.0.0.1", flight.hub.listening_ports()[0])
+    for visit in range(1000):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as visitor:
+            visitor.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
+        if visit % 10 == 0:
+            rig.clock.us += 1_000_000
+            caller = flight.stations[-1]
+            caller.say(caller.sender.heartbeat())
+        await flight.fly(1)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) <= 2 + room
+    assert flight.hub.listeners()[0].clients >= min(room, 16)
+
+
+async def test_settings_are_reloaded_under_load(rig: Any) -> None:
+    flight = Healthy(rig)
+    await flight.start()
+    original = flight.hub.settings
+    extra = rig.station()
+    changed = msgspec.structs.replace(
+        original,
+        endpoints=(*original.endpoints, f"udp:127.0.0.1:{extra.port}?deny=ATTITUDE"),
+        max_clients=3,
+        idle_timeout_s=5.0,
+    )
+    for _ in range(50):
+        flight.hub.apply(changed)
+        await flight.fly(20)
+        flight.hub.apply(original)
+        await flight.fly(20)
+    assert await flight.lost() == 0
+    assert len(flight.hub.clients()) == 3
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or not all(map(shutil.which, ("unshare", "ip", "nsenter"))),
+    reason="only root can make network namespaces, with iproute2 and util-linux",
+)
+@pytest.mark.slow
+async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
+    """Run in a network namespace of its own: see `interface_world.py` beside this file."""
+    program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
+    run = await asyncio.to_thread(
+        subprocess.run,
+        ["unshare", "--net", sys.executable, program],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    if "not permitted" in run.stderr:
+        pytest.skip("this machine forbids network namespaces")
+    assert run.returncode == 0, run.stderr
+    seen = json.loads(run.stdout)
+    assert seen["state while down"] == "unreachable"
+    assert seen["loopback lost"] == 0
+    before_and_after = seen["far end could hear"]
+    assert before_and_after - 50 <= seen["far end heard"] <= before_and_after
+    assert seen["far end heard"] >= seen["sent after"] - 5
+
+
+class TestALinkThatRaises:
+    """An error that nobody foresaw costs its own link a second, and nobody else anything."""
+
+    async def test_it_is_named_and_tried_again_and_the_others_go_on(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        gone = rig.station()
+        gone.socket.close()
+        ours, device = os.openpty()
+        rig.closing += [lambda: os.close(ours), lambda: os.close(device)]
+
+        def overflow(*_: object, **__: object) -> None:
+            raise OverflowError("signed integer is greater than maximum")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("serial.Serial", overflow)
+            hub = rig.hub(f"serial:{os.ttyname(device)}:57600?name=radio")
+            hub.add(f"udp:127.0.0.1:{gone.port}")
+            await rig.until(lambda: hub.clients()[1].state == "open")
+            hub.send(rig.out(rig.vehicle.attitude()))
+            hub.send(rig.out(rig.vehicle.attitude()))
+            assert hub.clients()[1].state == "refused"
+            radio = hub.clients()[0]
+            assert (radio.state, radio.reason[:14]) == ("unreachable", "signed integer")
+            for _ in range(3):
+                rig.clock.us += 1_000_000
+                rig.tick(hub)
+            assert "radio is closed and tried again" in caplog.text
+            assert hub.clients()[1].state == "open", "the other one's trouble is called off"
+            assert not hub._timer.cancelled()
+        rig.clock.us += 1_000_000
+        rig.tick(hub)
+        assert hub.clients()[0].state == "open"
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_listening_port_is_bound_again(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        listener = next(iter(hub._endpoints.values()))
+        with monkeypatch.context() as patched:
+            patched.setattr(type(listener), "tick", lambda *_: 1 // 0)
+            rig.tick(hub)
+            assert hub.listeners()[0].state == "closed"
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        assert hub.listeners()[0].state == "open"
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_a_name_that_the_resolver_chokes_on(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        errors: list[Any] = []
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: errors.append(context))
+
+        async def choke(*_: object, **__: object) -> None:
+            raise UnicodeError("label empty or too long")
+
+        monkeypatch.setattr(loop, "getaddrinfo", choke)
+        hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
+        await rig.until(lambda: hub.clients()[0].reason != "")
+        assert (hub.clients()[0].state, errors) == ("resolving", [])
+
+
+async def test_heartbeats_cut_short_do_no_harm(rig: Any) -> None:
+    errors: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no")
+    caller = rig.station(hub.listening_ports()[0])
+    for length in range(10):
+        payload = bytes((0, 0, 0, 0, 6, 8, 0, 4, 3))[:length]
+        body = bytes((len(payload), 0, 0, length, 255, 190, 0, 0, 0)) + payload
+        crc = mcrf4xx(CRC_EXTRA[0], mcrf4xx(body))
+        caller.say(b"\xfd" + body + crc.to_bytes(2, "little"))
+    await rig.until(lambda: len(rig.incoming) == 10)
+    assert errors == []
+
+
+async def test_strangers_without_number_do_not_flood_the_log(
+    rig: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="gateway")
+    many = VISITS_IN_FULL + 10
+    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
+    for _ in range(many):
+        stranger = rig.station(hub.listening_ports()[0])
+        stranger.say(stranger.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == many)
+    assert len(caplog.messages) == VISITS_IN_FULL
+    hub.add("udp:127.0.0.1:9")
+    assert caplog.messages[-1].endswith("127.0.0.1:9"), "who is configured is always named"
+    rig.clock.us += WINDOW_US
+    rig.tick(hub)
+    assert "10 more comings and goings at listening ports" in caplog.messages

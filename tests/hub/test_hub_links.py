@@ -1,0 +1,134 @@
+"""Gateways joined twice, stations that share an id: everybody gets everything once, in order."""
+
+import asyncio
+import itertools
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_splitter import message_id_of
+from tests.ports import free_ports
+from tests.vehicle.samples import sample_at, state_at
+
+pytestmark = pytest.mark.io
+
+STEP_US = 20_000
+
+
+class Gateway:
+    """A hub with a real vehicle."""
+
+    def __init__(self, rig: Any, system: int, *endpoints: str) -> None:
+        self.rig = rig
+        self.vehicle = Vehicle(VehicleSettings(), system)
+        settings = HubSettings(endpoints=endpoints, ping_interval_s=1.0)
+        self.hub = Hub(settings, self.handle, rig.clock, on_gone=self.vehicle.forget_client)
+        rig.closing.append(self.hub.close)
+        self.hub.start()
+
+    def handle(self, incoming: Incoming) -> None:
+        self.perform(self.vehicle.handle(incoming, self.rig.clock()))
+
+    def perform(self, actions: list[Any]) -> None:
+        for action in actions:
+            if isinstance(action, Outgoing):
+                self.hub.send(action)
+            elif isinstance(action, ClientInterval):
+                self.hub.set_interval(action)
+
+    def fly(self) -> None:
+        now_us = self.rig.clock()
+        self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
+        self.perform(self.vehicle.poll(now_us))
+
+
+class Joined:
+    """Two gateways, each calling the other, and a station at the second."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        ports = free_ports(2)
+        self.first, self.second = (
+            Gateway(rig, system, f"udp-listen:127.0.0.1:{here}", f"udp:127.0.0.1:{there}")
+            for system, here, there in ((1, *ports), (2, *reversed(ports)))
+        )
+        self.station = rig.station(ports[1])
+        self.heard: dict[int, list[bytes]] = {1: [], 2: []}
+
+    async def run(self, seconds: float) -> None:
+        for step in range(round(seconds * 1e6 / STEP_US)):
+            self.rig.clock.us += STEP_US
+            self.first.fly()
+            self.second.fly()
+            if step % 12 == 0:
+                self.rig.tick(self.first.hub)
+                self.rig.tick(self.second.hub)
+            if step % 50 == 0:
+                self.station.say(self.station.sender.heartbeat())
+            for _ in range(8):
+                await asyncio.sleep(0)
+            self.listen()
+
+    def listen(self) -> None:
+        while True:
+            try:
+                frame = self.station.socket.recv(4096)
+            except BlockingIOError:
+                return
+            if frame[5] in self.heard and frame[6] == 1:
+                self.heard[frame[5]].append(frame)
+
+    def gaps(self, system: int) -> int:
+        numbers = [frame[4] for frame in self.heard[system]]
+        return sum((b - a) % 256 != 1 for a, b in itertools.pairwise(numbers))
+
+
+async def test_two_gateways_joined_twice_send_every_frame_once(rig: Any) -> None:
+    joined = Joined(rig)
+    await joined.run(4)
+    joined.heard = {1: [], 2: []}
+    await joined.run(10)
+    for system in (1, 2):
+        assert len(joined.heard[system]) > 500
+        assert joined.gaps(system) == 0
+
+
+async def test_a_request_over_two_links_is_answered_and_parts_no_numbers(rig: Any) -> None:
+    joined = Joined(rig)
+    await joined.run(4)
+    joined.heard = {1: [], 2: []}
+    for _ in range(10):
+        joined.station.say(joined.station.sender.command(1, 1))
+        await joined.run(0.2)
+    acks = [frame for frame in joined.heard[1] if message_id_of(frame) == 77]
+    assert len(acks) == 10
+    assert (joined.gaps(1), joined.gaps(2)) == (0, 0)
+
+
+async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
+    gateway = Gateway(rig, 1, "udp-listen:127.0.0.1:0")
+    twins = [rig.station(gateway.hub.listening_ports()[0]) for _ in range(2)]
+    gateway.fly()
+    answers = [0, 0]
+    for step in range(10):
+        rig.clock.us += 100_000
+        for twin in twins:
+            if step % 10 == 0:
+                twin.say(twin.sender.heartbeat())
+            twin.say(twin.sender.command(1, 1))
+        await rig.quiet()
+        for number, twin in enumerate(twins):
+            while True:
+                try:
+                    frame = twin.socket.recv(4096)
+                except BlockingIOError:
+                    break
+                answers[number] += message_id_of(frame) == dialect.MAVLINK_MSG_ID_COMMAND_ACK
+    assert answers[0] >= 10
+    assert answers[1] >= 10

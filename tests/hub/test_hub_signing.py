@@ -1,0 +1,143 @@
+"""All that is ours leaves signed, whatever way it takes; what is not ours leaves as it came."""
+
+import asyncio
+import socket
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.hub.round_trip import PROBE_COMPONENT
+from gateway.records import ClientInterval
+from gateway.wire.mavlink_signing import Signer
+from gateway.wire.mavlink_splitter import MavlinkSplitter, is_signed, message_id_of, restamp
+from tests.hub.conftest import LIMIT_S
+
+pytestmark = pytest.mark.io
+
+OLD, NEW = bytes(32), bytes(range(32))
+STAMP = 30_000_000_000_000
+
+
+class Strict:
+    """A receiver that takes nothing unsigned, by pymavlink."""
+
+    def __init__(self, key: bytes = OLD) -> None:
+        self.mav: Any = mavlink.MAVLink(None)
+        self.mav.signing.timestamp = STAMP
+        self.mav.signing.secret_key = key
+
+    def read(self, frame: bytes) -> tuple[str, int, int]:
+        message = self.mav.decode(bytearray(frame))
+        assert message.get_signed()
+        return message.get_type(), message.get_srcComponent(), message.get_seq()
+
+
+class Keys:
+    """Stands in for the aircraft: who signs, and by which key."""
+
+    def __init__(self) -> None:
+        self.key: bytes | None = OLD
+        self._signer = Signer()
+
+    def seal(self, frame: bytes, sequence: int) -> bytes:
+        if self.key is None:
+            return restamp(frame, sequence)
+        return self._signer.sign(frame, sequence, self.key, STAMP)
+
+
+async def test_greetings_questions_answers_and_limited_telemetry(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", seal=Keys().seal)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    hub.send(rig.out(rig.vehicle.home()))
+    station, receiver = rig.station(hub.listening_ports()[0]), Strict()
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    (client,) = hub.clients()
+    got = []
+    hub.set_interval(ClientInterval(client.client_id, 1, 30, -1))
+    for _ in range(3):
+        hub.send(rig.out(rig.vehicle.raw_imu()))
+        hub.send(rig.out(rig.vehicle.attitude()))
+    hub.send(rig.out(rig.vehicle.home(), client.client_id))
+    rig.clock.us += 5_000_000
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.tick(hub)
+    while ("TIMESYNC", PROBE_COMPONENT) not in [kind[:2] for kind in got]:
+        got.append(receiver.read(await station.receive()))
+    assert [kind for kind, component, _ in got if component == 1] == [
+        *("HEARTBEAT", "HOME_POSITION", "RAW_IMU", "HOME_POSITION", "HEARTBEAT"),
+    ]
+    numbers = [sequence for _, component, sequence in got if component == 1]
+    assert numbers == list(range(numbers[0], numbers[0] + 5)), "signed and yet without a gap"
+    assert {kind for kind, component, _ in got if component == PROBE_COMPONENT} == {
+        "PING",
+        "TIMESYNC",
+    }
+
+
+async def test_what_overtakes_in_a_queue_leaves_the_stamps_in_order(rig: Any) -> None:
+    hub = rig.hub("tcp-listen:127.0.0.1:0", seal=Keys().seal)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    client = socket.socket()
+    client.setblocking(False)
+    rig.closing.append(client.close)
+    loop = asyncio.get_running_loop()
+    await loop.sock_connect(client, ("127.0.0.1", hub.listening_ports()[0]))
+    await rig.until(lambda: len(hub.clients()) == 1)
+    while hub.clients()[0].queued < 50:
+        hub.send(rig.out(rig.vehicle.raw_imu()))
+    for _ in range(50):
+        hub.send(rig.out(rig.vehicle.raw_imu()))
+        hub.send(rig.out(rig.vehicle.attitude()))
+    splitter, receiver, kinds = MavlinkSplitter(), Strict(), []
+    while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
+        data = await asyncio.wait_for(loop.sock_recv(client, 65536), LIMIT_S)
+        kinds += [receiver.read(frame)[0] for frame in splitter.feed(data)]
+    assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
+
+
+async def test_frames_of_others_stay_as_they_came(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", seal=Keys().seal)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    port = hub.listening_ports()[0]
+    source, station, receiver = rig.station(port), rig.station(port), Strict()
+    station.say(station.sender.heartbeat())
+    autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
+    for said in [pilot.heartbeat() for pilot in autopilots]:
+        source.say(said)
+
+    def received() -> int:
+        return sum(client.received for client in hub.clients())
+
+    await rig.until(lambda: received() == 1 + len(autopilots))
+    said = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
+    for frame in said:
+        source.say(frame)
+    await rig.until(lambda: received() == 1 + len(autopilots) + len(said))
+    hub.send(rig.out(rig.vehicle.raw_imu()))
+    got = []
+    while not got or (got[-1][5:7], message_id_of(got[-1])) != (b"\1\1", 27):
+        got.append(await station.receive())
+        if got[-1][5:7] == b"\1\1":
+            receiver.read(got[-1])
+    assert [frame for frame in got if frame in said] == said
+
+
+async def test_another_key_holds_from_the_next_frame_on(rig: Any) -> None:
+    keys = Keys()
+    hub = rig.hub("udp-listen:127.0.0.1:0", seal=keys.seal)
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    for key in (OLD, NEW):
+        keys.key = key
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        receiver = Strict(key)
+        if key is OLD:
+            receiver.read(await station.receive())
+        receiver.read(await station.receive())
+    keys.key = None
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    assert not is_signed(await station.receive())

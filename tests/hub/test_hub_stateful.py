@@ -1,0 +1,338 @@
+"""Clients come, go, stall and lie in any order; a good one misses nothing, and no stranger harms.
+
+Hypothesis draws the order and shrinks what fails to the fewest steps. After each of them:
+
+* the good client gets every frame of our vehicle without a gap, and every frame of the autopilot;
+* what it asks reaches our vehicle and the autopilot, and is answered;
+* nothing that a stranger said reaches it or the autopilot, and nothing of ours has changed;
+* a stranger gets telemetry and answers to itself, and nothing that is addressed to another.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import os
+import socket
+from collections.abc import Coroutine
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from tests.hub.conftest import Rig, Station
+from tests.vehicle.samples import sample_at, state_at
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+EXAMPLES = int(os.environ.get("HUB_EXAMPLES", "15"))
+STEPS = 20
+OURS, AUTOPILOT, GOOD = (1, 1), (42, 1), (255, 190)
+TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
+COMMAND_ACK = dialect.MAVLINK_MSG_ID_COMMAND_ACK
+NAMES = st.sampled_from([OURS, AUTOPILOT, GOOD, (42, 190), (7, 7), (1, 240), (200, 190)])
+
+
+def lies(sender: Any, guessed: bytes) -> dict[str, bytes]:
+    """Return what a liar may say under a name; `guessed` is what the good client will say next."""
+    pack = sender.pack
+
+    def command(target: tuple[int, int]) -> bytes:
+        # Unlike any that is meant.
+        return pack(dialect.MAVLink_command_long_message(*target, 512, 0, 148, 0, 0, 0, 0, 0, 7))
+
+    return {
+        "vehicle": pack(dialect.MAVLink_heartbeat_message(2, 0, 0, 0, 4, 3)),
+        "station": pack(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)),
+        "telemetry": pack(dialect.MAVLink_attitude_message(5, 1.0, 0, 0, 0, 0, 0)),
+        "command to the autopilot": command(AUTOPILOT),
+        "command to the station": command(GOOD),
+        "request": command(OURS),
+        "change": pack(dialect.MAVLink_param_set_message(*OURS, b"RATE_ATT", 0.0, 9)),
+        "mission": pack(dialect.MAVLink_mission_clear_all_message(*OURS, 255)),
+        "list": pack(dialect.MAVLink_param_request_list_message(0, 0)),
+        "ping": pack(dialect.MAVLink_ping_message(5, 1, 0, 0)),
+        "to all": pack(dialect.MAVLink_command_long_message(*OURS, 512, 0, 148, 0, 0, 0, 0, 0, 2)),
+        "copy in advance": guessed,
+        "garbage": b"\xfd\x09\x00" + guessed[:7],
+    }
+
+
+class HubMachine(RuleBasedStateMachine):
+    """One hub with one good client, an autopilot, and everybody else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.runner = asyncio.Runner()
+        self.errors: list[Any] = []
+        self.runner.get_loop().set_exception_handler(lambda _, error: self.errors.append(error))
+        self.rig = Rig()
+        self.vehicle = Vehicle(VehicleSettings(), OURS[0])
+        self.numbers = bytearray()
+        self.telemetry: list[bytes] = []
+        """What the autopilot sent and the good client has still to get."""
+        self.requests: list[bytes] = []
+        """What the good client sent and the autopilot has still to get."""
+        self.answers = 0
+        self.lies: set[bytes] = set()
+        self.said: set[bytes] = set()
+        self.strangers: list[Station] = []
+        self.readers: list[socket.socket] = []
+
+    def run(self, steps: Coroutine[Any, Any, None]) -> None:
+        self.runner.run(steps)
+
+    @initialize()
+    def begin(self) -> None:
+        self.run(self._begin())
+
+    async def _begin(self) -> None:
+        self.good = self.rig.station()
+        endpoints = (
+            f"udp:127.0.0.1:{self.good.port}",
+            f"udp-listen:{TRUSTED}:0",
+            f"udp-listen:{UNTRUSTED}:0?trusted=no",
+            f"tcp-listen:{TRUSTED}:0",
+        )
+        self.hub = Hub(
+            HubSettings(endpoints=endpoints, max_clients=4, idle_timeout_s=5.0),
+            self.handle,
+            self.rig.clock,
+            lambda _: None,
+            on_gone=self.vehicle.forget_client,
+        )
+        self.rig.closing.append(self.hub.close)
+        self.hub.start()
+        await self.rig.until_open(self.hub)
+        self.trusted, self.untrusted, self.tcp = self.hub.listening_ports()
+        self.good.target = ("127.0.0.1", self.hub._clients[1]._port)
+        self.autopilot = self.rig.station(self.trusted)
+        self.autopilot.sender = self.rig.sender(*AUTOPILOT)
+        await self._second()
+
+    def handle(self, incoming: Incoming) -> None:
+        self.perform(self.vehicle.handle(incoming, self.rig.clock()))
+
+    def perform(self, actions: list[Any]) -> None:
+        for action in actions:
+            if isinstance(action, Outgoing):
+                self.hub.send(action)
+            else:
+                assert isinstance(action, ClientInterval), "strangers change nothing"
+                self.hub.set_interval(action)
+
+    async def _second(self) -> None:
+        """Let a second pass in which everybody good is alive."""
+        self.rig.clock.us += 1_000_000
+        now_us = self.rig.clock()
+        self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
+        self.perform(self.vehicle.poll(now_us))
+        beat = self.autopilot.sender.heartbeat()
+        self.telemetry.append(beat)
+        self.autopilot.say(beat)
+        self._ask(self.good.sender.heartbeat())
+        self.rig.tick(self.hub)
+        await self._settle()
+
+    def _ask(self, frame: bytes) -> None:
+        self.said.add(frame)
+        self.requests.append(frame)
+        self.good.say(frame)
+
+    async def _settle(self) -> None:
+        """Let everything arrive."""
+
+        def arrived() -> bool:
+            self._listen()
+            return not self.telemetry and not self.requests
+
+        await self.rig.until(arrived)
+        await self.rig.quiet()
+        self._listen()
+
+    def _listen(self) -> None:
+        for frame in received(self.good):
+            assert frame not in self.lies
+            if origin_of(frame) == OURS:
+                self.numbers.append(frame[4])
+                self.answers += message_id_of(frame) == COMMAND_ACK
+            elif origin_of(frame) == AUTOPILOT:
+                assert frame == self.telemetry.pop(0)
+        for frame in received(self.autopilot):
+            assert frame not in self.lies
+            if origin_of(frame) == GOOD:
+                assert frame == self.requests.pop(0)
+        for stranger in self.strangers:
+            for frame in received(stranger):
+                assert frame not in self.said, "what the good client says is not for strangers"
+
+    @rule(seconds=st.integers(1, 7))
+    def time_passes(self, seconds: int) -> None:
+        for _ in range(seconds):
+            self.run(self._second())
+
+    @rule(count=st.integers(1, 40))
+    def fly(self, count: int) -> None:
+        async def steps() -> None:
+            for _ in range(count):
+                self.rig.clock.us += 5_000
+                now_us = self.rig.clock()
+                self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
+                self.telemetry.append(self.autopilot.sender.attitude())
+                self.autopilot.say(self.telemetry[-1])
+            await self._settle()
+
+        self.run(steps())
+
+    @rule()
+    def the_good_client_asks_the_vehicle(self) -> None:
+        async def steps() -> None:
+            before = self.answers
+            frame = self.good.sender.command(*OURS)
+            self.said.add(frame)
+            self.good.say(frame)
+
+            def answered() -> bool:
+                self._listen()
+                return self.answers > before
+
+            await self.rig.until(answered)
+
+        self.run(steps())
+
+    @rule()
+    def the_good_client_asks_the_autopilot(self) -> None:
+        async def steps() -> None:
+            self._ask(self.good.sender.command(*AUTOPILOT))
+            await self._settle()
+
+        self.run(steps())
+
+    @rule()
+    def a_stranger_comes(self) -> None:
+        stranger = self.rig.station()
+        stranger.target = (UNTRUSTED, self.untrusted)
+        self.strangers.append(stranger)
+
+    @rule(
+        data=st.data(),
+        name=NAMES,
+        kinds=st.lists(st.sampled_from(sorted(lies(Rig().sender(1), b""))), min_size=1, max_size=9),
+        times=st.integers(1, 8),
+    )
+    def a_stranger_lies(
+        self, data: st.DataObject, name: tuple[int, int], kinds: list[str], times: int
+    ) -> None:
+        if not self.strangers:
+            return
+        stranger = data.draw(st.sampled_from(self.strangers))
+        sender = self.rig.sender(*name)
+        sender.link.seq = data.draw(st.integers(0, 255))
+
+        async def steps() -> None:
+            for kind in kinds * times:
+                # Whoever has listened knows the next number of the good client.
+                link = self.good.sender.link
+                guessed = self.good.sender.command(*AUTOPILOT)
+                link.seq = (link.seq - 1) % 256
+                frame = lies(sender, guessed)[kind]
+                if kind != "copy in advance":
+                    self.lies.add(frame)
+                stranger.say(frame)
+                await asyncio.sleep(0)
+            await self._settle()
+
+        self.run(steps())
+
+    @rule(data=st.data())
+    def a_stranger_goes(self, data: st.DataObject) -> None:
+        if self.strangers:
+            gone = data.draw(st.sampled_from(self.strangers))
+            self.strangers.remove(gone)
+            gone.socket.close()
+
+    @rule()
+    def somebody_connects_and_never_reads(self) -> None:
+        async def steps() -> None:
+            reader = socket.create_connection((TRUSTED, self.tcp))
+            self.rig.closing.append(reader.close)
+            self.readers.append(reader)
+            await self._settle()
+
+        self.run(steps())
+
+    @rule()
+    def a_reader_breaks_off(self) -> None:
+        if self.readers:
+            self.readers.pop().close()
+            self.run(self._settle())
+
+    @rule(options=st.sampled_from(["", "&deny=ATTITUDE", "&rate=ATTITUDE:5", "&pack=300"]))
+    def settings_are_reloaded(self, options: str) -> None:
+        async def steps() -> None:
+            endpoints = list(self.hub.settings.endpoints)
+            endpoints[2] = f"udp-listen:{UNTRUSTED}:0?trusted=no{options}"
+            self.hub.apply(msgspec.structs.replace(self.hub.settings, endpoints=tuple(endpoints)))
+            await self._settle()
+
+        self.run(steps())
+
+    @invariant()
+    def nothing_is_missed(self) -> None:
+        steps = {(b - a) % 256 for a, b in itertools.pairwise(self.numbers)}
+        assert steps <= {1}
+        assert self.errors == []
+
+    @invariant()
+    def nothing_has_changed(self) -> None:
+        assert self.vehicle.telemetry.settings == VehicleSettings()
+        assert self.vehicle.places.missions.items[0] == ()
+
+    @invariant()
+    def strangers_are_in_no_table(self) -> None:
+        if hasattr(self, "hub"):
+            trusted = {client.client_id for client in self.hub.clients() if client.trusted}
+            assert set(self.hub._router._table._of_client) <= trusted
+
+    def teardown(self) -> None:
+        async def end() -> None:
+            for close in reversed(self.rig.closing):
+                close()
+            await asyncio.sleep(0)
+
+        self.run(end())
+        self.runner.close()
+
+
+def received(station: Station) -> list[bytes]:
+    frames = []
+    with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
+        while True:
+            frames.append(station.socket.recv(65535))
+    return frames
+
+
+def test_no_order_of_events_harms_the_good_client() -> None:
+    bounded = settings(
+        max_examples=EXAMPLES,
+        stateful_step_count=STEPS,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+    run_state_machine_as_test(HubMachine, settings=bounded)

@@ -1,0 +1,153 @@
+"""Ten thousand strangers at the listening port: the telemetry goes on and nothing grows."""
+
+import asyncio
+import gc
+import itertools
+import logging
+import socket
+import struct
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.aircraft import Action
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.vehicle.samples import FIX, sample_at, state_at
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+STRANGERS = 10_000
+MAX_CLIENTS = 16
+GROWTH_LIMIT_BLOCKS = STRANGERS // 4
+"""Half a block of memory for each of the second half: whoever is remembered takes one or more."""
+FLIGHT_EVERY = 5
+STEP_US = 1_000_000
+
+
+def address(number: int) -> str:
+    return f"127.{1 + number // 62_500}.{number // 250 % 250}.{1 + number % 250}"
+
+
+def hostile_datagrams(rng: np.random.Generator) -> list[bytes]:
+    """Sound requests, requests that would change something, and every kind of rubbish."""
+    mav = mavlink.MAVLink(None, 255, 190)
+    opening = struct.pack("<HBBBBBxI", 1, 0, 4, 13, 0, 0, 0) + b"/general.json"
+    frames = [
+        mavlink.MAVLink_param_request_list_message(1, 1).pack(mav),
+        mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 0.0, 9).pack(mav),
+        mavlink.MAVLink_command_long_message(1, 1, 511, 0, 30, 9000, *[0] * 5).pack(mav),
+        mavlink.MAVLink_command_long_message(1, 1, 2510, 0, *[0] * 7).pack(mav),
+        mavlink.MAVLink_mission_count_message(1, 1, 500, 0).pack(mav),
+        mavlink.MAVLink_mission_clear_all_message(1, 1, 255).pack(mav),
+        mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, opening.ljust(251, b"\0")).pack(
+            mav
+        ),
+        mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3).pack(mav, force_mavlink1=True),
+        # Somebody who claims to be the vehicle itself.
+        mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 0, 3).pack(mavlink.MAVLink(None, 1, 1)),
+    ]
+    bad = bytearray(frames[0])
+    bad[-1] ^= 1
+    return [*map(bytes, frames), bytes(bad), frames[1][:9], rng.bytes(300), b"", rng.bytes(60_000)]
+
+
+class Gateway:
+    """A hub with a real vehicle behind it, and one client that everything is done for."""
+
+    def __init__(self, rig: Any) -> None:
+        self.clock = rig.clock
+        self.vehicle = Vehicle(VehicleSettings(), 1)
+        self.steady = rig.station()
+        self.attitudes = self.attitudes_heard = 0
+        self.sequence = bytearray()
+        """Numbers of the vehicle's frames that the client got."""
+        endpoints = (
+            f"udp:127.0.0.1:{self.steady.port}",
+            "udp-listen:127.0.0.1:0?trusted=no",
+        )
+        self.hub = Hub(
+            HubSettings(endpoints=endpoints, max_clients=MAX_CLIENTS, idle_timeout_s=5.0),
+            self.handle,
+            self.clock,
+            lambda _: None,
+            on_gone=self.vehicle.forget_client,
+        )
+        rig.closing.append(self.hub.close)
+        self.hub.start()
+
+    def handle(self, incoming: Incoming) -> None:
+        self.perform(self.vehicle.handle(incoming, self.clock()))
+
+    def perform(self, actions: list[Action]) -> None:
+        for action in actions:
+            if isinstance(action, Outgoing):
+                self.hub.send(action)
+            else:
+                # A client may choose its own rates; nobody here may ask for more.
+                assert isinstance(action, ClientInterval)
+                self.hub.set_interval(action)
+
+    def fly(self) -> None:
+        self.clock.us += STEP_US
+        now_us = self.clock()
+        found = self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us)
+        self.attitudes += sum(a.message_id == 31 for a in found if isinstance(a, Outgoing))
+        self.perform([*found, *self.vehicle.poll(now_us)])
+
+    def listen(self) -> None:
+        while True:
+            try:
+                frame = self.steady.socket.recv(4096)
+            except BlockingIOError:
+                return
+            if frame[5:7] == b"\x01\x01":
+                self.sequence.append(frame[4])
+                self.attitudes_heard += frame[7:10] == b"\x1f\0\0"
+
+
+async def test_ten_thousand_unknown_addresses(
+    rig: Any, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The lines that pytest keeps would be counted.
+    caplog.set_level(logging.CRITICAL, logger="gateway")
+    gateway = Gateway(rig)
+    await rig.until_open(gateway.hub)
+    gateway.perform(gateway.vehicle.on_gps(FIX, 0))
+    target = ("127.0.0.1", gateway.hub.listening_ports()[0])
+    datagrams = hostile_datagrams(rng)
+
+    async def assail(first: int, last: int) -> None:
+        for number in range(first, last):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+                stranger.bind((address(number), 0))
+                stranger.sendto(datagrams[number % len(datagrams)], target)
+            if number % FLIGHT_EVERY == 0:
+                gateway.fly()
+                await asyncio.sleep(0)
+                gateway.listen()
+                assert len(gateway.hub.clients()) <= 1 + MAX_CLIENTS
+        gc.collect()
+
+    await assail(0, STRANGERS // 2)
+    before = sys.getallocatedblocks()
+    await assail(STRANGERS // 2, STRANGERS)
+    assert sys.getallocatedblocks() - before < GROWTH_LIMIT_BLOCKS
+
+    def is_all_heard() -> bool:
+        gateway.listen()
+        return gateway.attitudes_heard >= gateway.attitudes
+
+    await rig.until(is_all_heard)
+    assert gateway.attitudes_heard == gateway.attitudes
+    steps = {(b - a) % 256 for a, b in itertools.pairwise(gateway.sequence)}
+    assert steps == {1}, "nothing lost, and no gap from what others were answered"
+    assert gateway.vehicle.refusals > 500
+    assert gateway.vehicle.places.missions.items[0] == ()
+    assert gateway.vehicle.telemetry.settings == VehicleSettings()

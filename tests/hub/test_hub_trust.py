@@ -1,0 +1,145 @@
+"""Who is not trusted gets telemetry and answers, and changes nothing that anybody else sees."""
+
+from typing import Any
+
+import pytest
+
+from gateway.hub.request_queue import STRANGERS_BURST
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+async def world(rig: Any) -> Any:
+    """An autopilot and a station whom the hub trusts, and a stranger who has been let in."""
+    hub = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0?trusted=no")
+    trusted, untrusted = hub.listening_ports()
+    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.world = hub
+    rig.autopilot, rig.station_ = rig.station(trusted), rig.station(trusted)
+    rig.autopilot.sender = rig.sender(42, 1)
+    rig.stranger = rig.station()
+    rig.stranger.target = ("127.0.0.2", untrusted)
+    rig.stranger.sender = rig.sender(200, 190)
+    for number, client in enumerate((rig.stranger, rig.station_, rig.autopilot), start=1):
+        client.say(client.sender.heartbeat())
+        await rig.until(lambda number=number: len(rig.incoming) == number)
+    for client in (rig.stranger, rig.station_):
+        assert (await client.receive())[5] == 42
+    return rig
+
+
+async def lie(world: Any, *frames: bytes) -> None:
+    """Let the stranger say something, and see to it that it was heard."""
+    hub = world.world
+
+    def heard() -> int:
+        return sum(client.received for client in hub.clients())
+
+    before = heard()
+    for frame in frames:
+        world.stranger.say(frame)
+    await world.until(lambda: heard() == before + len(frames))
+
+
+async def test_a_vehicle_that_a_stranger_calls_a_station_is_heard_all_the_same(world: Any) -> None:
+    forged = world.sender(42, 190)
+    forged.link.srcComponent = 1
+    for _ in range(20):
+        await lie(world, forged.heartbeat())
+        frame = world.autopilot.sender.attitude()
+        world.autopilot.say(frame)
+        assert await world.station_.receive() == frame
+
+
+async def test_copies_sent_in_advance_eat_no_request(world: Any) -> None:
+    seen = world.sender(255, 190)
+    seen.heartbeat()
+    for _ in range(10):
+        request = world.station_.sender.command(42, 1)
+        assert seen.command(42, 1) == request, "numbers are easily guessed"
+        await lie(world, request)
+        world.station_.say(request)
+        assert await world.autopilot.receive() == request
+    assert world.world.counters().duplicates == 0
+
+
+async def test_a_command_goes_to_the_system_and_not_to_who_claims_a_component_of_it(
+    world: Any,
+) -> None:
+    claimed = world.sender(42, 77)
+    await lie(world, claimed.heartbeat(), claimed.attitude())
+    request = world.station_.sender.command(42, 77)
+    world.station_.say(request)
+    assert await world.autopilot.receive() == request
+    await world.quiet()
+    while not world.stranger.is_silent():
+        assert world.stranger.socket.recv(100) != request
+
+
+async def test_forged_stations_without_number_take_nobodys_place(world: Any) -> None:
+    for number in range(357):
+        forged = world.sender(1 + number % 200, 1 + number // 200)
+        forged.is_station = True
+        await lie(world, forged.heartbeat())
+        world.clock.us += 10_000
+    late = world.station(world.world.listening_ports()[0])
+    late.sender = world.sender(253, 190)
+    said = late.sender.heartbeat()
+    late.say(said)
+    assert await world.autopilot.receive() == said
+    assert world.station_.is_silent(), "what a station says to all goes to vehicles only"
+
+
+async def test_what_a_stranger_is_called_is_shown_and_bounded(world: Any) -> None:
+    for number in range(100):
+        await lie(world, world.sender(100 + number, 1).attitude())
+    stranger = next(c for c in world.world.clients() if not c.trusted)
+    assert 1 <= len(stranger.systems) <= 8
+
+
+async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None:
+    hub = world.world
+    request = world.station_.sender.command(42, 1)
+    world.station_.say(request)
+    assert await world.autopilot.receive() == request
+    client = hub._clients[hub.clients()[-1].client_id]
+    client.trusted = False
+    hub.reconfigure(client)
+    count = hub.counters().unroutable
+    world.station_.say(world.station_.sender.command(42, 1))
+    await world.until(lambda: hub.counters().unroutable == count + 1)
+    assert world.autopilot.is_silent()
+
+
+class TestRequests:
+    async def test_strangers_are_answered_as_far_as_their_common_share_goes(
+        self, world: Any
+    ) -> None:
+        before = len(world.incoming)
+        hub = world.world
+        hub._router.charge(hub.clients()[0].client_id, STRANGERS_BURST)
+        await lie(world, *(world.stranger.sender.command(1, 1) for _ in range(100)))
+        await world.quiet()
+        assert len(world.incoming) == before
+        assert hub.counters().unserved == 100 - 64
+        request = world.station_.sender.command(1, 1)
+        world.station_.say(request)
+        await world.until(lambda: world.incoming[-1].frame == request)
+
+    async def test_telemetry_passes_between_two_answers(self, world: Any) -> None:
+        """A flood of requests is served one by one, so nothing waits for more than one of them."""
+        order: list[Any] = []
+        world.world._router._on_frame = order.append
+        for _ in range(50):
+            world.station_.say(world.station_.sender.command(1, 1))
+        frame = world.autopilot.sender.attitude()
+        world.autopilot.say(frame)
+
+        def heard() -> bool:
+            if not world.station_.is_silent():
+                order.append(frame)
+            return frame in order
+
+        await world.until(heard)
+        assert order.index(frame) <= 5

@@ -1,0 +1,106 @@
+"""Requests in turns, answers within each client's means; on the manual clock."""
+
+from gateway.hub.request_queue import (
+    CLIENT_BURST,
+    CLIENT_RATE,
+    MAX_WAITING,
+    REQUEST_COST,
+    STRANGERS_BURST,
+    STRANGERS_RATE,
+    RequestQueue,
+)
+from gateway.records import Incoming
+from gateway.units import US_PER_S
+
+
+def asked(client_id: int, number: int = 0, *, trusted: bool = True) -> Incoming:
+    return Incoming(client_id, bytes((number,)), trusted)
+
+
+def test_in_turns_and_each_in_its_order() -> None:
+    queue = RequestQueue()
+    for number in range(3):
+        queue.offer(asked(1, number), 0)
+    queue.offer(asked(2), 0)
+    queue.offer(asked(3, trusted=False), 0)
+    taken = [queue.take(0) for _ in range(6)]
+    assert [(i.client_id, i.frame[0]) for i in taken if i] == [
+        (1, 0), (2, 0), (3, 0), (1, 1), (1, 2)
+    ]  # fmt: skip
+    assert taken[-1] is None
+    assert queue.wait_us(0) is None
+
+
+def test_a_flood_waits_for_itself() -> None:
+    queue = RequestQueue()
+    assert [queue.offer(asked(1), 0) for _ in range(MAX_WAITING + 1)][-2:] == [True, False]
+    assert queue.offer(asked(2), 0)
+    assert queue.take(0) == asked(1)
+    assert queue.take(0) == asked(2)
+
+
+def test_answers_are_paid_for_before_the_next_request() -> None:
+    queue = RequestQueue()
+    queue.offer(asked(1), 0)
+    queue.offer(asked(1), 0)
+    queue.take(0)
+    queue.charge(1, CLIENT_BURST)
+    assert queue.take(0) is None
+    wait_us = queue.wait_us(0)
+    assert wait_us
+    assert abs(wait_us - REQUEST_COST * US_PER_S / CLIENT_RATE) < 100
+    assert queue.take(wait_us) == asked(1)
+
+
+def test_one_in_debt_holds_up_nobody_else() -> None:
+    queue = RequestQueue()
+    for client_id in (1, 2):
+        queue.offer(asked(client_id), 0)
+    queue.charge(1, 2 * CLIENT_BURST)
+    assert queue.take(0) == asked(2)
+    assert queue.take(0) is None
+
+
+def test_strangers_share_one_purse_and_cannot_flee_their_debt() -> None:
+    queue = RequestQueue()
+    queue.offer(asked(1, trusted=False), 0)
+    queue.take(0)
+    queue.charge(1, STRANGERS_BURST)
+    queue.forget(1)
+    for client_id in (2, 3):
+        queue.offer(asked(client_id, trusted=False), 0)
+    queue.offer(asked(4), 0)
+    assert queue.take(0) == asked(4), "who is trusted is served all the same"
+    assert queue.take(0) is None
+    assert queue.take(US_PER_S) == asked(2, trusted=False)
+
+
+def test_what_strangers_may_cause_in_a_minute() -> None:
+    queue = RequestQueue()
+    answered = 0
+    for ms in range(60_000):
+        for client_id in range(32):
+            queue.offer(asked(client_id, trusted=False), ms * 1000)
+        if taken := queue.take(ms * 1000):
+            queue.charge(taken.client_id, 300)
+            answered += 1
+    assert answered <= (STRANGERS_BURST + 60 * STRANGERS_RATE) / (REQUEST_COST + 300) + 1
+
+
+def test_trust_taken_away_takes_the_purse_too() -> None:
+    queue = RequestQueue()
+    queue.offer(asked(9, trusted=False), 0)
+    queue.charge(9, 2 * STRANGERS_BURST)
+    queue.offer(asked(1), 0)
+    assert queue.take(0) == asked(1)
+    queue.offer(asked(1, trusted=False), 0)
+    assert queue.take(0) is None
+
+
+def test_who_has_gone_leaves_nothing() -> None:
+    queue = RequestQueue()
+    for client_id in range(1000):
+        queue.offer(asked(client_id), 0)
+        queue.forget(client_id)
+    assert queue.take(0) is None
+    assert (queue._lines, queue._turns) == ({}, {})

@@ -1,0 +1,328 @@
+"""TCP both ways and serial ports: broken and stalled peers, and what overtakes what."""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import pty
+import socket
+import sys
+import termios
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.hub.client_table import SILENT_AFTER_US
+from gateway.hub.transports.tcp import UNSENT_BYTES
+from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
+from tests.hub.conftest import LIMIT_S
+from tests.ports import free_port
+
+pytestmark = pytest.mark.io
+
+ATTITUDE, COMMAND_ACK = 30, 77
+SIOCOUTQNSD = 0x894B
+"""Bytes that the kernel has not sent, not even once."""
+
+
+async def connect(rig: Any, port: int) -> socket.socket:
+    client = socket.socket()
+    client.setblocking(False)
+    rig.closing.append(client.close)
+    await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
+    return client
+
+
+async def receive(client: socket.socket) -> bytes:
+    async with asyncio.timeout(LIMIT_S):
+        return await asyncio.get_running_loop().sock_recv(client, 65536)
+
+
+async def read_frames(client: socket.socket, count: int) -> list[bytes]:
+    splitter, frames = MavlinkSplitter(), []
+    while len(frames) < count:
+        data = await receive(client)
+        assert data
+        frames += splitter.feed(data)
+    return frames
+
+
+class TestTcpListen:
+    async def test_both_ways(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        client = await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        frames = await read_frames(client, 2)
+        assert [(message_id_of(frame), frame[4]) for frame in frames] == [(0, 0), (30, 1)]
+        said = rig.sender(255, 190).heartbeat()
+        client.send(said[:5])
+        client.send(said[5:])
+        await rig.until(lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].trusted
+
+    async def test_the_end_of_a_connection_is_the_end_of_the_client(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        client = await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        client.close()
+        await rig.until(lambda: not hub.clients())
+
+    async def test_at_most_so_many(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
+        for _ in range(2):
+            await connect(rig, hub.listening_ports()[0])
+        third = await connect(rig, hub.listening_ports()[0])
+        assert await receive(third) == b""
+        assert len(hub.clients()) == 2
+
+    async def test_a_stalled_client_loses_its_own_oldest_telemetry(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0", queue_bytes=4096)
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        port = hub.listening_ports()[0]
+        stalled, lively = await connect(rig, port), await connect(rig, port)
+        await rig.until(lambda: len(hub.clients()) == 2)
+        splitter, got = MavlinkSplitter(), []
+        sent = 0
+        while hub.clients()[0].dropped < 1000:
+            for _ in range(50):
+                hub.send(rig.out(rig.vehicle.raw_imu()))
+                sent += 1
+            await asyncio.sleep(0)
+            data = await asyncio.get_running_loop().sock_recv(lively, 65536)
+            got += splitter.feed(data)
+        while len(got) < sent + 1:
+            got += splitter.feed(await receive(lively))
+        slow, fast = hub.clients()
+        assert (fast.sent, fast.dropped) == (sent + 1, 0)
+        assert [frame[4] for frame in got] == [n & 0xFF for n in range(sent + 1)]
+        assert slow.sent + slow.dropped == sent + 1
+        late = await read_frames(stalled, slow.sent)
+        assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
+        assert hub.clients()[0].queued == 0
+
+    async def narrow_client(self, rig: Any, hub: Any) -> socket.socket:
+        """Connect with the smallest buffer that the kernel gives."""
+        client = socket.socket()
+        rig.closing.append(client.close)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
+        client.setblocking(False)
+        place = ("127.0.0.1", hub.listening_ports()[0])
+        await asyncio.get_running_loop().sock_connect(client, place)
+        await rig.until(lambda: len(hub.clients()) == 1)
+        return client
+
+    async def test_frames_wait_in_our_queue_and_not_in_the_kernels(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        await self.narrow_client(rig, hub)
+        for _ in range(5000):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            await asyncio.sleep(0)
+        assert hub.clients()[0].queued > 1000
+        assert hub.clients()[0].bytes_sent < 10_000
+
+    async def test_what_the_kernel_joins_does_not_wait_there_either(self, rig: Any) -> None:
+        """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        await connect(rig, hub.listening_ports()[0])
+        await rig.until(lambda: len(hub.clients()) == 1)
+        (client,) = hub._clients.values()
+        while not client.queued:
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+        unsent = fcntl.ioctl(client._socket, SIOCOUTQNSD, bytes(4))
+        assert int.from_bytes(unsent, sys.byteorder) < 2 * UNSENT_BYTES
+
+    async def test_a_slow_client_gets_what_is_fresh_and_answers_first(self, rig: Any) -> None:
+        """It takes 2 kB a second of 10."""
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        slow = await self.narrow_client(rig, hub)
+        splitter, heard = MavlinkSplitter(), list[tuple[int, bytes]]()
+        for now_ms in range(0, 12_000, 20):
+            rig.clock.us += 20_000
+            for _ in range(5):
+                hub.send(rig.out(rig.vehicle.pack(attitude_at(now_ms))))
+            if now_ms == 8000:
+                hub.send(rig.out(rig.vehicle.pack(dialect.MAVLink_command_ack_message(512, 0))))
+            await asyncio.sleep(0)
+            with contextlib.suppress(BlockingIOError):
+                heard += [(now_ms, frame) for frame in splitter.feed(slow.recv(40))]
+        late_ms = [now_ms - time_of(f) for now_ms, f in heard if message_id_of(f) == ATTITUDE]
+        (answered_ms,) = [now_ms for now_ms, f in heard if message_id_of(f) == COMMAND_ACK]
+        assert len(late_ms) > 400
+        assert max(late_ms[200:]) < 3500
+        assert answered_ms < 10_000
+
+
+def attitude_at(time_ms: int) -> Any:
+    return dialect.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 1.0)
+
+
+def time_of(frame: bytes) -> int:
+    return int.from_bytes(frame[10:14], "little")
+
+
+class TestTcpOut:
+    async def test_a_connection_to_itself_is_a_refusal(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The kernel may draw the wanted port, where nobody listens, as our own."""
+        loop = asyncio.get_running_loop()
+        connect = loop.sock_connect
+
+        async def from_there(sock: socket.socket, address: tuple[str, int]) -> None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            await connect(sock, address)
+
+        port = free_port()
+        monkeypatch.setattr(loop, "sock_connect", from_there)
+        hub = rig.hub(f"tcp:127.0.0.1:{port}")
+        await rig.until(lambda: hub.clients()[0].state in ("refused", "open"))
+        assert hub.clients()[0].state == "refused"
+
+    async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
+        self, rig: Any
+    ) -> None:
+        port = free_port()
+        hub = rig.hub(f"tcp:127.0.0.1:{port}")
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        for _ in range(2):
+            with socket.create_server(("127.0.0.1", port)) as server:
+                server.setblocking(False)
+                rig.clock.us += 2_000_000
+                async with asyncio.timeout(LIMIT_S):
+                    connection, _ = await asyncio.get_running_loop().sock_accept(server)
+            await rig.until_open(hub)
+            frame = rig.vehicle.attitude()
+            hub.send(rig.out(frame))
+            assert len(await read_frames(connection, 1)) == 1
+            connection.close()
+            await rig.until(lambda: hub.clients()[0].state != "open")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients()[0].dropped == 1
+
+
+class TestSerial:
+    @pytest.fixture
+    def line(self, rig: Any) -> tuple[int, str]:
+        near, far = pty.openpty()
+        rig.closing += [lambda: os.close(near), lambda: os.close(far)]
+        os.set_blocking(near, False)
+        attributes = termios.tcgetattr(near)
+        attributes[3] &= ~(termios.ECHO | termios.ICANON)
+        termios.tcsetattr(near, termios.TCSANOW, attributes)
+        return near, os.ttyname(far)
+
+    @staticmethod
+    async def read(rig: Any, near: int, size: int) -> bytes:
+        """Read so many bytes, which the kernel hands over when it has the time."""
+        data = b""
+
+        def is_all() -> bool:
+            nonlocal data
+            with contextlib.suppress(BlockingIOError):
+                data += os.read(near, size - len(data))
+            return len(data) == size
+
+        await rig.until(is_all)
+        return data
+
+    async def test_both_ways(self, rig: Any, line: tuple[int, str]) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:57600")
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await self.read(rig, near, len(frame)) == frame
+        said = rig.sender(255, 190).heartbeat()
+        os.write(near, b"noise" + said)
+        await rig.until(lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert hub.clients()[0].bytes_garbage == 5
+
+    async def test_a_radio_that_tells_of_a_full_buffer_is_sent_less(
+        self, rig: Any, line: tuple[int, str]
+    ) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:57600")
+        width = hub._fanout._outlets[1].width
+        radio = rig.sender(51, 68)
+        for count, free in enumerate((100, 10), start=1):
+            report = dialect.MAVLink_radio_status_message(200, 200, free, 30, 30, 0, 0)
+            os.write(near, radio.pack(report))
+            await rig.until(lambda count=count: hub.clients()[0].received == count)
+            assert width.share == (1.0 if free == 100 else 0.7)
+
+    async def test_the_attitude_overtakes_and_numbers_stay_in_order(
+        self, rig: Any, line: tuple[int, str]
+    ) -> None:
+        near, device = line
+        hub = rig.hub(f"serial:{device}:9600")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        for _ in range(15):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+        hub.send(rig.out(rig.vehicle.attitude()))
+        waiting = hub.clients()[0].queued
+        assert waiting > 10
+        splitter, frames = MavlinkSplitter(), []
+        while len(frames) < 17:
+            rig.clock.us += 1_000
+            await asyncio.sleep(0.001)
+            try:
+                frames += splitter.feed(os.read(near, 4096))
+            except BlockingIOError:
+                continue
+        ids = [message_id_of(frame) for frame in frames]
+        assert ids.index(30) <= 17 - waiting + 1
+        assert [frame[4] for frame in frames] == list(range(17))
+
+    async def test_a_port_that_goes_and_comes_back(
+        self, rig: Any, line: tuple[int, str], tmp_path: Any
+    ) -> None:
+        device = tmp_path / "radio"
+        device.symlink_to(line[1])
+        hub = rig.hub(f"serial:{device}:57600")
+        await rig.until_open(hub)
+        near, far = pty.openpty()
+        os.set_blocking(near, False)
+        hub._clients[1]._broke(OSError("pulled out"))
+        device.unlink()
+        rig.clock.us = 2_000_000
+        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(hub)
+        (client,) = hub.clients()
+        assert (client.state, client.dropped) == ("unreachable", 1)
+        assert client.reason == "No such file or directory"
+        device.symlink_to(os.ttyname(far))
+        rig.clock.us = 4_000_000
+        await rig.until_open(hub)
+        assert hub.clients()[0].reason == ""
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await self.read(rig, near, len(frame)) == frame
+        os.close(near)
+        await rig.until(lambda: hub.clients()[0].state == "unreachable")
+        os.close(far)
+
+
+async def test_silent_readers_make_room_for_newcomers(rig: Any) -> None:
+    hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
+    (port,) = hub.listening_ports()
+    readers = [rig.station(port, socket.SOCK_STREAM) for _ in range(2)]
+    for count, reader in enumerate(readers, start=1):
+        reader.socket.connect_ex(reader.target)
+        await rig.until(lambda count=count: len(hub.clients()) == count)
+    early = rig.station(port, socket.SOCK_STREAM)
+    early.socket.connect_ex(early.target)
+    await rig.until(lambda: hub.listeners()[0].turned_away == 1)
+    rig.clock.us += SILENT_AFTER_US
+    readers[1].socket.send(readers[1].sender.heartbeat())
+    await rig.until(lambda: hub.clients()[1].received == 1)
+    late = rig.station(port, socket.SOCK_STREAM)
+    late.socket.connect_ex(late.target)
+    await rig.until(lambda: hub.clients()[-1].remote == f"127.0.0.1:{late.port}")
+    remotes = [client.remote for client in hub.clients()]
+    assert remotes == [f"127.0.0.1:{each.port}" for each in (readers[1], late)]

@@ -1,0 +1,460 @@
+"""UDP clients, configured and calling: what they get, what they may say, how they go."""
+
+import asyncio
+import socket
+from typing import Any
+
+import pytest
+
+from gateway.hub.transports.udp import MAX_DATAGRAM
+from gateway.records import ClientInterval, Incoming
+
+pytestmark = pytest.mark.io
+
+
+async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: Any) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?name=laptop")
+    await rig.until_open(hub)
+    attitude, heartbeat = rig.vehicle.attitude(), rig.vehicle.heartbeat()
+    hub.send(rig.out(attitude))
+    assert await station.receive() == attitude
+    hub.send(rig.out(heartbeat))
+    data, station.target = await asyncio.get_running_loop().sock_recvfrom(station.socket, 100)
+    assert data == heartbeat
+    said = station.sender.heartbeat()
+    station.say(said)
+    await rig.until(lambda: bool(rig.incoming))
+    (client,) = hub.clients()
+    assert rig.incoming == [Incoming(client.client_id, said, trusted=True, forwarded=True)]
+    assert (client.name, client.sent, client.received) == ("laptop", 2, 1)
+    assert client.bytes_sent == len(attitude) + len(heartbeat)
+    assert client.systems == ((255, 190),)
+
+
+async def test_whoever_speaks_to_the_port_is_served_and_greeted_without_a_gap(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    home, heartbeat = rig.vehicle.home(), rig.vehicle.heartbeat()
+    hub.send(rig.out(home))
+    hub.send(rig.out(heartbeat))
+    rig.vehicle.link.seq = 77
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: bool(rig.incoming))
+    hub.send(rig.out(rig.vehicle.attitude()))
+    frames = [await station.receive() for _ in range(3)]
+    assert [frame[7] for frame in frames] == [0, 242, 30]
+    assert [frame[4] for frame in frames] == [75, 76, 77]
+    assert rig.incoming[0].trusted
+
+
+async def test_clients_of_one_port_are_told_apart(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
+    for place, station in enumerate(stations):
+        station.sender.link.srcSystem = 200 + place
+        station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 5)
+    for _ in range(3):
+        for station in stations:
+            station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 20)
+    assert [client.received for client in hub.clients()] == [4] * 5
+    assert {client.systems for client in hub.clients()} == {
+        ((200 + place, 190),) for place in range(5)
+    }
+    answered = hub.clients()[2]
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame, answered.client_id))
+    told = [station for station in stations if not station.is_silent()]
+    assert [f"127.0.0.1:{station.port}" for station in told] == [answered.remote]
+
+
+async def test_noise_and_odd_sizes_make_no_client(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    noise = rig.station(hub.listening_ports()[0])
+    for data in (b"", b"hello", b"\xfe" * 65507):
+        noise.say(data)
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: bool(rig.incoming))
+    assert len(hub.clients()) == 1
+
+
+async def test_odd_sizes_from_a_client_are_counted(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    station = rig.station(hub.listening_ports()[0])
+    for data in (station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat()):
+        station.say(data)
+    await rig.until(lambda: len(rig.incoming) == 2)
+    assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
+
+
+async def test_a_silent_client_goes(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=10.0)
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    rig.clock.us = 11_000_000
+    await rig.until(lambda: not hub.clients())
+
+
+async def test_a_killed_client_goes_when_its_machine_says_so(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    station.socket.close()
+    hub.send(rig.out(rig.vehicle.attitude()))
+    await rig.until(lambda: hub.clients()[0].state == "refused")
+    rig.clock.us = 4_000_000
+    await rig.until(lambda: not hub.clients())
+
+
+async def test_a_caller_is_called_by_its_port_too(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?name=tablets", "tcp-listen:127.0.0.1:0?name=bench")
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    with socket.create_connection(("127.0.0.1", hub.listening_ports()[1])):
+        await rig.until(lambda: len(hub.clients()) == 2)
+        names = sorted(client.name.partition(" ")[0] for client in hub.clients())
+    assert names == ["bench", "tablets"]
+
+
+async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == 1)
+    station.socket.close()
+    hub.send(rig.out(rig.vehicle.attitude()))
+    await rig.until(lambda: hub.clients()[0].state == "refused")
+    for _ in range(100):
+        hub.send(rig.out(rig.vehicle.attitude()))
+    (caller,) = hub.clients()
+    assert (caller.sent + caller.unheard, caller.dropped) == (101, 0)
+    assert caller.unheard >= 99
+    assert caller.reason == "nobody listens there"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
+        again.setblocking(False)
+        again.bind(("127.0.0.1", station.port))
+        again.sendto(station.sender.heartbeat(), station.target)
+        await rig.until(lambda: hub.clients()[0].received == 2)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await asyncio.get_running_loop().sock_recv(again, 100) == frame
+    assert len(hub.clients()) == 1
+
+
+async def test_back_on_another_port_replaces_itself(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
+    before, after = (rig.station(hub.listening_ports()[0]) for _ in range(2))
+    before.say(before.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 1)
+    rig.clock.us = 4_000_000
+    after.say(after.sender.attitude())
+    await rig.until(lambda: len(rig.incoming) == 2)
+    await rig.until(lambda: len(hub.clients()) == 1)
+    assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"
+
+
+async def test_at_most_so_many(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=2)
+    stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
+    for station in stations:
+        station.say(station.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 2)
+    last = stations[0].sender.heartbeat()
+    stations[0].say(last)
+    await rig.until(lambda: rig.incoming[-1].frame == last)
+    assert len(hub.clients()) == 2
+
+
+async def test_a_refused_port_is_counted_and_hurts_nobody(rig: Any) -> None:
+    gone, station = rig.station(), rig.station()
+    gone.socket.close()
+    hub = rig.hub(f"udp:127.0.0.1:{gone.port}", f"udp:127.0.0.1:{station.port}")
+    await rig.until_open(hub)
+    for _ in range(10):
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await station.receive() == frame
+    refused, fine = hub.clients()
+    assert refused.state == "refused"
+    assert (refused.sent + refused.unheard, refused.dropped) == (10, 0)
+    assert refused.reason == "nobody listens there"
+    assert (fine.sent, fine.dropped) == (10, 0)
+
+
+async def test_a_station_that_starts_late_loses_nothing_after_its_start(rig: Any) -> None:
+    late = rig.station()
+    late.socket.close()
+    hub = rig.hub(f"udp:127.0.0.1:{late.port}")
+    await rig.until_open(hub)
+    for _ in range(5):
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as started:
+        started.setblocking(False)
+        started.bind(("127.0.0.1", late.port))
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await asyncio.get_running_loop().sock_recv(started, 100) == frame
+
+
+async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    station = rig.station()
+    known: list[str] = []
+
+    async def resolve(host: str, port: int, **_: object) -> list[object]:
+        if host not in known:
+            raise socket.gaierror(socket.EAI_AGAIN, "no network yet")
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", ("127.0.0.1", port))]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    hub = rig.hub(f"udp:observer.example:{station.port}")
+    hub.send(rig.out(rig.vehicle.attitude()))
+    (client,) = hub.clients()
+    assert (client.state, client.dropped) == ("resolving", 1)
+    known.append("observer.example")
+    rig.clock.us = 2_000_000
+    await rig.until_open(hub)
+    frame = rig.vehicle.attitude()
+    hub.send(rig.out(frame))
+    assert await station.receive() == frame
+
+
+async def test_of_two_addresses_the_one_that_does_not_refuse(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `localhost` has, whose first address is often not the one that a station listens at."""
+    station = rig.station()
+
+    async def resolve(host: str, port: int, **_: object) -> list[object]:
+        addresses = (("127.0.0.2", port), ("127.0.0.1", port))
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", address) for address in addresses]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    hub = rig.hub(f"udp:here.example:{station.port}")
+    await rig.until_open(hub)
+    assert hub.clients()[0].remote == f"127.0.0.2:{station.port}"
+    hub.send(rig.out(rig.vehicle.attitude()))
+    await rig.until(lambda: hub.clients()[0].state == "refused")
+    for second in range(1, 5):
+        rig.clock.us = second * 1_000_000
+        rig.tick(hub)
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients()[0].remote == f"127.0.0.1:{station.port}"
+        assert (await station.receive())[7] == 30
+
+
+async def test_a_name_moves_to_another_address(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new = rig.station(), rig.station()
+    ports = [old.port]
+
+    async def resolve(host: str, port: int, **_: object) -> list[object]:
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", ("127.0.0.1", ports[-1]))]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    hub = rig.hub("udp:observer.example:14550")
+    await rig.until_open(hub)
+    source = hub._clients[1]._socket.getsockname()
+    for moved_at_us in (61_000_000, 122_000_000):
+        rig.clock.us = moved_at_us
+        await rig.until(lambda at_us=moved_at_us: hub._clients[1]._resolve_us > at_us)
+        await rig.until(lambda: hub._clients[1]._task is None)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        station = old if ports == [old.port] else new
+        assert await station.receive() == frame
+        assert hub._clients[1]._socket.getsockname() == source
+        ports.append(new.port)
+
+
+async def test_an_answer_and_a_wish_concern_one_client(rig: Any) -> None:
+    first, second = rig.station(), rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{first.port}", f"udp:127.0.0.1:{second.port}")
+    await rig.until_open(hub)
+    one, _ = hub.clients()
+    answer = rig.vehicle.heartbeat()
+    hub.send(rig.out(answer, one.client_id))
+    assert await first.receive() == answer
+    hub.set_interval(ClientInterval(one.client_id, 1, 30, -1))
+    hub.send(rig.out(rig.vehicle.attitude()))
+    assert (await second.receive())[4] == 0
+    assert first.is_silent()
+    assert second.is_silent()
+
+
+class Waiting:
+    """A socket with datagrams in it, which counts how often it is read."""
+
+    def __init__(self, *datagrams: bytes) -> None:
+        self.datagrams = list(datagrams)
+        self.reads = 0
+
+    def recv(self, _size: int) -> bytes:
+        self.reads += 1
+        if not self.datagrams:
+            raise BlockingIOError
+        return self.datagrams.pop(0)
+
+
+async def test_datagrams_one_by_one_cost_one_read_each_and_a_burst_is_read_at_once(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}")
+    await rig.until_open(hub)
+    (client,) = hub._clients.values()
+    clock = [1_000_000]
+    monkeypatch.setattr(hub, "now_us", lambda: clock[0])
+
+    def wake_up(waiting: Waiting) -> Waiting:
+        with monkeypatch.context() as patch:
+            patch.setattr(client, "_socket", waiting)
+            client._on_readable(waiting)
+        return waiting
+
+    for _ in range(3):
+        clock[0] += 1000
+        alone = wake_up(Waiting(station.sender.heartbeat()))
+        assert (alone.reads, alone.datagrams) == (1, [])
+    burst = Waiting(*(station.sender.heartbeat() for _ in range(10)))
+    clock[0] += 1000
+    assert wake_up(burst).reads == 1
+    clock[0] += 50
+    assert (wake_up(burst).reads, burst.datagrams) == (11, [])
+    assert client.counters.received == 13
+
+
+async def test_packed_frames_share_a_datagram(rig: Any) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=30")
+    await rig.until_open(hub)
+    frames = [rig.vehicle.attitude() for _ in range(5)]
+    for frame in frames:
+        hub.send(rig.out(frame))
+    first, second = await station.receive(), await station.receive()
+    assert (first, second) == (b"".join(frames[:2]), b"".join(frames[2:4]))
+    assert await station.receive() == frames[4]
+    assert hub.clients()[0].sent == 5
+
+
+async def test_packing_waits_for_nothing_but_what_comes_at_once(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two datagrams that are read at one wake-up go on as one, without a timer."""
+    station = rig.station()
+    hub = rig.hub("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}?pack=1100")
+    await rig.until_open(hub)
+    source = rig.station(hub.listening_ports()[0])
+    source.sender = rig.sender(42, 1)
+    source.say(source.sender.heartbeat())
+    assert (await station.receive())[5] == 42
+    frames = [source.sender.attitude() for _ in range(3)]
+    loop = asyncio.get_running_loop()
+    now_s = loop.time()
+    monkeypatch.setattr(loop, "time", lambda: now_s)
+    for frame in frames:
+        source.say(frame)
+    assert await station.receive() == b"".join(frames)
+    assert hub._gathering == {}
+
+
+async def test_packing_may_wait(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=1100&wait=20")
+    await rig.until_open(hub)
+    loop = asyncio.get_running_loop()
+    now_s = [loop.time()]
+    monkeypatch.setattr(loop, "time", lambda: now_s[0])
+    frames = [rig.vehicle.attitude() for _ in range(3)]
+    for frame in frames:
+        hub.send(rig.out(frame))
+        now_s[0] += 0.006
+        await asyncio.sleep(0)
+        assert station.is_silent()
+    now_s[0] += 0.003
+    assert await station.receive() == b"".join(frames)
+
+
+async def test_a_packing_client_that_goes_before_the_flush(rig: Any) -> None:
+    errors: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}?pack=1100")
+    await rig.until_open(hub)
+    hub.send(rig.out(rig.vehicle.attitude()))
+    hub.remove(f"udp:127.0.0.1:{station.port}")
+    await rig.quiet()
+    assert errors == []
+
+
+async def test_a_full_socket_buffer_drops_the_oldest(rig: Any) -> None:
+    station = rig.station()
+    hub = rig.hub(f"udp:127.0.0.1:{station.port}")
+    await rig.until_open(hub)
+    link = hub._clients[hub.clients()[0].client_id]
+    direct, room = link._direct, [0]
+
+    def stuffed(data: bytes) -> object:
+        if not room[0]:
+            raise BlockingIOError
+        room[0] -= 1
+        return direct(data)
+
+    link.write = link._direct = stuffed
+    frames = [rig.vehicle.attitude() for _ in range(300)]
+    for frame in frames:
+        hub.send(rig.out(frame))
+    (client,) = hub.clients()
+    assert (client.queued, client.sent, client.dropped) == (256, 256, 44)
+    room[0] = 1000
+    assert [await station.receive() for _ in range(256)] == frames[44:]
+    assert hub.clients()[0].queued == 0
+    newest = rig.vehicle.attitude()
+    hub.send(rig.out(newest))
+    assert await station.receive() == newest
+
+
+async def test_ipv6_on_both_kinds(rig: Any) -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as station:
+        station.setblocking(False)
+        station.bind(("::1", 0))
+        hub = rig.hub("udp-listen:[::1]:0", f"udp:[::1]:{station.getsockname()[1]}")
+        await rig.until_open(hub)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await asyncio.get_running_loop().sock_recv(station, 100) == frame
+        station.sendto(rig.sender(255, 190).heartbeat(), ("::1", hub.listening_ports()[0]))
+        await rig.until(lambda: len(hub.clients()) == 2)
+    assert all(client.trusted for client in hub.clients())
+
+
+async def test_a_second_gateway_on_the_same_port_waits(rig: Any) -> None:
+    first = rig.hub("udp-listen:127.0.0.1:0")
+    port = first.listening_ports()[0]
+    second = rig.hub(f"udp-listen:127.0.0.1:{port}")
+    assert second.listening_ports() == (0,)
+    first.close()
+    rig.clock.us = 2_000_000
+    await rig.until(lambda: second.listening_ports() == (port,))
+
+
+async def test_a_thousand_come_and_go(rig: Any) -> None:
+    settings = {"max_clients": 8, "idle_timeout_s": 1000.0, "ping_interval_s": 0.0}
+    hub = rig.hub("udp-listen:127.0.0.1:0", **settings)
+    steady = rig.station(hub.listening_ports()[0])
+    steady.say(steady.sender.heartbeat())
+    await rig.until(lambda: len(rig.incoming) == 1)
+    for visit in range(1000):
+        rig.clock.us += 1_000_000
+        steady.say(steady.sender.heartbeat())
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as visitor:
+            visitor.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), steady.target)
+        await rig.until(lambda count=2 * visit + 3: len(rig.incoming) == count)
+        frame = rig.vehicle.attitude()
+        hub.send(rig.out(frame))
+        assert await steady.receive() == frame
+    assert len(hub.clients()) <= 8
+    assert hub.clients()[0].dropped == 0

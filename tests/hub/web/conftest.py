@@ -1,0 +1,144 @@
+"""Programs that speak WebSocket to a hub, and a certificate of this machine."""
+
+import asyncio
+import socket
+import ssl
+import subprocess
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import AcceptConnection, BytesMessage, Event, Ping, Request
+
+from gateway.wire.mavlink_splitter import MavlinkSplitter
+from tests.hub.conftest import LIMIT_S, Rig
+
+
+@pytest.fixture(scope="session")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a PEM file with a certificate of 127.0.0.1 and its key."""
+    folder = tmp_path_factory.mktemp("tls")
+    key, certificate = folder / "key.pem", folder / "certificate.pem"
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
+            *("-nodes", "-days", "30", "-subj", "/CN=mavgate", "-keyout", key, "-out", certificate),
+            *("-addext", "subjectAltName=IP:127.0.0.1"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    certificate.write_text(certificate.read_text() + key.read_text())
+    return certificate
+
+
+class Page:
+    """A program at the other end, reading and writing without blocking the loop."""
+
+    def __init__(self) -> None:
+        self.web = WSConnection(ConnectionType.CLIENT)
+        self.splitter = MavlinkSplitter()
+        self.events: list[Event] = []
+        self.messages: list[bytes] = []
+        self.answers_pings = True
+        self.writer: asyncio.StreamWriter | None = None
+
+    async def connect(
+        self, port: int, origin: str = "", tls: ssl.SSLContext | None = None
+    ) -> "Page":
+        self.reader, self.writer = await asyncio.open_connection(
+            "127.0.0.1", port, ssl=tls, server_hostname="127.0.0.1" if tls else None
+        )
+        headers = [(b"Origin", origin.encode())] if origin else []
+        self.writer.write(
+            self.web.send(Request(host=f"127.0.0.1:{port}", target="/", extra_headers=headers))
+        )
+        await self.until(lambda: bool(self.events))
+        return self
+
+    @property
+    def is_open(self) -> bool:
+        return isinstance(self.events[0], AcceptConnection)
+
+    async def take(self) -> bool:
+        """Take what comes next; tell whether anything came before the end."""
+        try:
+            data = await asyncio.wait_for(self.reader.read(65536), LIMIT_S)
+        except ConnectionError:
+            # The hub closed while something of ours was still unread.
+            return False
+        if not data:
+            return False
+        self.web.receive_data(data)
+        for event in self.web.events():
+            self.events.append(event)
+            if isinstance(event, BytesMessage):
+                self.messages.append(bytes(event.data))
+            elif isinstance(event, Ping) and self.answers_pings:
+                self.writer.write(self.web.send(event.response()))
+        return True
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(LIMIT_S):
+            while not condition():
+                assert await self.take()
+
+    async def frames(self, count: int) -> list[bytes]:
+        """Read until so many messages have come; return their frames."""
+        await self.until(lambda: len(self.messages) >= count)
+        return [frame for event in self.messages for frame in self.splitter.feed(event)]  # type: ignore[misc]
+
+    async def end(self) -> None:
+        """Read until the server has closed."""
+        async with asyncio.timeout(LIMIT_S):
+            while await self.take():
+                pass
+
+    def say(self, data: bytes) -> None:
+        self.writer.write(self.web.send(BytesMessage(data=data)))
+
+    def close(self) -> None:
+        if self.writer is not None:
+            self.writer.transport.abort()
+
+
+@pytest.fixture
+async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
+    """Return what opens a WebSocket to a hub's port."""
+    pages: list[Page] = []
+
+    async def open_page(port: int, origin: str = "", tls: ssl.SSLContext | None = None) -> Page:
+        pages.append(Page())
+        return await pages[-1].connect(port, origin, tls)
+
+    yield open_page
+    for page in pages:
+        page.close()
+    await rig.quiet()
+
+
+@pytest.fixture
+def plug(rig: Rig) -> Callable[..., Any]:
+    """Return what opens a bare connection to a hub's port."""
+
+    async def open_socket(port: int, *, room_bytes: int = 0) -> socket.socket:
+        sock = socket.socket()
+        sock.setblocking(False)
+        if room_bytes:
+            # Before it connects: a window that shrinks later makes the kernel drop what comes.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room_bytes)
+        rig.closing.append(sock.close)
+        await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+        return sock
+
+    return open_socket
+
+
+async def hung_up(sock: socket.socket) -> bool:
+    """Tell whether the hub closes a bare connection without a word."""
+    try:
+        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), LIMIT_S) == b""
+    except ConnectionError:
+        return True

@@ -1,0 +1,392 @@
+"""The hub's WebSockets: pages and programs, slow and gone, and what they may."""
+
+import asyncio
+import re
+import resource
+import shutil
+import socket
+import ssl
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wsproto.events import CloseConnection, RejectConnection, TextMessage
+
+from gateway.hub.settings import HubSettings
+from gateway.wire.mavlink_splitter import message_id_of
+from tests.hub.conftest import LIMIT_S, Rig
+from tests.hub.web.conftest import hung_up
+
+pytestmark = pytest.mark.io
+
+LISTEN = "ws-listen:127.0.0.1:0"
+Visit = Callable[..., Any]
+
+
+@pytest.fixture
+def many_descriptors() -> Iterator[None]:
+    """Let this process have enough open files for both ends of a thousand connections."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 4096:
+        pytest.skip(f"this machine allows {hard} open files")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 4096), hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+class TestPages:
+    async def test_both_ways(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        page = await visit(hub.listening_ports()[0], "http://localhost:8080")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        frames = await page.frames(2)
+        assert [(message_id_of(frame), frame[4]) for frame in frames] == [(0, 0), (30, 1)]
+        assert len(page.messages) == 2
+        said = rig.sender(255, 190).heartbeat()
+        page.say(said[:5])
+        page.say(said[5:])
+        await rig.until(lambda: bool(rig.incoming))
+        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].trusted
+        (client,) = hub.clients()
+        assert (client.state, client.systems) == ("open", ((255, 190),))
+        assert (client.sent, client.received, client.bytes_received) == (2, 1, len(said))
+        assert client.remote.startswith("127.0.0.1:")
+
+    async def test_text_is_counted_and_refused_nobody(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        page = await visit(hub.listening_ports()[0])
+        page.writer.write(page.web.send(TextMessage(data="hello")))
+        await rig.until(lambda: hub.clients()[0].bytes_garbage == 5)
+        assert hub.clients()[0].state == "open"
+
+    async def test_a_page_of_elsewhere_is_refused_and_reported(
+        self, rig: Rig, visit: Visit, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        hub = rig.hub(LISTEN)
+        page = await visit(hub.listening_ports()[0], "https://example.org")
+        assert isinstance(page.events[0], RejectConnection)
+        assert page.events[0].status_code == 403
+        await page.end()
+        assert not hub.clients()
+        assert hub.listeners()[0].turned_away == 1
+        assert "'https://example.org' was refused" in caplog.text
+
+    async def test_a_named_page_may_come(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(f"{LISTEN}?origins=https://example.org,null&trusted=no")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        page = await visit(hub.listening_ports()[0], "https://example.org")
+        assert page.is_open
+        assert (await visit(hub.listening_ports()[0], "null")).is_open
+        assert not (await visit(hub.listening_ports()[0], "https://example.com")).is_open
+        page.say(rig.sender(255, 190).command(1, 1))
+        await rig.until(lambda: bool(rig.incoming))
+        assert not rig.incoming[0].trusted
+
+    async def test_filters_and_rates_hold(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(f"{LISTEN}?deny=RAW_IMU&rate=ATTITUDE:1")
+        page = await visit(hub.listening_ports()[0])
+        for _ in range(4):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+            hub.send(rig.out(rig.vehicle.attitude()))
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        frames = await page.frames(2)
+        assert [(message_id_of(frame), frame[4]) for frame in frames] == [(30, 0), (0, 1)]
+
+    async def test_packed_frames_share_messages(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(f"{LISTEN}?pack=200")
+        page = await visit(hub.listening_ports()[0])
+        for _ in range(9):
+            hub.send(rig.out(rig.vehicle.raw_imu()))
+        size = len(rig.vehicle.raw_imu())
+        await page.until(lambda: sum(map(len, page.messages)) >= 9 * size)
+        frames = await page.frames(1)
+        assert [frame[4] for frame in frames] == list(range(9))
+        assert max(map(len, page.messages)) <= 200
+        assert hub.clients()[0].sent == 9
+
+    async def test_the_end_of_a_page_is_the_end_of_the_client(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        page, other = [await visit(hub.listening_ports()[0]) for _ in range(2)]
+        page.writer.write(page.web.send(CloseConnection(code=1001)))
+        await page.end()
+        assert page.events[-1].code == 1001
+        other.close()
+        await rig.until(lambda: not hub.clients())
+
+    async def test_a_port_that_closes_says_good_bye(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        page = await visit(hub.listening_ports()[0])
+        hub.close()
+        await page.end()
+        assert page.events[-1].code == 1001
+
+
+class TestTrouble:
+    async def test_a_stalled_page_loses_its_own_oldest_telemetry(
+        self, rig: Rig, visit: Visit
+    ) -> None:
+        hub = rig.hub(LISTEN, queue_bytes=4096)
+        stalled, lively = [await visit(hub.listening_ports()[0]) for _ in range(2)]
+        stalled.reader._transport.pause_reading()
+        sent = 0
+        while hub.clients()[0].dropped < 500:
+            for _ in range(50):
+                hub.send(rig.out(rig.vehicle.raw_imu()))
+                sent += 1
+            await lively.until(lambda: len(lively.messages) == sent)  # noqa: B023
+        slow, fast = hub.clients()
+        assert (fast.sent, fast.dropped, fast.queued) == (sent, 0, 0)
+        assert [frame[4] for frame in await lively.frames(sent)] == [n & 255 for n in range(sent)]
+        assert slow.sent + slow.dropped == sent
+        stalled.reader._transport.resume_reading()
+        late = await stalled.frames(slow.sent)
+        assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
+        assert hub.clients()[0].queued == 0
+
+    async def test_who_asks_and_never_reads_is_dropped(self, rig: Rig, plug: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        sock = await plug(hub.listening_ports()[0], room_bytes=4096)
+        await self.shake_hands(rig, hub, sock)
+        ping = b"\x89\xfd" + bytes(4 + 125)
+        async with asyncio.timeout(LIMIT_S):
+            while hub.clients():
+                try:
+                    await asyncio.get_running_loop().sock_sendall(sock, ping * 30)
+                except ConnectionError:
+                    break
+        await rig.until(lambda: not hub.clients())
+
+    async def test_a_page_that_no_longer_answers_is_dropped(self, rig: Rig, visit: Visit) -> None:
+        """Half-open: its machine is gone, and nothing tells us."""
+        hub = rig.hub(LISTEN, idle_timeout_s=9)
+        page, mute = [await visit(hub.listening_ports()[0]) for _ in range(2)]
+        mute.answers_pings = False
+        rig.clock.us += 3_000_000
+        rig.tick(hub)
+        pings = len(page.events) + 1
+        await page.until(lambda: len(page.events) >= pings)
+        await rig.until(lambda: hub._clients[1]._answers)
+        page.answers_pings = False
+        for _ in range(2):
+            rig.clock.us += 4_000_000
+            rig.tick(hub)
+            assert len(hub.clients()) == 2
+        rig.clock.us += 4_000_000
+        rig.tick(hub)
+        (left,) = hub.clients()
+        assert left.client_id == 2, "one that never answered pings is left to the kernel"
+
+    async def test_who_never_shakes_hands_is_dropped(self, rig: Rig, plug: Visit) -> None:
+        hub = rig.hub(LISTEN)
+        sock = await plug(hub.listening_ports()[0])
+        await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
+        (listener,) = hub._endpoints.values()
+        await rig.until(lambda: len(listener._callers) == 1)  # type: ignore[union-attr]
+        assert not hub.clients()
+        rig.clock.us += 5_000_000
+        rig.tick(hub)
+        assert await hung_up(sock)
+        assert not listener._callers  # type: ignore[union-attr]
+
+    async def test_who_never_shakes_hands_keeps_nobody_out(
+        self, rig: Rig, plug: Visit, visit: Visit
+    ) -> None:
+        hub = rig.hub(LISTEN, max_clients=3)
+        port = hub.listening_ports()[0]
+        for _ in range(20):
+            await plug(port)
+        pages = [await visit(port) for _ in range(3)]
+        assert all(page.is_open for page in pages)
+        assert len(hub.clients()) == 3
+        late = await plug(port)
+        assert await hung_up(late)
+        assert len(hub.clients()) == 3
+
+    @pytest.mark.parametrize("seed", range(10))
+    async def test_garbage_ends_only_its_own_connection(
+        self, rig: Rig, plug: Visit, visit: Visit, seed: int
+    ) -> None:
+        hub = rig.hub(LISTEN)
+        page = await visit(hub.listening_ports()[0])
+        sock = await plug(hub.listening_ports()[0])
+        if seed % 2:
+            await self.shake_hands(rig, hub, sock)
+        await asyncio.get_running_loop().sock_sendall(sock, bytes(range(seed, 250)) * 20)
+        await rig.until(lambda: len(hub.clients()) == 1 and not self.callers(hub))
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert len(await page.frames(1)) == 1
+
+    @pytest.mark.usefixtures("many_descriptors")
+    async def test_a_thousand_connections(self, rig: Rig, visit: Visit) -> None:
+        hub = rig.hub(LISTEN, max_clients=1000, ping_interval_s=0)
+        port = hub.listening_ports()[0]
+        pages = []
+        for _ in range(20):
+            pages += await asyncio.gather(*(visit(port) for _ in range(50)))
+        assert len(hub.clients()) == 1000
+        for _ in range(5):
+            hub.send(rig.out(rig.vehicle.attitude()))
+        for page in pages:
+            assert [frame[4] for frame in await page.frames(5)] == list(range(5))
+        assert {client.sent for client in hub.clients()} == {5}
+        for page in pages:
+            page.close()
+        await rig.until(lambda: not hub.clients())
+
+    @staticmethod
+    def callers(hub: Any) -> int:
+        return sum(len(listener._callers) for listener in hub._endpoints.values())
+
+    @staticmethod
+    async def shake_hands(rig: Rig, hub: Any, sock: socket.socket) -> None:
+        before = len(hub.clients())
+        await asyncio.get_running_loop().sock_sendall(
+            sock,
+            b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n",
+        )
+        await rig.until(lambda: len(hub.clients()) > before)
+
+
+class TestCalling:
+    async def test_connects_again_when_the_server_comes_back(self, rig: Rig) -> None:
+        server = rig.hub(LISTEN)
+        port = server.listening_ports()[0]
+        hub = rig.hub(f"ws:127.0.0.1:{port}?path=/raw")
+        await rig.until_open(hub)
+        hub.send(rig.out(rig.sender(7).attitude()))
+        await rig.until(lambda: bool(server.clients()) and server.clients()[0].received == 1)
+        server.send(rig.out(rig.sender(8).attitude()))
+        await rig.until(lambda: hub.clients()[0].received == 1)
+        server.close()
+        await rig.until(lambda: hub.clients()[0].state != "open")
+        hub.send(rig.out(rig.vehicle.attitude()))
+        assert hub.clients()[0].dropped == 1
+        again = rig.hub(f"ws-listen:127.0.0.1:{port}")
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        await rig.until_open(hub)
+        assert len(again.clients()) == 1
+
+    async def test_a_server_that_refuses_is_named(self, rig: Rig) -> None:
+        async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n")
+            writer.close()
+
+        server = await asyncio.start_server(refuse, "127.0.0.1", 0)
+        hub = rig.hub(f"ws:127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        assert hub.clients()[0].reason == "the server answers HTTP 403"
+        hub.close()
+        server.close()
+        await rig.quiet()
+
+    async def test_a_server_that_never_answers_is_given_up(self, rig: Rig) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            hub = rig.hub(f"ws:127.0.0.1:{server.getsockname()[1]}")
+            await rig.until(lambda: bool(hub._clients[1].is_connected))
+            rig.clock.us += 5_000_000
+            rig.tick(hub)
+            assert hub.clients()[0].state == "refused"
+            assert hub.clients()[0].reason == "no handshake"
+            hub.close()
+
+
+class TestTls:
+    async def test_both_ends(self, rig: Rig, visit: Visit, certificate: Path) -> None:
+        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+        port = server.listening_ports()[0]
+        hub = rig.hub(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
+        await rig.until_open(hub)
+        page = await visit(port, tls=ssl.create_default_context(cafile=certificate))
+        hub.send(rig.out(rig.sender(7).attitude()))
+        (frame,) = await page.frames(1)
+        assert frame[5] == 7
+        for _ in range(500):
+            server.send(rig.out(rig.vehicle.raw_imu()))
+        await rig.until(lambda: hub.clients()[0].received == 500)
+        assert len(await page.frames(501)) == 501
+
+    async def test_a_stalled_page_within_tls(
+        self, rig: Rig, visit: Visit, certificate: Path
+    ) -> None:
+        hub = rig.hub(
+            "wss-listen:127.0.0.1:0?pack=1100", tls_certificate=str(certificate), queue_bytes=4096
+        )
+        tls = ssl.create_default_context(cafile=certificate)
+        page = await visit(hub.listening_ports()[0], tls=tls)
+        page.reader._transport.pause_reading()
+        sent = 0
+        while hub.clients()[0].dropped < 500:
+            for _ in range(50):
+                hub.send(rig.out(rig.vehicle.raw_imu()))
+                sent += 1
+            await asyncio.sleep(0)
+        page.reader._transport.resume_reading()
+        (slow,) = hub.clients()
+        got = 0
+        async with asyncio.timeout(LIMIT_S):
+            while got < slow.sent:
+                await page.take()
+                got = sum(len(data) for data in page.messages) // len(rig.vehicle.raw_imu())
+        frames = await page.frames(1)
+        assert [frame[4] for frame in frames] == [n & 255 for n in range(slow.sent)]
+
+    async def test_a_stranger_is_not_believed(self, rig: Rig, certificate: Path) -> None:
+        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+        hub = rig.hub(f"wss:127.0.0.1:{server.listening_ports()[0]}")
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        assert hub.clients()[0].reason == "tls: certificate verify failed: self-signed certificate"
+        await rig.until(lambda: server.listeners()[0].turned_away == 1)
+        assert not server.clients()
+
+    async def test_a_certificate_of_another_is_named(self, rig: Rig, certificate: Path) -> None:
+        """What is wrong with it is not the same for who has to mend it: name, date, authority."""
+        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+        port = server.listening_ports()[0]
+        hub = rig.hub(f"wss:localhost:{port}", tls_authority=str(certificate))
+        await rig.until(lambda: hub.clients()[0].state == "refused")
+        assert "certificate is not valid for 'localhost'" in hub.clients()[0].reason
+
+    async def test_plain_speech_is_refused(
+        self, rig: Rig, plug: Visit, certificate: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+        sock = await plug(hub.listening_ports()[0])
+        await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n\r\n")
+        await rig.until(lambda: hub.listeners()[0].turned_away == 1)
+        assert re.search("tls: http request", caplog.text)
+
+    async def test_a_new_certificate_holds_at_once(
+        self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
+    ) -> None:
+        file = tmp_path / "mine.pem"
+        shutil.copy(certificate, file)
+        hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(file))
+        port = hub.listening_ports()[0]
+        tls = ssl.create_default_context(cafile=certificate)
+        assert (await visit(port, tls=tls)).is_open
+        file.write_text("no certificate")
+        with pytest.raises(ConnectionError):
+            await visit(port, tls=tls)
+        shutil.copy(certificate, file)
+        assert (await visit(port, tls=tls)).is_open
+
+    async def test_a_missing_certificate_is_reported_and_waited_for(
+        self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
+    ) -> None:
+        file = tmp_path / "mine.pem"
+        hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(file))
+        assert hub.listeners()[0].reason == "No such file or directory"
+        shutil.copy(certificate, file)
+        rig.clock.us += 2_000_000
+        rig.tick(hub)
+        assert hub.listeners()[0].state == "open"
+
+    def test_settings_without_a_certificate_are_refused(self) -> None:
+        with pytest.raises(ValueError, match="needs a tls_certificate"):
+            HubSettings(endpoints=("wss-listen:127.0.0.1:56781",))

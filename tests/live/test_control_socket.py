@@ -1,0 +1,288 @@
+"""The control socket: its rights, its words, and what it says to nonsense."""
+
+import asyncio
+import os
+import socket
+import stat
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from gateway.live import control_finder, control_socket
+from gateway.live.control_finder import find_socket
+from gateway.live.control_socket import (
+    MAX_CONNECTIONS,
+    MAX_LINE,
+    ControlError,
+    ControlServer,
+    NoParams,
+    request,
+    socket_path,
+)
+
+pytestmark = pytest.mark.io
+
+LIMIT_S = 60.0
+"""After which a connection that nobody closes makes its test fail."""
+
+
+class Seek(msgspec.Struct, forbid_unknown_fields=True):
+    offset_s: float
+
+
+@pytest.fixture
+async def server(tmp_path: Path) -> AsyncIterator[ControlServer]:
+    made = ControlServer(tmp_path / "mavgate" / "run.sock")
+
+    async def seek(params: Seek) -> dict[str, float]:
+        return {"position_s": params.offset_s}
+
+    def refuse(_: NoParams) -> None:
+        raise ControlError("not now")
+
+    made.register("seek", Seek, seek)
+    made.register("refuse", NoParams, refuse)
+    await made.start()
+    yield made
+    made.close()
+
+
+async def ask(server: ControlServer, verb: str, params: dict[str, Any] | None = None) -> Any:
+    return await asyncio.to_thread(request, server.path, verb, params)
+
+
+async def test_a_request_is_answered(server: ControlServer) -> None:
+    assert await ask(server, "seek", {"offset_s": 80}) == {"position_s": 80.0}
+    assert await ask(server, "verbs") == ["refuse", "seek", "verbs"]
+
+
+@pytest.mark.parametrize(
+    ("verb", "params", "text"),
+    [
+        ("refuse", {}, "not now"),
+        ("fly", {}, "no such verb: fly; there are refuse, seek, verbs"),
+        ("seek", {}, "missing required field `offset_s`"),
+        ("seek", {"offset_s": "x"}, "Expected `float`"),
+        ("seek", {"offset_s": 1, "far": 2}, "unknown field `far`"),
+    ],
+)
+async def test_what_cannot_be_granted_is_refused_with_a_reason(
+    server: ControlServer, verb: str, params: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(ControlError, match=text):
+        await ask(server, verb, params)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"\n", b"nonsense\n", b"[]\n", b'{"verb": 3}\n', b"\xff\xfe\n", b'{"verb": "\xff"}\n'),
+        b'{"verb": "verbs", "params": {"a": ' + b"[" * 60_000 + b"\n",
+    ],
+    ids=range(7),
+)
+async def test_nonsense_is_answered_too(server: ControlServer, line: bytes) -> None:
+    answer = msgspec.json.decode(await server.answer(line))
+    assert answer["ok"] is False
+    assert answer["error"]
+
+
+async def test_only_the_user_may_open_it(server: ControlServer) -> None:
+    assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(server.path.parent.stat().st_mode) == 0o700
+
+
+async def test_several_requests_on_one_connection(server: ControlServer) -> None:
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    writer.write(b'{"verb":"seek","params":{"offset_s":1}}\n{"verb":"refuse"}\n')
+    first, second = await reader.readline(), await reader.readline()
+    assert msgspec.json.decode(first)["ok"] is True
+    assert msgspec.json.decode(second) == {"ok": False, "result": None, "error": "not now"}
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_line_without_end_ends_the_connection_alone(server: ControlServer) -> None:
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    writer.write(b"x" * (2 * MAX_LINE))
+    assert await reader.read() == b""
+    writer.close()
+    assert await ask(server, "verbs")
+
+
+async def test_too_many_connections_are_turned_away(server: ControlServer) -> None:
+    links = [await asyncio.open_unix_connection(str(server.path)) for _ in range(MAX_CONNECTIONS)]
+    for reader, writer in links:
+        writer.write(b'{"verb":"verbs"}\n')
+        await reader.readline()
+    with pytest.raises(ControlError, match="no answer"):
+        await ask(server, "verbs")
+    for _, writer in links:
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "run.sock")
+    accepted, ended, serve = asyncio.Event(), asyncio.Event(), server._serve
+
+    async def serve_late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        accepted.set()
+        await ended.wait()
+        await serve(reader, writer)
+
+    server._serve = serve_late  # type: ignore[method-assign]
+    await server.start()
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    await accepted.wait()
+    server.close()
+    ended.set()
+    async with asyncio.timeout(LIMIT_S):
+        assert await reader.read() == b""
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_path_that_is_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 100) / "run.sock"
+    with pytest.raises(ControlError, match="at most 107; let XDG_RUNTIME_DIR name a shorter"):
+        await ControlServer(path).start()
+    with pytest.raises(ControlError, match="at most 107"):
+        request(path, "verbs")
+
+
+async def test_gateways_of_one_user_have_a_socket_each(server: ControlServer) -> None:
+    second, third = ControlServer(server.path), ControlServer(server.path)
+    await second.start()
+    await third.start()
+    names = [made.path.name for made in (server, second, third)]
+    assert names == ["run.sock", "run-2.sock", "run-3.sock"]
+    assert await ask(server, "verbs")
+    assert await ask(second, "verbs") == ["verbs"]
+    second.close()
+    third.close()
+    assert await ask(server, "verbs"), "closing another's socket leaves this one"
+
+
+@pytest.mark.parametrize(
+    ("user", "groups", "in_service", "is_answered"),
+    [
+        (0, (), False, True),
+        (1, (), False, True),
+        (2, (7,), False, False),
+        (2, (7,), True, True),
+        (2, (8,), True, False),
+    ],
+)
+async def test_only_its_owner_root_and_a_services_group_are_answered(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    user: int,
+    groups: tuple[int, ...],
+    in_service: bool,
+    is_answered: bool,
+) -> None:
+    """Also where the folder's rights let others in."""
+    if in_service:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    server = ControlServer(tmp_path / "run.sock")
+    await server.start()
+    assert stat.S_IMODE(server.path.stat().st_mode) == (0o660 if in_service else 0o600)
+    monkeypatch.setattr(control_socket, "peer_of", lambda _: (user, groups))
+    monkeypatch.setattr(control_socket.os, "getuid", lambda: 1)
+    monkeypatch.setattr(control_socket.os, "getgid", lambda: 7)
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    writer.write(b'{"verb":"verbs"}\n')
+    try:
+        answered = bool(await reader.read(1))
+    except ConnectionResetError:
+        answered = False
+    writer.close()
+    server.close()
+    assert answered == is_answered
+
+
+async def test_the_kernel_tells_who_asks(
+    server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, tuple[int, ...]]] = []
+    peer_of = control_socket.peer_of
+
+    def noted(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
+        asked.append(peer_of(writer))
+        return asked[-1]
+
+    monkeypatch.setattr(control_socket, "peer_of", noted)
+    await ask(server, "verbs")
+    [(user, groups)] = asked
+    assert user == os.getuid()
+    assert os.getgid() in groups
+
+
+async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "run.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    server = ControlServer(path)
+    await server.start()
+    assert await ask(server, "verbs") == ["verbs"]
+    server.close()
+    assert not path.exists()
+
+
+def test_nobody_there_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    with pytest.raises(ControlError, match="nobody listens at the socket"):
+        request(tmp_path / "run.sock", "status")
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
+        find_socket("run")
+    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
+        find_socket("play")
+
+
+async def test_a_command_finds_the_gateway_that_is_meant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    service = ControlServer(tmp_path / "service" / "run.sock")
+    await service.start()
+    assert find_socket("run") == service.path, "the service's, where the user has none"
+    first, second = ControlServer(socket_path("run")), ControlServer(socket_path("run"))
+    await first.start()
+    assert find_socket("run") == first.path, "before the service's"
+    await second.start()
+    with pytest.raises(ControlError, match=r"several run.*--socket.*run.sock.*run-2.sock"):
+        find_socket("run")
+    first.close()
+    assert find_socket("run") == second.path
+    for server in (second, service):
+        server.close()
+
+
+async def test_a_service_that_may_not_be_asked_tells_how(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    monkeypatch.setattr(control_finder.os, "access", lambda *_: False)
+    service = ControlServer(tmp_path / "service" / "run.sock")
+    await service.start()
+    with pytest.raises(ControlError, match="usermod -aG mavgate"):
+        find_socket("run")
+    service.close()
+
+
+def test_the_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert socket_path("run") == Path("/run/user/1/mavgate/run.sock")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/x/state")
+    assert socket_path("play") == Path("/home/x/state/mavgate/play.sock")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/mavgate:/run/other")
+    assert socket_path("run") == Path("/run/mavgate/run.sock")

@@ -1,0 +1,127 @@
+"""The verbs do what docs/control.md says."""
+
+import math
+import threading
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from gateway.edges.disk.recordings import Recording
+from gateway.live.control_socket import ControlServer
+from gateway.live.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
+from gateway.vehicle.home import Place
+from tests.conftest import ManualClock
+from tests.edges.disk.test_player_edge import Played
+from tests.edges.disk.test_recorder import Bench
+from tests.flightlog.frames import START_US, make_frames, make_records, make_tlog
+
+pytestmark = pytest.mark.io
+
+
+async def ask(server: ControlServer, verb: str, **params: object) -> dict[str, Any]:
+    line = msgspec.json.encode({"verb": verb, "params": params})
+    answer: dict[str, Any] = msgspec.json.decode(await server.answer(line))
+    return answer
+
+
+@pytest.fixture
+async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path / "recordings", clock, mode="manual")
+    made.recorder.start()
+    yield made
+    made.recorder.close()
+
+
+async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "s")
+    RecorderVerbs(bench.recorder).register(server)
+    started = (await ask(server, "record.start"))["result"]
+    assert (started["state"], started["part"]) == ("recording", 1)
+    bench.send(make_frames(9))
+    assert (await ask(server, "record.note", text="here"))["ok"]
+    await bench.recorder.settle()
+    saved = await ask(server, "record.save", name="first")
+    assert saved["result"]["name"] == "first"
+    assert not (await ask(server, "record.save", name="../x"))["ok"]
+    refused = await ask(server, "record.delete", name="last")
+    assert refused["error"] == "first is being recorded; stop it first"
+    stopped = (await ask(server, "record.stop"))["result"]
+    assert stopped["state"] == "idle"
+    (listed,) = (await ask(server, "record.list"))["result"]
+    assert listed["name"] == "first"
+    deleted = await ask(server, "record.delete", name="first")
+    assert [Path(file).name for file in deleted["result"]["files"]] == ["first_01.tlog"]
+    assert (await ask(server, "record.list"))["result"] == []
+    assert not (await ask(server, "record.delete", name="first"))["ok"]
+    assert bench.announced[1] == (False, "Mark: here")
+
+
+async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = ControlServer(tmp_path / "s")
+    RecorderVerbs(bench.recorder).register(server)
+    looked: list[threading.Thread] = []
+
+    def look(_folder: Path) -> list[Recording]:
+        looked.append(threading.current_thread())
+        return []
+
+    monkeypatch.setattr("gateway.live.control_verbs.list_recordings", look)
+    assert (await ask(server, "record.list"))["result"] == []
+    assert looked != [threading.main_thread()]
+
+
+async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
+    marked: list[tuple[Place | None, int | None]] = []
+
+    def mark(place: Place | None, vehicle_id: int | None) -> None:
+        if vehicle_id == 9:
+            raise ValueError("no such aircraft; heard so far: 1")
+        marked.append((place, vehicle_id))
+
+    server = ControlServer(tmp_path / "s")
+    AircraftVerbs(mark).register(server)
+    assert (await ask(server, "mark", lat_deg=-7.5, lon_deg=110.0, alt_amsl_m=90.0))["ok"]
+    assert (await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=3))["ok"]
+    assert (await ask(server, "mark"))["result"] == "mark cleared"
+    assert not (await ask(server, "mark", lat_deg=1.0))["ok"]
+    refused = await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=9)
+    assert refused["error"] == "no such aircraft; heard so far: 1"
+    assert marked[0] == (Place(-7.5, 110.0, 90.0), None)
+    assert marked[1][0] is not None
+    assert math.isnan(marked[1][0].alt_amsl_m)
+    assert marked[1][1] == 3
+    assert marked[2] == (None, None)
+
+
+async def test_a_player_is_steered(clock: ManualClock, tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(make_tlog(make_records(500)))
+    played = Played(path, clock)
+    played.edge.start()
+    server = ControlServer(tmp_path / "s")
+    PlayerVerbs(played.edge).register(server)
+
+    async def state(verb: str, **params: object) -> dict[str, Any]:
+        answer = await ask(server, verb, **params)
+        assert answer["ok"], answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    assert (await state("play.pause"))["state"] == "paused"
+    assert (await state("seek", to="0:05"))["position_s"] == pytest.approx(5.0)
+    assert (await state("seek", to="-2"))["position_s"] == pytest.approx(3.0)
+    assert (await state("seek", to="2025-10-09T08:53:21Z"))["time_us"] == START_US + 1_000_000
+    assert (await state("play.step", count=3))["sent"] == 4
+    assert (await state("play.speed", speed=20))["speed"] == 20.0
+    assert (await state("play.speed", speed=None))["speed"] is None
+    assert (await state("play.loop", on=True))["loop"] is True
+    assert (await state("play.resume"))["state"] == "playing"
+    assert math.isclose((await state("play.status"))["duration_s"], 499 * 0.02)
+    assert not (await ask(server, "seek", to="soon"))["ok"]
+    assert not (await ask(server, "play.speed", speed=1000))["ok"]
+    played.close()

@@ -1,0 +1,236 @@
+"""The live view: what an operator reads, and that nothing unknown looks like a figure."""
+
+import logging
+import math
+from dataclasses import replace
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from gateway.geometry.quaternion import from_euler
+from gateway.hub.client_table import HubCounters, ListenerStats
+from gateway.live.console import LiveView
+from gateway.live.log_line import summary_line
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    LinkReport,
+    NavFlags,
+    NavState,
+    NodeId,
+    NodeLink,
+    NodeStatus,
+    PipeCounters,
+    ReceiverStatus,
+)
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from tests.client_stats import TABLET
+from tests.vehicle.samples import FIX
+
+NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
+RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)
+REPORT = LinkReport(
+    10_000_000, True, "/dev/ttyUSB0", 40_000, 1000, 2, (("crc", 7),), (NODE,), RECEIVER
+)
+FLYING = NavState(
+    time_us=9_990_000,
+    q_nb=from_euler(math.radians(-12.0), math.radians(3.0), math.radians(-90.0)),
+    rate_b_radps=(0.0, 0.0, 0.0),
+    lat_deg=-7.765612,
+    lon_deg=110.372834,
+    alt_amsl_m=171.5,
+    vel_n_mps=(3.0, -4.0, -1.5),
+    attitude_std_rad=UNKNOWN_VEC3,
+    vel_std_mps=UNKNOWN_VEC3,
+    pos_std_m=UNKNOWN_VEC3,
+    flags=NavFlags.ATTITUDE_VALID | NavFlags.POSITION_VALID | NavFlags.GPS_REJECTED,
+)
+LOST = msgspec.structs.replace(
+    FLYING, lat_deg=NAN, lon_deg=NAN, alt_amsl_m=NAN, vel_n_mps=UNKNOWN_VEC3
+)
+CLIENT = replace(
+    TABLET,
+    name="",
+    endpoint="udp:127.0.0.1:14550",
+    remote="127.0.0.1:14550",
+    systems=((255, 190),),
+    sent=1200,
+    dropped=3,
+    bytes_sent=50_000,
+    received=9,
+    bytes_received=200,
+    heard_us=9_500_000,
+)
+SNAPSHOT = Snapshot(
+    10_000_000, REPORT, ((1, FLYING),), (CLIENT,), ((0, 10), (31, 500)), HubCounters()
+)
+
+
+def text_of(*snapshots: Snapshot, width: int = 100, coloured: bool = False) -> str:
+    view = LiveView()
+    for snapshot in snapshots:
+        drawn = view.draw(snapshot)
+    console = Console(width=width, no_color=not coloured, force_terminal=coloured or None)
+    with console.capture() as captured:
+        console.print(drawn)
+    return captured.get()
+
+
+def test_link_node_aircraft_and_client_are_shown() -> None:
+    text = text_of(SNAPSHOT)
+    for part in (
+        "/dev/ttyUSB0 connected",
+        "1000 frames, 2 lost on the line, 7 crc faults",
+        "channel 76, noise 4 %",
+        "1.0",
+        "1.00",
+        "-12.0",
+        "270.0",
+        "-7.765612",
+        "5.0",
+        "+1.5",
+        "GPS rejected",
+        "127.0.0.1:14550",
+    ):
+        assert part in text
+
+
+def test_a_single_frame_is_one_frame() -> None:
+    once = msgspec.structs.replace(REPORT, frames=1)
+    assert " 1 frame, " in text_of(replace(SNAPSHOT, report=once))
+
+
+def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
+    far = msgspec.structs.replace(
+        FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6
+    )
+    long = replace(CLIENT, sent=123_456_789, dropped=1_234_567, received=1_234_567)
+    port = ListenerStats("udp-listen:127.0.0.1:14551", "", "open", "", 14551, 0, 0)
+    sent = tuple((number, 9) for number in (0, 1, 2, 24, 29, 30, 31, 33, 42, 62, 74, 105, 230))
+    full = replace(SNAPSHOT, states=((1, far),), clients=(long,), listeners=(port,), sent=sent)
+    text = text_of(full, width=80)
+    for part in ("-77.123456", "-170.123456", "12345.6", "123456789", "1234567", port.name):
+        assert part in text
+    assert "…" not in text
+    assert len(text.splitlines()) <= 24
+
+
+def test_a_client_is_called_by_its_name() -> None:
+    tablet = replace(CLIENT, name="tablet", remote="10.0.0.7:14550")
+    assert "tablet 10.0.0.7:14550" in text_of(replace(SNAPSHOT, clients=(tablet,)))
+
+
+def test_rates_are_those_since_the_previous_view() -> None:
+    later = replace(SNAPSHOT, time_us=12_000_000, sent=((0, 12), (31, 600)))
+    text = text_of(SNAPSHOT, later)
+    assert "ATTITUDE_QUATERNION" in text
+    assert "50.0" in text
+    assert "1.0" in text
+
+
+def test_what_stands_in_the_way_is_reported() -> None:
+    closed = ListenerStats("udp-listen:[::]:5760", "", "closed", "Address already in use", 0, 0, 0)
+    radio = replace(CLIENT, name="radio", state="unreachable", reason="Permission denied")
+    text = text_of(replace(SNAPSHOT, listeners=(closed,), clients=(CLIENT, radio)))
+    assert "udp-listen:[::]:5760: Address already in use" in text
+    assert "radio: Permission denied" in text
+
+
+@pytest.mark.parametrize("word", ["nan", "None"])
+def test_unknown_is_a_dash(word: str) -> None:
+    assert word not in text_of(replace(SNAPSHOT, states=((1, LOST),)))
+    assert word not in summary_line(replace(SNAPSHOT, states=((1, LOST),)))
+
+
+def test_an_empty_gateway_can_be_drawn() -> None:
+    report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
+    text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
+    assert "auto not connected" in text
+    assert "No aircraft heard yet" in text
+
+
+def test_the_newest_log_lines_are_on_the_screen() -> None:
+    view = LiveView()
+    for number in range(20):
+        record = logging.LogRecord("x", logging.WARNING, "", 0, "trouble %d", (number,), None)
+        view.log.handle(record)
+    console = Console(width=100, no_color=True)
+    with console.capture() as captured:
+        console.print(view.draw(SNAPSHOT))
+    assert "trouble 19" in captured.get()
+    assert "trouble 14" not in captured.get()
+
+
+def test_summary_line() -> None:
+    assert summary_line(SNAPSHOT) == (
+        "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
+        "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
+    )
+
+
+BOARD = NodeStatus(0, NodeId(1, 0), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290)
+WELL_KNOWN = replace(
+    SNAPSHOT,
+    aircraft=(
+        AircraftStatus(
+            1, FIX, Way(-7.76, 110.37, 150.0, 1234.4, 271.2), Way(-7.7, 110.3, 1.0, 88.0, 3.0),
+            (BOARD,),
+        ),
+    ),
+    recorder=RecorderStatus("recording", "alps", 2, 12_300_000, 4_100_000_000, "", ""),
+)  # fmt: skip
+FIGURES = {
+    "supply": "3.29", "bus": "12", "unsent": "3", "resent": "450", "fw": "1.4",
+    "fix": "3D", "satellites": "11", "±h m": "1.2", "home m": "1234", "home at°": "271",
+    "mark m": "88", "mark at°": "3", "roll°": "-12.0", "longitude°": "110.372834",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [200, 150, 100, 80, 60, 40])
+def test_everything_is_legible_at_any_width(width: int) -> None:
+    text = text_of(WELL_KNOWN, width=width)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    for head, figure in FIGURES.items():
+        at = next(i for i, line in enumerate(lines) if head in line)
+        end = lines[at].index(head) + len(head)
+        # A figure ends where its head does: none is cut off or shoved aside.
+        assert lines[at + 1][:end].split()[-1] == figure, head
+    assert "recording alps, part 2: 12.3 MB" in " ".join(text.split())
+
+
+def test_a_wide_terminal_is_used() -> None:
+    wide, narrow = (text_of(WELL_KNOWN, width=w).splitlines() for w in (160, 100))
+    (line,) = (line for line in wide if "lost %" in line)
+    assert "client" in line
+    assert len(wide) < len(narrow)
+
+
+@pytest.mark.parametrize(
+    ("recorder", "text"),
+    [
+        (replace(WELL_KNOWN.recorder, state="idle"), "recorder idle, 4.1 GB free"),
+        (replace(WELL_KNOWN.recorder, reason="disk is full"), "not recorded: disk is full"),
+    ],
+)
+def test_the_recorder_is_reported(recorder: RecorderStatus, text: str) -> None:
+    assert text in text_of(replace(WELL_KNOWN, recorder=recorder))
+
+
+def test_a_fix_that_is_none_is_red() -> None:
+    [known] = WELL_KNOWN.aircraft
+    assert known.fix is not None
+    lost = replace(known, fix=msgspec.structs.replace(known.fix, fix_ok=False))
+    red = "\x1b[31mnone"
+    assert red in text_of(replace(WELL_KNOWN, aircraft=(lost,)), coloured=True)
+    assert "\x1b[31m3D" not in text_of(WELL_KNOWN, coloured=True)
+
+
+def test_what_is_not_known_is_no_figure() -> None:
+    unknown = AircraftStatus(1, None, None, Way(1.0, 2.0, 3.0, None, None), ())
+    lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
+    for head in ("supply", "fix", "home m", "mark m", "mark at°"):
+        at = next(i for i, line in enumerate(lines) if head in line)
+        end = lines[at].index(head) + len(head)
+        assert lines[at + 1][:end].split()[-1] == "—", head

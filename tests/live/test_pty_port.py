@@ -1,0 +1,180 @@
+"""The pseudo-terminal: every byte to a reader, no byte kept for none."""
+
+import asyncio
+import os
+import select
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import serial
+
+from gateway.live.pty_port import PtyPort
+from gateway.simulator.timed_frame import TimedFrame
+from gateway.wire.framing import Fault, Frame, FrameDecoder, encode_frame
+
+pytestmark = pytest.mark.io
+
+SPEED = 20.0
+CONTENT_SIZE = 40
+
+
+def frames(count: int, rate_hz: float = 1000.0) -> Iterator[TimedFrame]:
+    for k in range(count):
+        yield TimedFrame(k / rate_hz, encode_frame(k.to_bytes(4, "big") * (CONTENT_SIZE // 4)))
+
+
+def numbers(events: list[Frame | Fault]) -> list[int]:
+    assert all(isinstance(event, Frame) for event in events)
+    return [int.from_bytes(e.content[:4], "big") for e in events if isinstance(e, Frame)]
+
+
+class Reader:
+    """Opens a port as the gateway does and collects what it says."""
+
+    def __init__(self, path: str) -> None:
+        self.events: list[Frame | Fault] = []
+        self._decoder = FrameDecoder()
+        self._port = serial.Serial(path, 500_000, timeout=0, exclusive=True)
+        self._waiting: list[tuple[int, asyncio.Future[None]]] = []
+        asyncio.get_running_loop().add_reader(self._port.fileno(), self._read)
+
+    async def until(self, count: int) -> None:
+        done = asyncio.get_running_loop().create_future()
+        self._waiting.append((count, done))
+        self._wake()
+        await asyncio.wait_for(done, 60.0)
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._port.fileno())
+        self._port.close()
+
+    def _read(self) -> None:
+        self.events += self._decoder.feed(self._port.read(4096))
+        self._wake()
+
+    def _wake(self) -> None:
+        for count, done in self._waiting:
+            if len(self.events) >= count and not done.done():
+                done.set_result(None)
+
+
+@pytest.fixture
+async def play() -> Iterator[Callable[..., PtyPort]]:  # type: ignore[misc]
+    ports: list[PtyPort] = []
+
+    def make(source: Iterator[TimedFrame], speed: float = SPEED) -> PtyPort:
+        ports.append(PtyPort(source, speed))
+        return ports[-1]
+
+    yield make
+    for port in ports:
+        port.close()
+
+
+async def test_every_frame_arrives(play: Callable[..., PtyPort]) -> None:
+    def paced() -> Iterator[TimedFrame]:
+        for sent, frame in enumerate(frames(2000)):
+            # The kernel keeps some kB only, and hands them over when it has the time.
+            while sent > 100 and sent - len(reader.events) > 100:
+                select.select([reader._port], [], [], 60.0)
+                reader._read()
+            yield frame
+
+    port = play(paced())
+    reader = Reader(port.path)
+    port.start()
+    await reader.until(2000)
+    reader.close()
+    assert numbers(reader.events) == list(range(2000))
+    assert (port.written, port.dropped) == (2000, 0)
+    assert port.ended.is_set()
+
+
+async def test_frames_keep_their_times(play: Callable[..., PtyPort]) -> None:
+    loop = asyncio.get_running_loop()
+    port = play(frames(6, rate_hz=50.0), 1.0)
+    reader = Reader(port.path)
+    begin_s = loop.time()
+    port.start()
+    for k in range(6):
+        await reader.until(k + 1)
+        assert loop.time() - begin_s >= k / 50.0
+    reader.close()
+
+
+async def test_nobody_reads(play: Callable[..., PtyPort]) -> None:
+    port = play(frames(3000))
+    port.start()
+    await asyncio.wait_for(port.ended.wait(), 60.0)
+    assert port.written + port.dropped == 3000
+    assert port.written * CONTENT_SIZE < 100_000, "only what the kernel holds"
+    assert port.dropped > 500
+
+
+async def test_reader_comes_late_leaves_and_returns(play: Callable[..., PtyPort]) -> None:
+    port = play(frames(10**9))
+    port.start()
+    while not port.dropped:
+        await asyncio.sleep(0)
+    for _ in range(3):
+        reader = Reader(port.path)
+        await reader.until(50)
+        reader.close()
+        # Flushing on opening may cut the first frame; from there on all are whole.
+        seen = numbers(reader.events[1:])
+        assert seen == sorted(seen)
+    assert not port.ended.is_set()
+
+
+async def test_a_frame_is_never_torn(play: Callable[..., PtyPort]) -> None:
+    """A frame that half fits is finished before any other is begun."""
+    port = play(frames(4000))
+    slave = os.open(port.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    decoder, events = FrameDecoder(), []
+    port.start()
+    while not port.ended.is_set():
+        # Reading odd sizes only when the terminal is full makes every kind of partial write.
+        if port.dropped:
+            events += decoder.feed(os.read(slave, 777))
+            port.dropped = 0
+        await asyncio.sleep(0)
+    os.close(slave)
+    assert len(events) > 100
+    seen = numbers(events)
+    assert seen == sorted(set(seen))
+
+
+async def test_closing_removes_the_terminal(play: Callable[..., PtyPort]) -> None:
+    port = play(frames(1000))
+    port.start()
+    assert Path(port.path).exists()
+    port.close()
+    port.close()
+    assert port.ended.is_set()
+    assert not Path(port.path).exists()
+
+
+async def test_goes_on_after_a_standstill(
+    play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = play(frames(1000, rate_hz=100.0), 1.0)
+    reader = Reader(port.path)
+    port.start()
+    await reader.until(3)
+    # An hour passes for the loop's clock: only the frame that is late comes at once.
+    loop = asyncio.get_running_loop()
+    clock = loop.time
+    begin_s = clock()
+    monkeypatch.setattr(loop, "time", lambda: clock() + 3600.0)
+    await reader.until(6)
+    reader.close()
+    port.close()
+    # On a busy machine more of them have become due meanwhile.
+    assert port.written <= 20 + 100 * (clock() - begin_s)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
+def test_speed_is_checked(speed: float) -> None:
+    with pytest.raises(ValueError, match="speed"):
+        PtyPort(frames(1), speed)

@@ -1,0 +1,256 @@
+"""The serial port: choice, unplugging, coming back."""
+
+import asyncio
+import os
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import serial
+
+from gateway.live.serial_port import (
+    LONGEST_RETRY_S,
+    Port,
+    PortNotFoundError,
+    SerialPort,
+    SerialSettings,
+    find_port,
+    why_not_open,
+)
+
+CH340 = Port("/dev/ttyUSB0", "1a86:7523", "", "WCH CH340", known=True)
+FTDI = Port("/dev/ttyUSB1", "0403:6001", "A50285BI", "FTDI FT232R", known=True)
+FTDI_2 = Port("/dev/ttyUSB2", "0403:6001", "XYZ", "FTDI FT232R", known=True)
+MODEM = Port("/dev/ttyACM0", "2cb7:0a05", "", "modem", known=False)
+BUILT_IN = Port("/dev/ttyS0", "", "", "n/a", known=False)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "ports", "device"),
+    [
+        ("/dev/ttyAMA0", [], "/dev/ttyAMA0"),
+        ("auto", [MODEM, CH340, BUILT_IN], "/dev/ttyUSB0"),
+        ("usb:2cb7:0a05", [CH340, MODEM], "/dev/ttyACM0"),
+        ("usb:1A86:7523", [FTDI, CH340], "/dev/ttyUSB0"),
+        ("usb:0403:6001:a50285bi", [FTDI_2, FTDI], "/dev/ttyUSB1"),
+    ],
+)
+def test_find_port(wanted: str, ports: list[Port], device: str) -> None:
+    assert find_port(wanted, ports) == device
+
+
+@pytest.mark.parametrize(
+    ("wanted", "ports", "message"),
+    [
+        ("auto", [], "no port at all"),
+        ("auto", [MODEM, BUILT_IN], r"/dev/ttyACM0 \(2cb7:0a05\), /dev/ttyS0 \(no USB\)"),
+        ("auto", [CH340, FTDI], "several USB adapters fit"),
+        ("usb:dead:beef", [CH340], "no port fits 'usb:dead:beef'"),
+    ],
+)
+def test_find_port_says_what_there_is(wanted: str, ports: list[Port], message: str) -> None:
+    with pytest.raises(PortNotFoundError, match=message):
+        find_port(wanted, ports)
+
+
+@pytest.mark.parametrize(
+    ("ports", "hint"),
+    [
+        ([], ""),
+        ([MODEM], ""),
+        ([CH340, MODEM], "; /dev/ttyUSB0 is there, always found as usb:1a86:7523"),
+    ],
+)
+def test_an_adapter_under_another_name_is_named(ports: list[Port], hint: str) -> None:
+    with pytest.raises(serial.SerialException) as raised:
+        serial.Serial("/dev/ttyUSB99")
+    assert why_not_open(raised.value, ports) == "No such file or directory" + hint
+
+
+def test_a_port_that_another_program_holds_is_said_to_be_so() -> None:
+    master, slave = os.openpty()
+    try:
+        with serial.Serial(os.ttyname(slave), timeout=0, exclusive=True) as held:
+            with pytest.raises(serial.SerialException) as raised:
+                serial.Serial(held.port, timeout=0, exclusive=True)
+            assert why_not_open(raised.value, [CH340]) == "another program has it open"
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_what_is_no_serial_port_is_said_to_be_none() -> None:
+    with pytest.raises(serial.SerialException) as raised:
+        serial.Serial("/dev/null", timeout=0)
+    assert why_not_open(raised.value, [CH340]) == "not a serial port"
+
+
+class Bench:
+    """A pseudo-terminal behind a symbolic link, so that it can be pulled and plugged again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.link = folder / "ttyRECEIVER"
+        self.master = -1
+
+    def plug(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.link.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def pull(self) -> None:
+        self.link.unlink()
+        os.close(self.master)
+        self.master = -1
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    if bench.master >= 0:
+        bench.pull()
+
+
+class Listener:
+    def __init__(self) -> None:
+        self.data = b""
+        self.opened = 0
+        self.lost: list[str] = []
+        self.changed = asyncio.Event()
+
+    def on_bytes(self, data: bytes, now_us: int) -> None:
+        assert now_us == 42
+        self.data += data
+        self.changed.set()
+
+    def on_open(self, device: str) -> None:
+        self.opened += 1
+        self.changed.set()
+
+    def on_lost(self, device: str) -> None:
+        self.lost.append(device)
+
+    async def until(self, *, opened: int = 0, data: bytes = b"") -> None:
+        async with asyncio.timeout(60):
+            while self.opened < opened or data not in self.data:
+                self.changed.clear()
+                await self.changed.wait()
+
+
+@pytest.fixture
+def listener() -> Listener:
+    return Listener()
+
+
+@pytest.fixture
+def fast_retry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gateway.live.serial_port.FIRST_RETRY_S", 0.005)
+
+
+@pytest.mark.io
+@pytest.mark.usefixtures("fast_retry")
+async def test_unplugged_and_plugged_again(
+    bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = SerialSettings(port=str(bench.link))
+    link = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    link.start()
+    assert not link.connected
+    bench.plug()
+    await listener.until(opened=1)
+    os.write(bench.master, b"first")
+    await listener.until(data=b"first")
+    bench.pull()
+    async with asyncio.timeout(60):
+        while link.connected:
+            await asyncio.sleep(0)
+    assert listener.lost == [str(bench.link)]
+    bench.plug()
+    await listener.until(opened=2)
+    os.write(bench.master, b"second")
+    await listener.until(data=b"second")
+    link.close()
+    assert not link.connected
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == len(set(warnings)), "each trouble is told once"
+    assert any("is gone" in text for text in warnings)
+    missing = f"receiver {bench.link}: No such file or directory; trying again until it works"
+    assert missing in warnings
+
+
+@pytest.mark.io
+async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The delays double up to the longest: a missing port costs a few tries a minute."""
+    loop = asyncio.get_running_loop()
+    delays: list[float] = []
+    pending: list = []
+
+    def call_later(delay: float, callback: object) -> asyncio.TimerHandle:
+        delays.append(delay)
+        pending.append(callback)
+        return asyncio.TimerHandle(0.0, lambda: None, (), loop)
+
+    monkeypatch.setattr(loop, "call_later", call_later)
+    link = SerialPort(
+        SerialSettings(port="/dev/does-not-exist"),
+        listener.on_bytes,
+        listener.on_open,
+        listener.on_lost,
+        lambda: 42,
+    )
+    link.start()
+    for _ in range(7):
+        pending.pop()()
+    assert delays == [0.25, 0.5, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0]
+    assert delays[-1] == LONGEST_RETRY_S
+    link.close()
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("can", [True, False])
+async def test_the_adapter_is_asked_to_hold_no_bytes_back(
+    bench: Bench,
+    listener: Listener,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    can: bool,
+) -> None:
+    asked: list[bool] = []
+
+    def ask(_: object, wanted: bool) -> None:
+        asked.append(wanted)
+        if not can:
+            raise ValueError("Failed to update ASYNC_LOW_LATENCY flag")
+
+    monkeypatch.setattr("serial.Serial.set_low_latency_mode", ask)
+    bench.plug()
+    settings = SerialSettings(port=str(bench.link))
+    link = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    link.start()
+    assert (asked, link.connected) == ([True], True)
+    assert not caplog.records, "an adapter that cannot is used as it is, without a word"
+    link.close()
+
+
+def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
+    """Samples are lost where turns of the loop are long and each reads no more than one sample."""
+    times_us = (0, 300, 40_300, 40_600, 60_600, 90_000)
+    sizes: list[int] = []
+    link = SerialPort(
+        SerialSettings(baud=500_000),
+        lambda data, _: sizes.append(len(data)),
+        lambda _: None,
+        lambda _: None,
+        iter(times_us).__next__,
+    )
+    line, end = os.pipe()
+    os.set_blocking(line, False)
+    os.write(end, bytes(3000))
+    for _ in times_us:
+        link._read(line)
+    os.close(line)
+    os.close(end)
+    # 40 ms of the line are 2000 bytes; the last two reads find what is left, and nothing.
+    assert sizes == [48, 48, 2000, 48, 856]

@@ -1,0 +1,128 @@
+"""What systemd is told, seen from the socket that it would listen at."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.live.service import ServiceNotifier, set_realtime_priority
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        sock.setblocking(False)
+        sock.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+        yield sock
+
+
+async def test_life_of_a_service(systemd: socket.socket) -> None:
+    notifier = ServiceNotifier()
+    notifier.ready()
+    notifier.status("2 clients")
+    notifier.reloading()
+    notifier.stopping()
+    told = [systemd.recv(200).decode() for _ in range(4)]
+    assert told[:2] == ["READY=1", "STATUS=2 clients"]
+    assert told[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
+    assert told[3] == "STOPPING=1"
+
+
+async def test_the_watchdog_is_fed_at_twice_its_rate(
+    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "20000")
+    notifier = ServiceNotifier()
+    notifier.ready()
+    loop = asyncio.get_running_loop()
+    told = [await asyncio.wait_for(loop.sock_recv(systemd, 200), 60) for _ in range(4)]
+    assert told == [b"READY=1"] + [b"WATCHDOG=1"] * 3
+    notifier.stopping()
+    await asyncio.sleep(0)
+    assert notifier._timer is None
+
+
+async def test_signs_of_life_come_twice_in_the_time_that_systemd_waits(
+    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "60000000")
+    delays: list[float] = []
+    monkeypatch.setattr(
+        asyncio.get_running_loop(), "call_later", lambda delay_s, _: delays.append(delay_s)
+    )
+    ServiceNotifier().ready()
+    assert delays == [30.0]
+
+
+async def test_a_watchdog_of_another_process_is_not_ours(
+    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "20000")
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid() + 1))
+    ServiceNotifier().ready()
+    assert systemd.recv(200) == b"READY=1"
+    with pytest.raises(BlockingIOError):
+        systemd.recv(200)
+
+
+async def test_without_systemd_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    ServiceNotifier().ready()
+    monkeypatch.setenv("NOTIFY_SOCKET", "/no/such/socket")
+    ServiceNotifier().ready()
+
+
+def test_realtime_is_asked_for_or_a_refusal_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked: list[tuple[int, int]] = []
+
+    def schedule(pid: int, policy: int, param: os.sched_param) -> None:
+        if param.sched_priority > 50:
+            raise PermissionError("not allowed")
+        asked.append((policy, param.sched_priority))
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    set_realtime_priority(1)
+    set_realtime_priority(0)
+    assert [(policy & ~os.SCHED_RESET_ON_FORK, level) for policy, level in asked] == [
+        (os.SCHED_RR, 1),
+        (os.SCHED_OTHER, 0),
+    ]
+    set_realtime_priority(99)
+    assert "CAP_SYS_NICE" in caplog.text
+
+
+REAL_TIME = """
+import os, threading
+from gateway.live.service import set_realtime_priority
+policies = []
+note = lambda: policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+set_realtime_priority(1)
+note()
+thread = threading.Thread(target=note)
+thread.start()
+thread.join()
+set_realtime_priority(0)
+note()
+print(policies == [os.SCHED_RR, os.SCHED_OTHER, os.SCHED_OTHER])
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may have real-time priority")
+def test_the_kernel_grants_real_time_to_the_one_thread() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", REAL_TIME], capture_output=True, text=True, check=True
+    )
+    if "not permitted" in run.stderr:
+        pytest.skip("this machine forbids real-time priority")
+    assert run.stdout == "True\n"

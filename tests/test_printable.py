@@ -1,0 +1,79 @@
+"""Text from the network on a terminal, in JSON output and in a log."""
+
+import io
+import json
+import logging
+import unicodedata
+
+import pytest
+from rich.table import Table
+from rich.text import Text
+
+from gateway.cli.support.terminal import console_of
+from gateway.printable import LONGEST, PrintableFormatter, printable, printable_json
+
+RIGHT_TO_LEFT = "\u202e"
+DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
+
+
+def log_line(text: str) -> str:
+    record = logging.makeLogRecord({"msg": "from %s", "args": (text,)})
+    return PrintableFormatter("%(message)s").format(record)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[2J\r", r"\x1b[2J\x0d"),
+        ("\x9b2J", r"\x9b2J"),
+        (f"a{RIGHT_TO_LEFT}gnp.exe", r"a\u202egnp.exe"),
+        ("\u2028\ufeff", r"\u2028\ufeff"),
+        ("\U000e0041", r"\U000e0041"),
+        ("tab\tline\nÄ µ 高度 \u0645\u06cc\u200c\u062e\u0648", "tab\tline\nÄ µ 高度 می\u200cخو"),
+    ],
+)
+def test_control_and_direction_characters_are_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+    assert printable(shown) == shown
+
+
+def test_every_control_and_direction_character_of_unicode_is_escaped() -> None:
+    dangerous = [
+        chr(code)
+        for code in range(0x110000)
+        if unicodedata.category(chr(code)) in ("Cc", "Zl", "Zp")
+        or unicodedata.bidirectional(chr(code)) in DIRECTIONS
+    ]
+    assert [each for each in dangerous if printable(each) == each] == ["\t", "\n"]
+
+
+def test_json_output_is_escaped_and_decodes_to_the_same_value() -> None:
+    text = "\x1b \x9b \u202e \u2028 \U000e0041 ä"
+    shown = printable_json(json.dumps(text, ensure_ascii=False))
+    assert json.loads(shown) == text
+    assert all(letter.isprintable() for letter in shown)
+
+
+@pytest.mark.parametrize("make", [str, Text, lambda text: _table(text)])
+def test_console_escapes_text_of_any_renderable(make: object) -> None:
+    console = console_of()
+    console.file = io.StringIO()
+    console.print(make(f"Site {RIGHT_TO_LEFT}\x9b2J"))  # type: ignore[operator]
+    assert r"Site \u202e\x9b2J" in console.file.getvalue()
+    assert not {RIGHT_TO_LEFT, "\x9b"} & set(console.file.getvalue())
+
+
+def _table(text: str) -> Table:
+    table = Table()
+    table.add_column(text)
+    table.add_row(Text(text))
+    return table
+
+
+def test_log_line_is_escaped_and_its_length_bounded() -> None:
+    assert log_line(f"\x1b{RIGHT_TO_LEFT}") == r"from \x1b\u202e"
+    assert len(log_line("/" * 60_000)) == LONGEST + 1
+
+
+def test_line_feed_in_a_logged_text_cannot_imitate_a_log_line() -> None:
+    assert log_line("x\n2026-01-01 INFO all is well") == "from x\n    2026-01-01 INFO all is well"
