@@ -53,12 +53,17 @@ void give(ImuReducer *reducer, const ImuReducerSettings &settings, WireImu *payl
 
 }  // namespace
 
-void imu_read_bytes(const uint8_t *bytes, ImuReading *reading) {
+bool imu_read_bytes(const uint8_t *bytes, ImuReading *reading) {
+    uint8_t same = 1;
+    while (same < 14 && bytes[same] == bytes[0]) {
+        ++same;
+    }
     for (uint8_t axis = 0; axis < 3; ++axis) {
         reading->accel[axis] = word(bytes + 2 * axis);
         reading->gyro[axis] = word(bytes + 8 + 2 * axis);
     }
     reading->temperature = word(bytes + 6);
+    return same < 14;
 }
 
 bool imu_reduce(ImuReducer *reducer, const ImuReducerSettings &settings, const ImuReading &reading,

@@ -38,8 +38,9 @@ struct ImuReducer {
     HighPass gyro_highpass[3];
 };
 
-// Reads the fourteen big-endian bytes of registers 0x3B to 0x48.
-void imu_read_bytes(const uint8_t *bytes, ImuReading *reading);
+// Reads the fourteen big-endian bytes of registers 0x3B to 0x48. False if they are all the same: a
+// chip that is not awake, or nobody on the bus.
+bool imu_read_bytes(const uint8_t *bytes, ImuReading *reading);
 
 // Takes one reading. True if a payload is due: then its accelerations, rates, temperature and the
 // filter and clipping flags are filled in.

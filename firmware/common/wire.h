@@ -35,9 +35,9 @@ enum WireImuFlag : uint16_t {
 };
 
 enum WireSensor : uint8_t {
-    WIRE_SENSOR_MPU6050 = 1 << 0,
-    WIRE_SENSOR_HMC5883L = 1 << 1,
-    WIRE_SENSOR_BMP180 = 1 << 2,
+    WIRE_SENSOR_IMU = 1 << 0,
+    WIRE_SENSOR_MAG = 1 << 1,
+    WIRE_SENSOR_BARO = 1 << 2,
     WIRE_SENSOR_GPS = 1 << 3,
 };
 

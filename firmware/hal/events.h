@@ -6,7 +6,7 @@
 
 enum Event : uint8_t {
     EVENT_TICK = 1 << 0,   // a millisecond has passed
-    EVENT_IMU = 1 << 1,    // the MPU6050 has a sample
+    EVENT_IMU = 1 << 1,    // the IMU has a sample
     EVENT_RADIO = 1 << 2,  // the radio's interrupt line fell
     EVENT_TWI = 1 << 3,    // a transfer ended
     EVENT_UART = 1 << 4,   // a byte came in

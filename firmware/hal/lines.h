@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The two interrupt lines: D2 (INT0) from the MPU6050, rising; D3 (INT1) from the radio, falling.
+// The two interrupt lines: D2 (INT0) from the IMU, rising; D3 (INT1) from the radio, falling.
 #pragma once
 
 #include <stdint.h>

@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
 #include <cstdint>
 
 #include "common/imu_reducer.h"
@@ -21,10 +22,21 @@ TEST(registers_are_read_big_endian) {
     const uint8_t bytes[14] = {0x00, 0x01, 0xFF, 0xFE, 0x10, 0x00, 0xF0,
                                0xB0, 0x80, 0x00, 0x7F, 0xFF, 0x00, 0x80};
     ImuReading read = {};
-    imu_read_bytes(bytes, &read);
+    CHECK(imu_read_bytes(bytes, &read));
     CHECK(read.accel[0] == 1 && read.accel[1] == -2 && read.accel[2] == 4096);
     CHECK(read.temperature == -3920);
     CHECK(read.gyro[0] == -32768 && read.gyro[1] == 32767 && read.gyro[2] == 128);
+}
+
+TEST(a_reading_of_equal_bytes_is_no_data) {
+    for (const uint8_t byte : {uint8_t{0x00}, uint8_t{0xFF}}) {
+        uint8_t bytes[14];
+        std::fill(bytes, bytes + 14, byte);
+        ImuReading read = {};
+        CHECK(!imu_read_bytes(bytes, &read));
+        bytes[13] ^= 1;
+        CHECK(imu_read_bytes(bytes, &read));
+    }
 }
 
 TEST(payloads_come_at_every_sending_rate) {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// BMP180 compensation and the MPU6050's self-test against their datasheets.
+// Compensation and self-test formulas against the datasheets.
 #include <cmath>
 #include <cstdint>
 
 #include "common/bmp180_math.h"
-#include "common/mpu6050_math.h"
+#include "common/imu_chip.h"
 #include "host_test/check.h"
 
 namespace {
@@ -74,28 +74,64 @@ TEST(bmp180_with_impossible_words_does_not_divide_by_zero) {
     CHECK(bmp180_b5(&words, 27898) == 0);
 }
 
-TEST(mpu6050_factory_trim_follows_the_register_map) {
-    CHECK(mpu6050_accel_trim(0) == 0 && mpu6050_gyro_trim(0) == 0);
-    for (int code = 1; code < 32; ++code) {
-        const double accel = 4096 * 0.34 * std::pow(0.92 / 0.34, (code - 1) / 30.0);
-        const double gyro = 25 * 131 * std::pow(1.046, code - 1);
-        CHECK_NEAR(mpu6050_accel_trim(static_cast<uint8_t>(code)), accel, accel * 0.001 + 1);
-        CHECK_NEAR(mpu6050_gyro_trim(static_cast<uint8_t>(code)), gyro, gyro * 0.001 + 1);
+// Registers of codes 14, 17, 20 for the accelerometer and 1, 2, 31 for the gyroscope.
+constexpr uint8_t MPU6050_CODES[4] = {14 >> 2 << 5 | 1, 17 >> 2 << 5 | 2, 20 >> 2 << 5 | 31,
+                                      (14 & 3) << 4 | (17 & 3) << 2 | (20 & 3)};
+constexpr uint8_t NO_CODES[3] = {0, 0, 0};
+
+TEST(mpu6050_expected_responses_follow_the_register_map) {
+    uint16_t expected[IMU_AXES];
+    imu_expected_responses(IMU_MPU6050, MPU6050_CODES, NO_CODES, expected);
+    const int accel_codes[3] = {14, 17, 20};
+    const int gyro_codes[3] = {1, 2, 31};
+    for (int axis = 0; axis < 3; ++axis) {
+        const double accel = 4096 * 0.34 * std::pow(0.92 / 0.34, (accel_codes[axis] - 1) / 30.0);
+        const double gyro = 25 * 131 * std::pow(1.046, gyro_codes[axis] - 1);
+        CHECK_NEAR(expected[axis], accel, accel * 0.001 + 1);
+        CHECK_NEAR(expected[3 + axis], gyro, gyro * 0.001 + 1);
     }
 }
 
-TEST(mpu6050_trim_codes_are_unpacked) {
-    const uint8_t registers[4] = {0xE1, 0x42, 0x1F, 0x39};
-    Mpu6050TrimCodes codes = {};
-    mpu6050_trim_codes(registers, &codes);
-    CHECK(codes.accel[0] == (7 << 2 | 3) && codes.gyro[0] == 1);
-    CHECK(codes.accel[1] == (2 << 2 | 2) && codes.gyro[1] == 2);
-    CHECK(codes.accel[2] == (0 << 2 | 1) && codes.gyro[2] == 31);
+TEST(later_chips_expected_responses_follow_their_register_map) {
+    for (int code = 1; code < 256; ++code) {
+        const uint8_t byte = static_cast<uint8_t>(code);
+        const uint8_t accel[4] = {byte, byte, 0, 0};
+        const uint8_t gyro[3] = {byte, byte, 0};
+        const double response = 2620 * std::pow(1.01, code - 1);
+        for (const ImuFamily family : {IMU_MPU6500, IMU_ICM20689}) {
+            uint16_t expected[IMU_AXES];
+            imu_expected_responses(family, accel, gyro, expected);
+            CHECK_NEAR(expected[1], response, response * 0.004 + 1);
+            CHECK_NEAR(expected[3], response, response * 0.004 + 1);
+            CHECK(expected[2] == 0 && expected[5] == 0);
+        }
+    }
 }
 
-TEST(mpu6050_response_may_differ_by_14_percent) {
-    CHECK(mpu6050_response_ok(1140, 1000) && mpu6050_response_ok(860, 1000));
-    CHECK(!mpu6050_response_ok(1141, 1000) && !mpu6050_response_ok(859, 1000));
-    CHECK(!mpu6050_response_ok(-1000, 1000) && !mpu6050_response_ok(0, 1000));
-    CHECK(mpu6050_response_ok(5, 0));
+TEST(imu_response_tolerance_depends_on_the_family) {
+    CHECK(imu_response_ok(IMU_MPU6050, 1140, 1000) && imu_response_ok(IMU_MPU6050, -860, 1000));
+    CHECK(!imu_response_ok(IMU_MPU6050, 1141, 1000) && !imu_response_ok(IMU_MPU6050, 859, 1000));
+    CHECK(imu_response_ok(IMU_MPU6500, 500, 1000) && imu_response_ok(IMU_ICM20689, -1500, 1000));
+    CHECK(!imu_response_ok(IMU_MPU6500, 499, 1000) && !imu_response_ok(IMU_ICM20689, 0, 1000));
+    CHECK(imu_response_ok(IMU_MPU6050, 5, 0) && imu_response_ok(IMU_UNKNOWN, 0, 1000));
+}
+
+TEST(imu_temperature_is_sent_on_the_mpu6050s_scale) {
+    CHECK(imu_temperature(IMU_MPU6050, -3920) == -3920);
+    for (int degc = -40; degc <= 85; ++degc) {
+        const double counts = (degc - 36.53) * 340;
+        const int16_t mpu6500 = static_cast<int16_t>(std::lround((degc - 21) * 333.87));
+        const int16_t icm20689 = static_cast<int16_t>(std::lround((degc - 25) * 326.8));
+        CHECK_NEAR(imu_temperature(IMU_MPU6500, mpu6500), counts, 4);
+        CHECK_NEAR(imu_temperature(IMU_ICM20689, icm20689), counts, 4);
+    }
+    CHECK(imu_temperature(IMU_ICM20689, INT16_MIN) == INT16_MIN);
+}
+
+TEST(imu_families_are_known_by_their_ids) {
+    CHECK(imu_family(0x68) == IMU_MPU6050 && imu_family(0x70) == IMU_MPU6500);
+    CHECK(imu_family(0x71) == IMU_MPU6500 && imu_family(0x73) == IMU_MPU6500);
+    CHECK(imu_family(0x98) == IMU_ICM20689 && imu_family(0x12) == IMU_ICM20689);
+    CHECK(imu_family(0x19) == IMU_ICM20689);
+    CHECK(imu_family(0x72) == IMU_UNKNOWN && imu_family(0x00) == IMU_UNKNOWN);
 }

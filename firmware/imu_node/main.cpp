@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// The IMU node: GY-87 (MPU6050, HMC5883L, BMP180) to radio.
+// The IMU node: the sensors of a GY-87 to radio.
 #include <string.h>
 
 #include "common/filters.h"
+#include "common/imu_chip.h"
 #include "common/imu_reducer.h"
 #include "common/wire.h"
 #include "hal/board.h"
@@ -53,6 +54,7 @@ void send_imu() {
     for (uint8_t axis = 0; axis < 3; ++axis) {
         imu.mag[axis] = readings.mag[axis];
     }
+    imu.temperature = imu_temperature(imu_family(sensors.imu_id), imu.temperature);
     imu.flags |= sensor_flags();
     const SettingsBlock &settings = stored_settings();
     imu.ranges = wire_ranges(settings.accel_range, settings.gyro_range, MAG_GAIN);

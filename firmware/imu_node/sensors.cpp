@@ -31,7 +31,7 @@ static_assert(BARO_EVERY_US > PRESSURE_US + BMP180_TEMPERATURE_US + 1000,
 bool set_up(Sensors *sensors, uint8_t index) {
     switch (index) {
         case SENSOR_IMU:
-            return mpu6050_set_up();
+            return imu_set_up(&sensors->imu_id);
         case SENSOR_MAG:
             sensors->mag_due_us = clock_us();
             return hmc5883l_set_up();
@@ -148,8 +148,8 @@ uint8_t end_baro(Sensors *sensors, bool ok, SensorReadings *readings) {
 uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
     switch (sensors->job) {
         case IMU_READ:
+            ok = ok && imu_read_bytes(sensors->bytes, &readings->imu);
             note(&sensors->states[SENSOR_IMU], ok);
-            imu_read_bytes(sensors->bytes, &readings->imu);
             readings->imu_us = sensors->imu_taken_us;
             return ok ? SENSOR_NEWS_IMU : 0;
         case MAG_READ:
@@ -175,7 +175,7 @@ void begin_job(Sensors *sensors, uint32_t now_us) {
         sensors->imu_taken_us = imu_us;
         sensors->imu_silent = false;
         sensors->states[SENSOR_IMU].retry_us = imu_us + IMU_SILENT_US;
-        read(sensors, IMU_READ, MPU6050_ADDRESS, MPU6050_DATA, MPU6050_DATA_SIZE);
+        read(sensors, IMU_READ, IMU_ADDRESS, IMU_DATA, IMU_DATA_SIZE);
     } else if (sensors->states[SENSOR_MAG].answering && clock_passed(now_us, sensors->mag_due_us)) {
         sensors->mag_due_us += MAG_EVERY_US;
         if (clock_passed(now_us, sensors->mag_due_us)) {
@@ -195,10 +195,11 @@ void sensors_start(Sensors *sensors, bool self_test) {
     memset(sensors, 0, sizeof *sensors);
     twi_start();
     if (self_test) {
-        mpu6050_reset();
-        sensors->self_test_failed = mpu6050_set_up() && !mpu6050_self_test();
+        imu_reset();
+        sensors->self_test_failed =
+            imu_set_up(&sensors->imu_id) && !imu_self_test(sensors->imu_id);
     }
-    // The MPU6050 once more: a test that broke off may have left its ranges behind.
+    // The IMU once more: a test that broke off may have left its ranges behind.
     for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
         try_set_up(sensors, index);
     }
@@ -230,7 +231,7 @@ uint8_t sensors_present(const Sensors *sensors) {
 }
 
 uint8_t sensors_failed(const Sensors *sensors) {
-    uint8_t bits = sensors->self_test_failed || sensors->imu_silent ? WIRE_SENSOR_MPU6050 : 0;
+    uint8_t bits = sensors->self_test_failed || sensors->imu_silent ? WIRE_SENSOR_IMU : 0;
     for (uint8_t index = 0; index < SENSOR_COUNT; ++index) {
         bits = static_cast<uint8_t>(bits | (sensors->states[index].answering ? 0 : 1 << index));
     }

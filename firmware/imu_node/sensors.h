@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// The three sensors of the GY-87 on one bus: which may use it when, and which are present.
+// The three sensors of a GY-87 on one bus: which may use it when, and which are present.
 //
-// One transfer runs at a time. The MPU6050's goes first, since its registers hold a reading for
+// One transfer runs at a time. The IMU's goes first, since its registers hold a reading for
 // one period only; magnetometer and barometer fill the gaps. A sensor that fails three times in a
-// row, lost its set-up, or is an MPU6050 whose interrupt stays away, counts as absent and is set up
+// row, lost its set-up, or is an IMU whose interrupt stays away, counts as absent and is set up
 // again every 0.2 s.
 #pragma once
 
@@ -11,7 +11,7 @@
 
 #include "common/bmp180_math.h"
 #include "common/imu_reducer.h"
-#include "drivers/mpu6050.h"
+#include "drivers/imu.h"
 
 enum SensorIndex : uint8_t { SENSOR_IMU, SENSOR_MAG, SENSOR_BARO, SENSOR_COUNT };
 
@@ -19,7 +19,7 @@ struct SensorState {
     bool answering;
     bool seen;  // since the start
     uint8_t failures;
-    uint32_t retry_us;  // while the MPU6050 answers: when it counts as silent
+    uint32_t retry_us;  // while the IMU answers: when it counts as silent
 };
 
 struct Sensors {
@@ -28,6 +28,7 @@ struct Sensors {
     uint8_t baro_cycle;
     bool self_test_failed;
     bool imu_silent;  // set up, but without an interrupt since
+    uint8_t imu_id;   // WHO_AM_I
     SensorState states[SENSOR_COUNT];
     uint32_t imu_taken_us;  // interrupt time of the reading last taken
     uint32_t mag_due_us;
@@ -35,7 +36,7 @@ struct Sensors {
     uint32_t baro_at_us;  // middle of the conversion now running
     int32_t baro_b5;
     Bmp180Words words;
-    uint8_t bytes[MPU6050_DATA_SIZE];  // the transfer now running
+    uint8_t bytes[IMU_DATA_SIZE];  // the transfer now running
 };
 
 // What a call of sensors_poll brought, one bit each.

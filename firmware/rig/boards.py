@@ -11,9 +11,9 @@ from firmware.rig.bench import Bench, Timer
 from firmware.rig.bmp180 import Bmp180
 from firmware.rig.hmc5883l import Hmc5883l
 from firmware.rig.i2c import I2cBus
+from firmware.rig.imu import IMU_CHIPS, Imu
 from firmware.rig.m8n import COMPUTING_S, M8n
 from firmware.rig.mcu import FIRMWARE, Mcu
-from firmware.rig.mpu6050 import Mpu6050
 from firmware.rig.nrf24 import Nrf24
 from firmware.rig.world import World
 
@@ -21,6 +21,13 @@ _CE: Final = 1 << 1
 _CSN: Final = 1 << 2
 _IMU_LINE: Final = 2
 _RADIO_LINE: Final = 3
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which chips are soldered to the boards."""
+
+    imu: str = "MPU6050"
 
 
 @dataclass
@@ -42,6 +49,7 @@ class Setup:
     build: Path = FIRMWARE / "build"
     frequency_hz: int = 16_000_000
     gps_computing_s: float = COMPUTING_S
+    parts: Parts = field(default_factory=Parts)
 
     def __post_init__(self) -> None:
         self.bench = Bench()
@@ -100,17 +108,18 @@ class Board:
 
 
 class ImuNode(Board):
-    """ATmega328P, GY-87, radio."""
+    """ATmega328P, the sensors of a GY-87, radio."""
 
     def __init__(
         self, setup: Setup, clock_ppm: float = 0.0, program: str = "imu_node", noise: bool = True
     ) -> None:
         super().__init__(setup, program, clock_ppm)
         bench, world = setup.bench, setup.world
-        self.mpu6050 = Mpu6050(bench, world, setup.rng(), self._drive_imu_line, noise)
-        self.hmc5883l = Hmc5883l(world, lambda: self.timer.now_ps, self.mpu6050)
+        chip = IMU_CHIPS[setup.parts.imu]
+        self.imu = Imu(bench, world, setup.rng(), self._drive_imu_line, chip, noise)
+        self.hmc5883l = Hmc5883l(world, lambda: self.timer.now_ps, self.imu)
         self.bmp180 = Bmp180(world, lambda: self.timer.now_ps)
-        self.bus = I2cBus(self.mcu, [self.mpu6050, self.hmc5883l, self.bmp180])
+        self.bus = I2cBus(self.mcu, [self.imu, self.hmc5883l, self.bmp180])
 
     def _drive_imu_line(self, high: bool) -> None:
         self.mcu.set_pin("D", _IMU_LINE, high)

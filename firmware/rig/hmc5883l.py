@@ -1,10 +1,10 @@
-"""HMC5883L at its registers, behind the MPU6050's bypass: datasheet 900405 revision E."""
+"""HMC5883L at its registers, behind the IMU's bypass: datasheet 900405 revision E."""
 
 from typing import Final
 
 from firmware.rig.bench import PS_PER_S
 from firmware.rig.i2c import Clock, RegisterDevice, big_endian, hold
-from firmware.rig.mpu6050 import Mpu6050
+from firmware.rig.imu import Imu
 from firmware.rig.world import World
 
 _RATES_HZ: Final = (0.75, 1.5, 3.0, 7.5, 15.0, 30.0, 75.0)
@@ -23,7 +23,7 @@ class Hmc5883l(RegisterDevice):
 
     address = 0x1E
 
-    def __init__(self, world: World, clock: Clock, behind: Mpu6050) -> None:
+    def __init__(self, world: World, clock: Clock, behind: Imu) -> None:
         super().__init__()
         self._world, self._clock, self._behind = world, clock, behind
         self.power_cycle()

@@ -35,7 +35,7 @@ SLICE_S: Final = 0.001
 START_UP_US: Final = 500
 """More than the clock starts behind the reset, less than a sample's interval."""
 FLASH_BYTES, RAM_BYTES = 32_768, 2_048
-SAMPLES: Final = {"imu_node": "MPU6050 sample", "gps_node": "fix", "receiver": "packet"}
+SAMPLES: Final = {"imu_node": "IMU sample", "gps_node": "fix", "receiver": "packet"}
 _SIZES: Final = re.compile(r"^(\w+) +flash +(\d+) bytes .*static RAM +(\d+) bytes", re.MULTILINE)
 
 
@@ -99,8 +99,8 @@ def measure(programs: Programs, loss: float, seconds: float) -> Run:
     run.processor_s = time.process_time() - start
     run.sent, run.collisions = air.sent - before[0], air.collisions - before[1]
     run.loads = {name: watch.load for name, watch in states.items()}
-    _read_line(run, line, tracker.imu.mpu6050.sampled_ps)
-    run.events["imu_node"] = sum(ps > STARTED_S * PS_PER_S for ps in tracker.imu.mpu6050.sampled_ps)
+    _read_line(run, line, tracker.imu.imu.sampled_ps)
+    run.events["imu_node"] = sum(ps > STARTED_S * PS_PER_S for ps in tracker.imu.imu.sampled_ps)
     tracker.close()
     return run
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from firmware.rig.bmp180 import Words
-from firmware.rig.mpu6050 import PWR_MGMT_1, SELF_TEST
+from firmware.rig.imu import PWR_MGMT_1, SELF_TEST
 from firmware.rig.world import Moment, World
 from gateway.records import ImuFlags
 from gateway.wire.payloads import BaroPayload, ImuPayload, NodeStatusPayload
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 START_S = 0.45
 """Reset, self-test and set-up."""
 FILTERED = ImuFlags.ACCEL_FILTERED | ImuFlags.GYRO_FILTERED
-MPU6050, HMC5883L, BMP180 = 1, 2, 4
+IMU, HMC5883L, BMP180 = 1, 2, 4
 
 MakeBench = Callable[..., Bench]
 
@@ -67,15 +67,15 @@ def test_rates_are_100_imu_75_mag_25_baro(bench: MakeBench) -> None:
     assert (status.sensors_present, status.sensors_failed, status.bus_errors) == (7, 0, 0)
     assert status.supply_mv == pytest.approx(3300, abs=20)
     assert 0 < status.loop_max_us < 2000
-    # Every one of the MPU6050's samples was read: a tenth of them makes the payloads.
-    assert len(node.mpu6050.sampled_ps) > 3000
+    # Every one of the IMU's samples was read: a tenth of them makes the payloads.
+    assert len(node.imu.sampled_ps) > 3000
 
 
 def test_node_time_is_the_moment_of_the_sample(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(1.5)
-    sampled_us = sorted(ps / 1e6 for ps in node.mpu6050.sampled_ps)
+    sampled_us = sorted(ps / 1e6 for ps in node.imu.sampled_ps)
     late_us = []
     for _, frame in rig.frames:
         if isinstance(frame.payload, ImuPayload):
@@ -141,10 +141,10 @@ def test_a_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
 
 def test_a_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> None:
     rig = bench()
-    rig.imu_node().mpu6050.self_test_works = False
+    rig.imu_node().imu.self_test_works = False
     rig.run(START_S + 0.3)
     assert ImuFlags.SELF_TEST_FAILED in rig.last(ImuPayload).flags
-    assert rig.last(NodeStatusPayload).sensors_failed == MPU6050
+    assert rig.last(NodeStatusPayload).sensors_failed == IMU
 
 
 @pytest.mark.parametrize(
@@ -171,27 +171,27 @@ def test_an_absent_sensor_is_reported_and_found_when_it_comes(
     assert rig.last(NodeStatusPayload).sensors_present == 7
 
 
-def test_without_the_mpu6050_barometer_and_status_still_come(bench: MakeBench) -> None:
+def test_without_the_imu_barometer_and_status_still_come(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
-    node.mpu6050.absent = True
+    node.imu.absent = True
     rig.run(1.6)
     assert not rig.payloads(ImuPayload)
     assert len(rig.payloads(BaroPayload)) > 20
     status = rig.last(NodeStatusPayload)
-    assert (status.sensors_present, status.sensors_failed) == (BMP180, MPU6050 | HMC5883L)
-    node.mpu6050.absent = False
-    node.mpu6050.power_cycle()
+    assert (status.sensors_present, status.sensors_failed) == (BMP180, IMU | HMC5883L)
+    node.imu.absent = False
+    node.imu.power_cycle()
     rig.run(0.8)
     assert len(rig.payloads(ImuPayload)) > 40
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
 
 
-def test_an_mpu6050_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
+def test_an_imu_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(1.0)
-    node.mpu6050.power_cycle()
+    node.imu.power_cycle()
     rig.run(0.5)
     assert len(rig.payloads(ImuPayload, since_s=1.15)) > 30
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
@@ -210,9 +210,9 @@ def test_a_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -
     assert not any(ImuFlags.MAG_NEW in p.flags for p in stale)
 
 
-def test_an_mpu6050_without_its_interrupt_is_asked_at_times_and_told(bench: MakeBench) -> None:
+def test_an_imu_without_its_interrupt_is_asked_at_times_and_told(bench: MakeBench) -> None:
     rig = bench()
-    chip = rig.imu_node().mpu6050
+    chip = rig.imu_node().imu
     rig.run(0.8)
     woken = 0
     write, irq = chip.write_register, chip._set_irq
@@ -225,7 +225,7 @@ def test_an_mpu6050_without_its_interrupt_is_asked_at_times_and_told(bench: Make
     chip.write_register, chip._set_irq = count, lambda high: None
     rig.run(1.4)
     assert 3 <= woken <= 8
-    assert rig.last(NodeStatusPayload).sensors_failed == MPU6050
+    assert rig.last(NodeStatusPayload).sensors_failed == IMU
     assert len(rig.payloads(BaroPayload, since_s=1.2)) == pytest.approx(25, abs=2)
     chip._set_irq = irq
     rig.run(1.2)
@@ -234,7 +234,7 @@ def test_an_mpu6050_without_its_interrupt_is_asked_at_times_and_told(bench: Make
 
 def test_a_self_test_that_breaks_off_leaves_no_range_behind(bench: MakeBench) -> None:
     rig = bench(world=still(gyro_radps=(1.0, 0.0, 0.0)))
-    chip = rig.imu_node(noise=False).mpu6050
+    chip = rig.imu_node(noise=False).imu
     read = chip.read_register
 
     def refuse_what_follows(register: int) -> int:
@@ -252,7 +252,7 @@ def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
     node = rig.imu_node()
     rig.run(0.8)
     node.bmp180.refuse_bytes = 2
-    node.mpu6050.refuse_bytes = 1
+    node.imu.refuse_bytes = 1
     rig.run(1.2)
     status = rig.last(NodeStatusPayload)
     assert status.bus_errors == 3

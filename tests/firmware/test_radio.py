@@ -51,8 +51,8 @@ def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> Non
         if isinstance(frame.payload, ImuPayload):
             # The node's clock starts within half a millisecond behind the reset.
             stamp_ps = frame.header.node_time_us * PS_PER_US + PS_PER_US * 500
-            at = bisect.bisect(node.mpu6050.sampled_ps, stamp_ps) - 1
-            late_s.append(end_s - node.mpu6050.sampled_ps[at] / PS_PER_S)
+            at = bisect.bisect(node.imu.sampled_ps, stamp_ps) - 1
+            late_s.append(end_s - node.imu.sampled_ps[at] / PS_PER_S)
     assert 0.002 < np.median(late_s) < 0.005
 
 

@@ -1,7 +1,11 @@
-"""MPU6050 at its registers: register map RM-MPU-6000A revision 4.2."""
+"""MPU6050 and its successors at their registers.
+
+Register maps RM-MPU-6000A revision 4.2, RM-MPU-6500A revision 2.1, DS-000143 (ICM-20689).
+"""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,6 +15,7 @@ from firmware.rig.i2c import RegisterDevice, big_endian, hold
 from firmware.rig.world import World
 
 SELF_TEST, SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG = 0x0D, 0x19, 0x1A, 0x1B, 0x1C
+_ACCEL_CONFIG_2, _LATER_GYRO_CODES = 0x1D, 0x00
 INT_PIN_CFG, INT_ENABLE, DATA, PWR_MGMT_1, WHO_AM_I = 0x37, 0x38, 0x3B, 0x6B, 0x75
 
 _ASLEEP: Final = 0x40
@@ -21,7 +26,9 @@ _DLPF_HZ: Final = (260, 184, 94, 44, 21, 10, 5)
 _INT_PULSE_PS: Final = 50 * PS_PER_US
 _NOISE_COUNTS: Final = 1.5
 _TRIM_CODES: Final = (14, 17, 20)
-"""Factory codes of all six axes, taken in turn."""
+"""Factory codes of all six axes of the MPU6050, taken in turn."""
+_LATER_CODES: Final = (60, 80, 100)
+"""Factory codes of each sensor of the later chips."""
 
 
 def accel_trim_g(code: int) -> float:
@@ -34,7 +41,53 @@ def gyro_trim_dps(code: int) -> float:
     return float(25 * 1.046 ** (code - 1))
 
 
-class Mpu6050(RegisterDevice):
+def later_trim(code: int) -> float:
+    """Return a factory trim of the MPU6500 and later, in counts at +-2 g or +-250 deg/s."""
+    return float(2620 * 1.01 ** (code - 1))
+
+
+def _mpu6050_codes() -> dict[int, int]:
+    a, g = _TRIM_CODES, _TRIM_CODES[::-1]
+    codes = {SELF_TEST + axis: a[axis] >> 2 << 5 | g[axis] for axis in range(3)}
+    return codes | {SELF_TEST + 3: (a[0] & 3) << 4 | (a[1] & 3) << 2 | a[2] & 3}
+
+
+def _later_codes() -> dict[int, int]:
+    starts = (SELF_TEST, _LATER_GYRO_CODES)
+    return {start + axis: _LATER_CODES[axis] for start in starts for axis in range(3)}
+
+
+@dataclass(frozen=True, slots=True)
+class ImuChip:
+    """How a chip with the MPU6050's register map differs from it."""
+
+    who_am_i: int
+    later: bool = False
+    """Self-test codes and accelerometer filter as in the MPU6500 and its successors."""
+    power_on: int = _ASLEEP
+    """PWR_MGMT_1 after power-on."""
+    counts_per_degc: float = 340.0
+    degc_at_zero: float = 36.53
+    keeps_ranges: bool = True
+    """False: a broken chip, which ignores writes to its range registers."""
+
+
+IMU_CHIPS: Final = {
+    "MPU6050": ImuChip(0x68),
+    "MPU6500": ImuChip(0x70, True, 0x01, 333.87, 21.0),
+    "MPU9250": ImuChip(0x71, True, 0x01, 333.87, 21.0),
+    "MPU9255": ImuChip(0x73, True, 0x01, 333.87, 21.0),
+    "ICM-20689": ImuChip(0x98, True, 0x41, 326.8, 25.0),
+    "ICM-20602": ImuChip(0x12, True, 0x41, 326.8, 25.0),
+    "MPU6886": ImuChip(0x19, True, 0x41, 326.8, 25.0),
+    "clone 0x72": ImuChip(0x72),
+    "clone 0x00": ImuChip(0x00),
+    "broken": ImuChip(0x68, keeps_ranges=False),
+}
+"""By the names that the node report is shown with."""
+
+
+class Imu(RegisterDevice):
     """The chip; it samples the world by its own clock and pulses its interrupt line."""
 
     address = 0x68
@@ -45,10 +98,12 @@ class Mpu6050(RegisterDevice):
         world: World,
         rng: np.random.Generator,
         set_irq: Callable[[bool], None],
+        chip: ImuChip,
         noise: bool = True,
     ) -> None:
         super().__init__()
         self._bench, self._world, self._rng, self._set_irq = bench, world, rng, set_irq
+        self._chip = chip
         self._noise = _NOISE_COUNTS if noise else 0.0
         self.self_test_works = True
         self.sampled_ps: list[int] = []
@@ -57,16 +112,22 @@ class Mpu6050(RegisterDevice):
         self.power_cycle()
 
     def power_cycle(self) -> None:
-        """Return to the state after power-on: asleep."""
-        self._registers = {PWR_MGMT_1: _ASLEEP, WHO_AM_I: self.address}
-        a, g = _TRIM_CODES, _TRIM_CODES[::-1]
-        for axis in range(3):
-            self._registers[SELF_TEST + axis] = a[axis] >> 2 << 5 | g[axis]
-        self._registers[SELF_TEST + 3] = (a[0] & 3) << 4 | (a[1] & 3) << 2 | a[2] & 3
-        self._trims = (
-            [accel_trim_g(code) for code in a],
-            [gyro_trim_dps(code) * sign for code, sign in zip(g, (1, -1, 1), strict=True)],
+        """Return to the state after power-on."""
+        self._registers = {PWR_MGMT_1: self._chip.power_on, WHO_AM_I: self._chip.who_am_i}
+        self._registers |= _later_codes() if self._chip.later else _mpu6050_codes()
+        accel_g, gyro_dps = (
+            (
+                [later_trim(c) / 16384 for c in _LATER_CODES],
+                [later_trim(c) / 131 for c in _LATER_CODES],
+            )
+            if self._chip.later
+            else (
+                [accel_trim_g(c) for c in _TRIM_CODES],
+                [gyro_trim_dps(c) for c in _TRIM_CODES[::-1]],
+            )
         )
+        # The gyroscope's y axis answers with the opposite sign: RM-MPU-6000A, section 4.1.
+        self._trims = accel_g, [gyro_dps[0], -gyro_dps[1], gyro_dps[2]]
         self._filtered: list[float] | None = None
         self._restart()
 
@@ -83,6 +144,8 @@ class Mpu6050(RegisterDevice):
         """Set a register; rate and sleep restart the sampling."""
         if register == PWR_MGMT_1 and value & _RESET:
             self.power_cycle()
+            return
+        if register in (GYRO_CONFIG, ACCEL_CONFIG) and not self._chip.keeps_ranges:
             return
         self._registers[register] = value
         if register in (PWR_MGMT_1, SMPLRT_DIV, CONFIG):
@@ -120,11 +183,17 @@ class Mpu6050(RegisterDevice):
 
     def _low_pass(self, values: list[float]) -> list[float]:
         """Filter as the chip's DLPF would, to first order."""
-        cutoff_hz = _DLPF_HZ[min(self._registers.get(CONFIG, 0) & 7, 6)]
-        gain = 1 - math.exp(-2 * math.pi * cutoff_hz * self._period_ps / PS_PER_S)
+        gains = [self._filter_gain(_ACCEL_CONFIG_2 if self._chip.later else CONFIG)] * 3
+        gains += [self._filter_gain(CONFIG)] * 3
         before = values if self._filtered is None else self._filtered
-        self._filtered = [b + gain * (v - b) for b, v in zip(before, values, strict=True)]
+        self._filtered = [
+            b + gain * (v - b) for b, v, gain in zip(before, values, gains, strict=True)
+        ]
         return self._filtered
+
+    def _filter_gain(self, register: int) -> float:
+        cutoff_hz = _DLPF_HZ[min(self._registers.get(register, 0) & 7, 6)]
+        return 1 - math.exp(-2 * math.pi * cutoff_hz * self._period_ps / PS_PER_S)
 
     def _store(self, values: list[float], temperature_degc: float) -> None:
         accel_config = self._registers.get(ACCEL_CONFIG, 0)
@@ -138,7 +207,9 @@ class Mpu6050(RegisterDevice):
             if accel_config & 0x80 >> axis and self.self_test_works:
                 g += self._trims[0][axis]
             words.append(hold(g * per_g + noise[axis]))
-        words.append(hold((temperature_degc - 36.53) * 340))
+        words.append(
+            hold((temperature_degc - self._chip.degc_at_zero) * self._chip.counts_per_degc)
+        )
         for axis in range(3):
             dps = math.degrees(values[3 + axis])
             if gyro_config & 0x80 >> axis and self.self_test_works:
