@@ -2,10 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
+
+from geographiclib.geodesic import Geodesic
 
 from gateway.records import GpsFix, GpsFixType
 from gateway.settings import Settings, setting
+
+WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
 
 HomeSource = Literal["none", "gps", "operator"]
 
@@ -74,3 +78,15 @@ def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
 def place_of(fix: GpsFix) -> Place:
     """Take the place out of a fix."""
     return Place(fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7, fix.alt_amsl_m)
+
+
+def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
+    """Measure distance and bearing between two locations.
+
+    Returns
+    -------
+    tuple of 2 floats
+        Distance along the ellipsoid in metres, and bearing at `here` in rad from north, -pi to pi.
+    """
+    found = Geodesic.WGS84.Inverse(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg, WANTED)
+    return (found["s12"], math.radians(found["azi1"]))

@@ -4,19 +4,15 @@ The newest mark wins, whoever set it: the current item of an uploaded mission, t
 point, a region of interest, a home set by hand, or the command line.
 """
 
-import math
-from typing import Any, Final
+from typing import Any
 
-from geographiclib.geodesic import Geodesic
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NAN, NavState
 from gateway.vehicle.client_place import is_on_earth
-from gateway.vehicle.home import Place
+from gateway.vehicle.home import Place, distance_and_bearing
 from gateway.vehicle.services.missions.mission_items import Item
 from gateway.vehicle.telemetry import fields
-
-WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
 
 
 class Mark:
@@ -99,15 +95,3 @@ class Mark:
             aspd_error=0.0,
             xtrack_error=NAN,
         )
-
-
-def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
-    """Measure distance and bearing between two places.
-
-    Returns
-    -------
-    tuple of 2 floats
-        Distance along the ellipsoid in metres, and bearing at `here` in rad from north, -pi to pi.
-    """
-    way = Geodesic.WGS84.Inverse(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg, WANTED)
-    return (way["s12"], math.radians(way["azi1"]))

@@ -5,7 +5,7 @@ client a separate stream instead of the common one. That costs CPU time, so only
 change things get it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Container
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import ClientInterval
 from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.telemetry.streams import OFF, Stream
-from gateway.vehicle.telemetry.telemetry import STATE_MESSAGES, Telemetry
+from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
 
 MAX_FAST_STREAMS: Final = 64
 """Each costs an encoding of its own."""
@@ -122,7 +122,7 @@ class IntervalService:
         if wish < 0:
             wish = NONE
         elif wish != DEFAULT:
-            carried = message_id in STATE_MESSAGES
+            carried = message_id in CARRIED_MESSAGES
             wish = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, wish)
         if _is_faster(wish, stream.interval_us) and not request.may_change:
             raise ValueError("more than the settings' rate is not for every client")
@@ -149,18 +149,18 @@ class IntervalService:
 
     def on_state(self, time_us: int) -> list[Answer]:
         """Send the messages of an IMU sample to the clients that requested more."""
-        return self._due(STATE_MESSAGES, time_us, Stream.offer) if self._fast else []
+        return self._due(CARRIED_MESSAGES, time_us, Stream.offer) if self._fast else []
 
     def poll(self, now_us: int) -> list[Answer]:
         """Send the timed messages to the clients that requested more."""
         if not self._fast:
             return []
-        timed = [m for _, m in self._fast if m not in STATE_MESSAGES]
+        timed = [m for _, m in self._fast if m not in CARRIED_MESSAGES]
         return self._due(timed, now_us, Stream.tick)
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to send."""
-        due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in STATE_MESSAGES]
+        due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in CARRIED_MESSAGES]
         return min(due, default=None)
 
     def _take(self, client_id: int, message_id: int, wish: int) -> list[Answer]:
@@ -177,9 +177,8 @@ class IntervalService:
             wish = NONE
         return [ClientInterval(client_id, self._system_id, message_id, wish)]
 
-    def _due(self, ids: Iterable[int], time_us: int, ask: Any) -> list[Answer]:
+    def _due(self, wanted: Container[int], time_us: int, ask: Any) -> list[Answer]:
         found: list[Answer] = []
-        wanted = set(ids)
         for (client_id, message_id), stream in self._fast.items():
             if message_id in wanted and ask(stream, time_us):
                 message = self._telemetry.build(message_id, time_us)

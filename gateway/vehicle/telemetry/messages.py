@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.geometry.quaternion import to_euler
+from gateway.geometry.quaternion import body_axes, rotate_inverse, to_euler
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,
@@ -21,8 +21,8 @@ from gateway.records import (
     NavState,
     Vec3,
 )
-from gateway.units import PA_PER_HPA
-from gateway.vehicle.home import Home, is_3d
+from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
+from gateway.vehicle.home import Home, Place, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry import fields
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
@@ -32,6 +32,12 @@ UT_PER_GAUSS: Final = 100.0
 MM: Final = 1e3
 CM: Final = 1e2
 CENTI_DOP: Final = 1e2
+CENTI: Final = 1e2
+MILLI: Final = 1e3
+MIN_COS_SQ: Final = 1e-4
+"""Roll and yaw are indistinguishable at a pitch of 90 degrees; their variances stay finite."""
+UNKNOWN_TERRAIN_M: Final = -10_000.0
+"""In ALTITUDE a terrain altitude below -1000 is unknown."""
 DEGE5: Final = 1e5
 DEGE7: Final = 1e7
 MS_US: Final = 1000
@@ -187,6 +193,141 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
     )
 
 
+def local_position_ned(state: NavState, origin: Place) -> Any:
+    """Encode position and velocity in the local frame; for states that have a position."""
+    return mavlink.MAVLink_local_position_ned_message(
+        boot_ms(state.time_us), *local_position_m(state, origin), *state.vel_n_mps
+    )
+
+
+def local_position_m(state: NavState, origin: Place) -> Vec3:
+    """Project a position onto the plane that touches the ellipsoid at the origin.
+
+    The projection is azimuthal equidistant, as autopilots use: distance and bearing from the origin
+    are exact.
+
+    Returns
+    -------
+    tuple of 3 floats
+        North, east and down in metres.
+    """
+    here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+    distance_m, bearing_rad = distance_and_bearing(origin, here)
+    north_m, east_m = distance_m * math.cos(bearing_rad), distance_m * math.sin(bearing_rad)
+    return (north_m, east_m, origin.alt_amsl_m - state.alt_amsl_m)
+
+
+def odometry(state: NavState, origin: Place) -> Any:
+    """Encode pose in the local frame and velocity in the body frame, with their variances.
+
+    The state has no correlations: these elements of the covariances are 0. The variances of the
+    angular rates are not estimated and are NaN.
+    """
+    return mavlink.MAVLink_odometry_message(
+        state.time_us,
+        mavlink.MAV_FRAME_LOCAL_NED,
+        mavlink.MAV_FRAME_BODY_FRD,
+        *local_position_m(state, origin),
+        state.q_nb,
+        *rotate_inverse(state.q_nb, state.vel_n_mps),
+        *state.rate_b_radps,
+        pose_covariance=_covariance(*_squared(state.pos_std_m), *_euler_variances(state)),
+        velocity_covariance=_covariance(*_body_velocity_variances(state), *UNKNOWN_VEC3),
+        reset_counter=0,
+        estimator_type=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT,
+    )
+
+
+def _squared(values: Vec3) -> Vec3:
+    x, y, z = values
+    return (x * x, y * y, z * z)
+
+
+def _covariance(*variances: float) -> list[float]:
+    """Lay out the upper right triangle, row by row, of a 6x6 matrix with this diagonal."""
+    found = [0.0] * 21
+    for place, variance in zip((0, 6, 11, 15, 18, 20), variances, strict=True):
+        found[place] = variance
+    return found
+
+
+def _euler_variances(state: NavState) -> Vec3:
+    """Convert variances about north, east and down to those of roll, pitch and yaw.
+
+    From the kinematics of intrinsic Z-Y-X angles: roll = (c N + s E) / cos(pitch),
+    pitch = c E - s N, yaw = D + tan(pitch) (c N + s E), with c and s of the yaw.
+    """
+    _, pitch, yaw = to_euler(state.q_nb)
+    north, east, down = _squared(state.attitude_std_rad)
+    cos_sq = math.cos(yaw) ** 2
+    along = cos_sq * north + (1.0 - cos_sq) * east
+    across = cos_sq * east + (1.0 - cos_sq) * north
+    level_sq = max(math.cos(pitch) ** 2, MIN_COS_SQ)
+    return (along / level_sq, across, down + along * (1.0 - level_sq) / level_sq)
+
+
+def _body_velocity_variances(state: NavState) -> Vec3:
+    variances = _squared(state.vel_std_mps)
+    x, y, z = (
+        sum(part * part * variance for part, variance in zip(axis, variances, strict=True))
+        for axis in body_axes(state.q_nb)
+    )
+    return (x, y, z)
+
+
+def altitude(state: NavState, baro: BaroSample | None, home_alt_m: float, origin: Place) -> Any:
+    """Encode the altitudes; the terrain and the clearance below, which are unknown, are not."""
+    return mavlink.MAVLink_altitude_message(
+        state.time_us,
+        altitude_monotonic=state.alt_amsl_m if baro is None else baro.alt_pressure_m,
+        altitude_amsl=state.alt_amsl_m,
+        altitude_local=state.alt_amsl_m - origin.alt_amsl_m,
+        altitude_relative=state.alt_amsl_m - home_alt_m,
+        altitude_terrain=UNKNOWN_TERRAIN_M,
+        bottom_clearance=-1.0,
+    )
+
+
+def _milli_imu(sample: ImuSample, mag_b_ut: Vec3) -> tuple[int, ...]:
+    """Return accelerations in mG, rates in mrad/s and the field in mgauss, 0 if it is unknown."""
+    scales = (
+        (sample.accel_b_mps2, MILLI / STANDARD_GRAVITY_MPS2),
+        (sample.gyro_b_radps, MILLI),
+        (mag_b_ut, MILLI / UT_PER_GAUSS),
+    )
+    return tuple(fields.int16(value * scale) for values, scale in scales for value in values)
+
+
+def _temperature_cdegc(sample: ImuSample) -> int:
+    """Return the temperature in 0.01 degrees; 0 means unknown, so 0 degrees is sent as 1."""
+    temperature = sample.temperature_degc
+    return 0 if math.isnan(temperature) else fields.int16(temperature * CENTI) or 1
+
+
+def scaled_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
+    """Encode the calibrated sensors as the integers of SCALED_IMU."""
+    values = _milli_imu(sample, mag_b_ut)
+    return mavlink.MAVLink_scaled_imu_message(
+        boot_ms(sample.time_us), *values, _temperature_cdegc(sample)
+    )
+
+
+def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
+    """Encode RAW_IMU in the units of SCALED_IMU, as ArduPilot does: clients expect these."""
+    values = _milli_imu(sample, mag_b_ut)
+    return mavlink.MAVLink_raw_imu_message(sample.time_us, *values, 0, _temperature_cdegc(sample))
+
+
+def gps_global_origin(origin: Place, time_us: int) -> Any:
+    """Encode the origin of the local frame."""
+    return mavlink.MAVLink_gps_global_origin_message(
+        fields.int32(origin.lat_deg * DEGE7),
+        fields.int32(origin.lon_deg * DEGE7),
+        fields.int32(origin.alt_amsl_m * MM),
+        time_us,
+    )
+
+
 def scaled_pressure(sample: BaroSample) -> Any:
     """Encode the barometer; the differential pressure, which nothing measures, is NaN."""
     return mavlink.MAVLink_scaled_pressure_message(
@@ -275,7 +416,7 @@ def estimator_status(state: NavState) -> Any:
 
 
 def home_position(home: Home) -> Any:
-    """Encode home, which is the origin of the local frame; slope and approach are not known."""
+    """Encode home; its local position, the slope and the approach are not known."""
     return mavlink.MAVLink_home_position_message(
         fields.int32(home.place.lat_deg * DEGE7),
         fields.int32(home.place.lon_deg * DEGE7),

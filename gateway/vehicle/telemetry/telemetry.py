@@ -11,14 +11,23 @@ from typing import Any, Final
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.records import NAN, UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState, NodeStatus
-from gateway.vehicle.home import Home, is_good_enough, place_of
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    BaroSample,
+    GpsFix,
+    ImuSample,
+    NavState,
+    NodeStatus,
+    Vec3,
+)
+from gateway.vehicle.home import Home, Place, is_good_enough, place_of
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.high_latency import high_latency2
 from gateway.vehicle.telemetry.motion import IN_AIR, Motion
-from gateway.vehicle.telemetry.streams import Pace, Stream, interval_us
+from gateway.vehicle.telemetry.streams import OFF, Pace, Stream, interval_us
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 STATE_MESSAGES: Final = {
@@ -30,6 +39,18 @@ STATE_MESSAGES: Final = {
 }
 """Carried by IMU samples, each from so many µs after the first: at the usual rates no sample
 carries more than two. The quaternion comes first, because its latency is the visible one."""
+
+REQUESTED_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY,
+    mavlink.MAVLINK_MSG_ID_ALTITUDE,
+)
+"""Carried by IMU samples too, but sent only to clients that request them: QGroundControl that has
+seen one ALTITUDE shows no other altitude any more."""
+
+CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
 
 TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -60,6 +81,8 @@ class Telemetry:
         self.health = health
         self.motion = Motion(settings.takeoff_speed_mps, settings.takeoff_height_m)
         self.home: Home | None = None
+        self._origin: Home | None = None
+        """Origin of the local frame: the first home, which a later one does not move."""
         self.calibrating = False
         self.state: NavState | None = None
         self._reference_alt_m = NAN
@@ -105,6 +128,12 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
+            mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._of_sample(messages.scaled_imu),
+            mavlink.MAVLINK_MSG_ID_RAW_IMU: self._of_sample(messages.raw_imu),
+            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._of_origin(messages.local_position_ned),
+            mavlink.MAVLINK_MSG_ID_ODOMETRY: self._of_origin(messages.odometry),
+            mavlink.MAVLINK_MSG_ID_ALTITUDE: self._of_origin(self._altitude),
+            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._global_origin,
         }
 
     def add(self, message_id: int, builder: Builder) -> None:
@@ -197,6 +226,7 @@ class Telemetry:
     def set_home(self, home: Home) -> list[Any]:
         """Set home, and return HOME_POSITION at once."""
         self.home = home
+        self._origin = self._origin or home
         self._reference_alt_m = home.place.alt_amsl_m
         return [messages.home_position(home)]
 
@@ -241,6 +271,25 @@ class Telemetry:
 
     def _of_state(self, build: Callable[[NavState], Any]) -> Builder:
         return lambda _: None if self.state is None else build(self.state)
+
+    def _of_sample(self, build: Callable[[ImuSample, Vec3], Any]) -> Builder:
+        return lambda _: None if self._sample is None else build(self._sample, self._mag_b_ut)
+
+    def _of_origin(self, build: Callable[[NavState, Place], Any]) -> Builder:
+        def builder(_now_us: int) -> Any:
+            state, origin = self.state, self._origin
+            if state is None or origin is None or not messages.has_position(state):
+                return None
+            return build(state, origin.place)
+
+        return builder
+
+    def _altitude(self, state: NavState, origin: Place) -> Any:
+        return messages.altitude(state, self._baro, self._reference_alt_m, origin)
+
+    def _global_origin(self, _now_us: int) -> Any:
+        origin = self._origin
+        return origin and messages.gps_global_origin(origin.place, origin.set_time_us)
 
     def _global_position(self, _now_us: int) -> Any:
         if self.state is None or not messages.has_position(self.state):
@@ -310,7 +359,8 @@ class Telemetry:
 
 def _intervals(settings: VehicleSettings) -> dict[int, int]:
     """Return the interval of every message; a rate's setting is named after its message."""
-    found = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: interval_us(HEARTBEAT_HZ)}
+    found = dict.fromkeys(REQUESTED_MESSAGES, OFF)
+    found[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = interval_us(HEARTBEAT_HZ)
     for name, rate in msgspec.structs.asdict(settings.rates).items():
         message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
         found[getattr(mavlink, message)] = interval_us(rate)

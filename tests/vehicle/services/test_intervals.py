@@ -51,6 +51,30 @@ def test_a_faster_rate_goes_to_the_one_who_wants_it_alone(station: GroundStation
     assert both - common == pytest.approx(200, abs=4), "the hub keeps the common ones away"
 
 
+@pytest.mark.parametrize("message_id", [26, 27, 32, 141, 331])
+def test_derived_message_is_sent_only_to_the_client_that_requested_it(
+    station: GroundStation, message_id: int
+) -> None:
+    name = mavlink.mavlink_map[message_id].msgname
+    other = GroundStation(station.vehicle, station.clock, client_id=8)
+    assert name not in fly(station, 2.0)
+    [ack] = station.command(SET, message_id, 50_000)
+    assert ack.result == ACCEPTED
+    assert fly(station, 2.0)[name] == pytest.approx(40, abs=1)
+    assert name not in fly(other, 2.0)
+    assert [m.get_type() for m in station.request(message_id)] == ["COMMAND_ACK", name]
+
+
+def test_origin_of_the_local_frame_does_not_move_with_home(station: GroundStation) -> None:
+    fly(station, 0.1)
+    [_, before] = station.request(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, 8.5, 900.0)
+    [_, after] = station.request(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    assert (after.x, after.y, after.z) == (before.x, before.y, before.z)
+    [_, origin] = station.request(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+    assert (origin.latitude, origin.altitude) == (471_234_567, 520_250)
+
+
 def test_a_faster_rate_of_a_timed_message(station: GroundStation) -> None:
     station.command(SET, HOME, 100_000)
     assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(20 + 2, abs=2)

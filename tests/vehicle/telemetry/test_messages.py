@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.geometry.quaternion import from_euler
 from gateway.records import GpsFixType, NavFlags
 from gateway.vehicle.encoder import Encoder
 from gateway.vehicle.home import Home, Place
@@ -148,6 +149,57 @@ def test_gps_raw_int_at_rest_has_no_course() -> None:
 def test_fix_types(fix_type: GpsFixType, fix_ok: bool, expected: int) -> None:
     fix = replace(FIX, fix_type=fix_type, fix_ok=fix_ok)
     assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
+
+
+ORIGIN = Place(47.123_456_7, -8.765_432_1 - 0.001, 500.0)
+
+
+def test_local_position_is_north_east_down_of_the_origin() -> None:
+    found = through_the_wire(messages.local_position_ned(STATE, ORIGIN))
+    assert (found.x, found.y, found.z) == pytest.approx((0.0, 75.9, -23.456), abs=0.1)
+    assert (found.vx, found.vy, found.vz) == STATE.vel_n_mps
+    north = replace(STATE, lat_deg=STATE.lat_deg + 0.01, lon_deg=ORIGIN.lon_deg)
+    assert messages.local_position_m(north, ORIGIN)[:2] == pytest.approx((1111.8, 0.0), abs=0.2)
+
+
+def test_odometry_has_the_velocity_in_the_body_frame_and_its_variances() -> None:
+    level_east = replace(
+        STATE,
+        q_nb=from_euler(0.0, 0.0, math.pi / 2),
+        vel_n_mps=(0.0, 5.0, 0.0),
+        vel_std_mps=(0.1, 0.2, 0.3),
+        attitude_std_rad=(0.01, 0.02, 0.05),
+    )
+    found = through_the_wire(messages.odometry(level_east, ORIGIN))
+    assert (found.frame_id, found.child_frame_id) == (
+        mavlink.MAV_FRAME_LOCAL_NED,
+        mavlink.MAV_FRAME_BODY_FRD,
+    )
+    assert (found.vx, found.vy, found.vz) == pytest.approx((5.0, 0.0, 0.0), abs=1e-6)
+    assert found.q == pytest.approx(level_east.q_nb)
+    diagonal = [found.pose_covariance[n] for n in (0, 6, 11, 15, 18, 20)]
+    assert diagonal == pytest.approx([0.36, 0.64, 4.0, 4e-4, 1e-4, 25e-4])
+    assert [found.velocity_covariance[n] for n in (0, 6, 11)] == pytest.approx([0.04, 0.01, 0.09])
+    assert math.isnan(found.velocity_covariance[15])
+
+
+def test_altitude_is_relative_to_home_and_local_to_the_origin() -> None:
+    found = through_the_wire(messages.altitude(STATE, BARO, 510.0, ORIGIN))
+    assert found.altitude_monotonic == BARO.alt_pressure_m
+    heights = (found.altitude_amsl, found.altitude_relative, found.altitude_local)
+    assert heights == pytest.approx((523.456, 13.456, 23.456), abs=1e-3)
+    assert (found.altitude_terrain < -1000, found.bottom_clearance < 0) == (True, True)
+
+
+@pytest.mark.parametrize("build", [messages.raw_imu, messages.scaled_imu])
+def test_imu_in_thousandths(build: Any) -> None:
+    found = through_the_wire(build(SAMPLE, (20.0, -5.0, 43.0)))
+    assert (found.xacc, found.yacc, found.zacc) == (51, -25, -994)
+    assert (found.xgyro, found.ygyro, found.zgyro) == (500, 250, -125)
+    assert (found.xmag, found.ymag, found.zmag) == (200, -50, 430)
+    assert found.temperature == 3150
+    cold = through_the_wire(build(replace(SAMPLE, temperature_degc=0.0), (math.nan,) * 3))
+    assert (cold.temperature, cold.xmag) == (1, 0)
 
 
 def test_gps_raw_int_with_unknown_accuracies() -> None:

@@ -10,8 +10,8 @@ from gateway.records import NAN, GpsFix
 from gateway.settings import Settings
 from gateway.vehicle.actions import Answer, Reply, SavePlaces
 from gateway.vehicle.client_place import GLOBAL_FRAMES, height_amsl_m, is_on_earth
-from gateway.vehicle.home import Place, is_3d, place_of
-from gateway.vehicle.mark import Mark, distance_and_bearing
+from gateway.vehicle.home import Place, distance_and_bearing, is_3d, place_of
+from gateway.vehicle.mark import Mark
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
