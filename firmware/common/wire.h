@@ -41,6 +41,14 @@ enum WireSensor : uint8_t {
     WIRE_SENSOR_GPS = 1 << 3,
 };
 
+// Scales of the magnetometer: 0 to 7 are the HMC5883L's gain codes.
+enum WireMagScale : uint8_t {
+    WIRE_MAG_QMC5883L_8G = 8,  // 3000 counts per gauss
+    WIRE_MAG_QMC5883P_8G = 9,  // 3750 counts per gauss
+};
+
+constexpr int16_t WIRE_MAG_OVERFLOW = -4096;
+
 #define WIRE_PACKED __attribute__((packed))
 
 struct WIRE_PACKED WireHeader {
@@ -55,10 +63,10 @@ struct WIRE_PACKED WireImu {
     WireHeader header;
     int16_t accel[3];      // 32768 / range g per count
     int16_t gyro[3];       // 131, 65.5, 32.8 or 16.4 counts per deg/s
-    int16_t mag[3];        // x, y, z; -4096 is the chip's overflow mark
+    int16_t mag[3];        // x, y, z on the HMC5883L's axes
     int16_t temperature;   // degC = counts / 340 + 36.53
     uint16_t flags;        // WireImuFlag
-    uint8_t ranges;        // bits 0-1 accelerometer, 2-3 gyroscope, 4-6 magnetometer gain
+    uint8_t ranges;        // bits 0-1 accelerometer, 2-3 gyroscope, 4-7 magnetometer scale
 };
 static_assert(sizeof(WireImu) == 31, "PROTOCOL.md: kind 1");
 
@@ -154,6 +162,6 @@ constexpr uint8_t wire_vehicle_node(uint8_t vehicle_id, uint8_t node_id) {
     return static_cast<uint8_t>(vehicle_id << 3 | node_id);
 }
 
-constexpr uint8_t wire_ranges(uint8_t accel_range, uint8_t gyro_range, uint8_t mag_gain) {
-    return static_cast<uint8_t>(accel_range | gyro_range << 2 | mag_gain << 4);
+constexpr uint8_t wire_ranges(uint8_t accel_range, uint8_t gyro_range, uint8_t mag_scale) {
+    return static_cast<uint8_t>(accel_range | gyro_range << 2 | mag_scale << 4);
 }

@@ -149,6 +149,14 @@ bool twi_run(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_t 
     return state == TWI_DONE;
 }
 
+bool twi_answers(uint8_t address) {
+    const uint16_t before = errors;
+    const uint8_t pointer[1] = {0};
+    const bool answers = twi_run(address, pointer, sizeof pointer, nullptr, 0);
+    errors = before;
+    return answers;
+}
+
 uint16_t twi_errors() {
     uint16_t count;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { count = errors; }

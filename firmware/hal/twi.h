@@ -23,5 +23,9 @@ TwiState twi_poll(uint32_t now_us);
 bool twi_run(uint8_t address, const uint8_t *write, uint8_t write_size, uint8_t *read,
              uint8_t read_size);
 
+// Whether a device answers at the address; its register pointer is at 0 then. For set-up alone, and
+// no answer is no failure.
+bool twi_answers(uint8_t address);
+
 // Transfers that failed, wraps.
 uint16_t twi_errors();

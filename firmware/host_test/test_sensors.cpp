@@ -4,6 +4,8 @@
 #include <cstdint>
 
 #include "common/bmp180_math.h"
+#include "common/bmp280_math.h"
+#include "common/compass_chip.h"
 #include "common/imu_chip.h"
 #include "host_test/check.h"
 
@@ -134,4 +136,74 @@ TEST(imu_families_are_known_by_their_ids) {
     CHECK(imu_family(0x98) == IMU_ICM20689 && imu_family(0x12) == IMU_ICM20689);
     CHECK(imu_family(0x19) == IMU_ICM20689);
     CHECK(imu_family(0x72) == IMU_UNKNOWN && imu_family(0x00) == IMU_UNKNOWN);
+}
+
+// The example of the BMP280 datasheet, section 3.12.
+constexpr Bmp280Words BMP280_EXAMPLE = {27504, 26435, -1000, 36477, -10685, 3024,
+                                        2855,  140,   -7,    15500, -14600, 6000};
+
+TEST(bmp280_gives_the_datasheets_example) {
+    const int32_t t_fine = bmp280_t_fine(&BMP280_EXAMPLE, 519888);
+    CHECK(t_fine == 128422);
+    CHECK(bmp280_temperature_ddegc(t_fine) == 251);
+    CHECK_NEAR(bmp280_pressure_centipa(&BMP280_EXAMPLE, t_fine, 415148), 10065327, 2);
+}
+
+TEST(bmp280_words_are_read_little_endian_and_checked) {
+    uint8_t bytes[BMP280_WORDS_SIZE] = {0x70, 0x6B, 0x43, 0x67, 0x18, 0xFC, 0x7D, 0x8E};
+    Bmp280Words words = {};
+    CHECK(bmp280_read_words(bytes, &words));
+    CHECK(words.t1 == 27504 && words.t2 == 26435 && words.t3 == -1000 && words.p1 == 36477);
+    bytes[6] = bytes[7] = 0;
+    CHECK(!bmp280_read_words(bytes, &words));
+}
+
+TEST(bmp280_skipped_measurements_are_no_readings) {
+    uint32_t pressure = 0;
+    uint32_t temperature = 0;
+    const uint8_t good[6] = {0x65, 0x5A, 0xC0, 0x7E, 0xED, 0x00};
+    CHECK(bmp280_read_raw(good, &pressure, &temperature));
+    CHECK(pressure == 415148 && temperature == 519888);
+    const uint8_t skipped[6] = {0x80, 0x00, 0x00, 0x7E, 0xED, 0x00};
+    CHECK(!bmp280_read_raw(skipped, &pressure, &temperature));
+    const uint8_t dead[6] = {};
+    CHECK(!bmp280_read_raw(dead, &pressure, &temperature));
+}
+
+TEST(compass_chips_are_read_on_the_hmc5883ls_axes) {
+    int16_t mag[3];
+    // x = 1, z = -2, y = 3, high byte first.
+    uint8_t hmc[9] = {HMC5883L_CONFIG_A, HMC5883L_CONFIG_B, 0, 0, 1, 0xFF, 0xFE, 0, 3};
+    CHECK(compass_read_bytes(COMPASS_CHIP[0], hmc, mag));
+    CHECK(mag[0] == 1 && mag[1] == 3 && mag[2] == -2);
+    hmc[2] = 2;
+    CHECK(!compass_read_bytes(COMPASS_CHIP[0], hmc, mag));
+    // x = 1, y = 3, z = -2, low byte first.
+    uint8_t qmc_l[10] = {1, 0, 3, 0, 0xFE, 0xFF, 0x01, 0, 0, QMC5883L_CONTROL};
+    CHECK(compass_read_bytes(COMPASS_CHIP[1], qmc_l, mag));
+    CHECK(mag[0] == 1 && mag[1] == 3 && mag[2] == -2);
+    qmc_l[9] = 0;
+    CHECK(!compass_read_bytes(COMPASS_CHIP[1], qmc_l, mag));
+    // Own x = 1, y = 3, z = -2.
+    uint8_t qmc_p[11] = {1, 0, 3, 0, 0xFE, 0xFF, 0, 0, 0x01, QMC5883P_CONTROL_1, QMC5883P_CONTROL_2};
+    CHECK(compass_read_bytes(COMPASS_CHIP[2], qmc_p, mag));
+    CHECK(mag[0] == -3 && mag[1] == -1 && mag[2] == 2);
+    qmc_p[10] = 0;
+    CHECK(!compass_read_bytes(COMPASS_CHIP[2], qmc_p, mag));
+}
+
+TEST(compass_overflow_is_marked_and_no_other_reading_looks_like_it) {
+    int16_t mag[3];
+    uint8_t qmc_l[10] = {0x00, 0xF0, 3, 0, 0, 0x80, 0x01, 0, 0, QMC5883L_CONTROL};
+    CHECK(compass_read_bytes(COMPASS_CHIP[1], qmc_l, mag));
+    CHECK(mag[0] == -4095 && mag[1] == 3 && mag[2] == INT16_MIN);
+    qmc_l[6] = 0x02;
+    CHECK(compass_read_bytes(COMPASS_CHIP[1], qmc_l, mag));
+    CHECK(mag[0] == WIRE_MAG_OVERFLOW && mag[2] == WIRE_MAG_OVERFLOW);
+    uint8_t qmc_p[11] = {0x00, 0x10, 0, 0x80, 1, 0, 0, 0, 0x01, QMC5883P_CONTROL_1, QMC5883P_CONTROL_2};
+    CHECK(compass_read_bytes(COMPASS_CHIP[2], qmc_p, mag));
+    CHECK(mag[0] == INT16_MAX && mag[1] == -4095 && mag[2] == -1);
+    qmc_p[8] = 0x02;
+    CHECK(compass_read_bytes(COMPASS_CHIP[2], qmc_p, mag));
+    CHECK(mag[0] == WIRE_MAG_OVERFLOW && mag[1] == WIRE_MAG_OVERFLOW);
 }

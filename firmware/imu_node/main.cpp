@@ -57,7 +57,8 @@ void send_imu() {
     imu.temperature = imu_temperature(imu_family(sensors.imu_id), imu.temperature);
     imu.flags |= sensor_flags();
     const SettingsBlock &settings = stored_settings();
-    imu.ranges = wire_ranges(settings.accel_range, settings.gyro_range, MAG_GAIN);
+    imu.ranges = wire_ranges(settings.accel_range, settings.gyro_range,
+                             sensors.compass != nullptr ? sensors.compass->scale : MAG_GAIN);
     mag_is_new = false;
     ++report.samples;
     radio_sender_push(&sender, WIRE_IMU, readings.imu_us, &imu, sizeof imu);
@@ -65,8 +66,8 @@ void send_imu() {
 
 void send_baro() {
     WireBaro baro = {};
-    baro.pressure_centipa = readings.pressure_centipa;
-    baro.temperature_ddegc = readings.temperature_ddegc;
+    baro.pressure_centipa = readings.baro.pressure_centipa;
+    baro.temperature_ddegc = readings.baro.temperature_ddegc;
     radio_sender_push(&sender, WIRE_BARO, readings.baro_us, &baro, sizeof baro);
 }
 

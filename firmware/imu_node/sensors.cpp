@@ -4,8 +4,6 @@
 #include <string.h>
 
 #include "common/wire.h"
-#include "drivers/bmp180.h"
-#include "drivers/hmc5883l.h"
 #include "hal/clock.h"
 #include "hal/lines.h"
 #include "hal/twi.h"
@@ -15,18 +13,11 @@ namespace {
 
 enum Job : uint8_t { NO_JOB, IMU_READ, MAG_READ, BARO_COMMAND, BARO_READ };
 
-// The barometer's cycle: a temperature now and then, a pressure each time.
-enum BaroStep : uint8_t { BEGIN_TEMPERATURE, READ_TEMPERATURE, BEGIN_PRESSURE, READ_PRESSURE };
-
 constexpr uint8_t FAILURES_TO_ABSENT = 3;
 constexpr uint32_t RETRY_US = 200000;
 constexpr uint32_t IMU_SILENT_US = 50000;
 constexpr uint32_t MAG_EVERY_US = 1000000UL / MAG_HZ;
 constexpr uint32_t BARO_EVERY_US = 1000000UL / BARO_HZ;
-constexpr uint8_t PRESSURES_PER_TEMPERATURE = BARO_HZ;  // once a second
-constexpr uint32_t PRESSURE_US = bmp180_pressure_us(BARO_OVERSAMPLING);
-static_assert(BARO_EVERY_US > PRESSURE_US + BMP180_TEMPERATURE_US + 1000,
-              "BARO_HZ is too high for BARO_OVERSAMPLING");
 
 bool set_up(Sensors *sensors, uint8_t index) {
     switch (index) {
@@ -34,12 +25,12 @@ bool set_up(Sensors *sensors, uint8_t index) {
             return imu_set_up(&sensors->imu_id);
         case SENSOR_MAG:
             sensors->mag_due_us = clock_us();
-            return hmc5883l_set_up();
+            sensors->compass = compass_set_up();
+            return sensors->compass != nullptr;
         default:
-            sensors->baro_step = BEGIN_TEMPERATURE;
-            sensors->baro_cycle = 0;
+            sensors->baro_converting = false;
             sensors->baro_due_us = clock_us();
-            return bmp180_set_up(&sensors->words);
+            return barometer_set_up(&sensors->barometer);
     }
 }
 
@@ -76,73 +67,50 @@ void read(Sensors *sensors, Job job, uint8_t address, uint8_t from, uint8_t size
     twi_begin(address, &from, 1, sensors->bytes, size);
 }
 
-void convert(Sensors *sensors, uint8_t conversion) {
-    const uint8_t bytes[2] = {BMP180_CONTROL, conversion};
-    sensors->job = BARO_COMMAND;
-    twi_begin(BMP180_ADDRESS, bytes, sizeof bytes, nullptr, 0);
-}
-
 void begin_baro(Sensors *sensors) {
-    switch (sensors->baro_step) {
-        case BEGIN_TEMPERATURE:
-            convert(sensors, BMP180_CONVERT_TEMPERATURE);
-            break;
-        case BEGIN_PRESSURE:
-            convert(sensors, bmp180_convert_pressure(BARO_OVERSAMPLING));
-            break;
-        case READ_TEMPERATURE:
-            read(sensors, BARO_READ, BMP180_ADDRESS, BMP180_RESULT, 2);
-            break;
-        default:
-            read(sensors, BARO_READ, BMP180_ADDRESS, BMP180_RESULT, 3);
-            break;
+    const Barometer *barometer = &sensors->barometer;
+    if (sensors->baro_converting) {
+        read(sensors, BARO_READ, barometer->address, barometer_result_from(barometer),
+             barometer_result_size(barometer));
+        return;
     }
+    const uint8_t bytes[2] = {BAROMETER_CONTROL, barometer_command(barometer)};
+    sensors->job = BARO_COMMAND;
+    twi_begin(barometer->address, bytes, sizeof bytes, nullptr, 0);
 }
 
-// The next step's time counts from the end of the command, when the conversion begins.
+// The conversion's time counts from the end of the command.
 void baro_commanded(Sensors *sensors) {
-    const uint32_t now_us = clock_us();
-    const bool pressure = sensors->baro_step == BEGIN_PRESSURE;
-    sensors->baro_due_us = now_us + (pressure ? PRESSURE_US : BMP180_TEMPERATURE_US);
-    sensors->baro_at_us = now_us + PRESSURE_US / 2;
-    ++sensors->baro_step;
+    sensors->baro_converting = true;
+    sensors->baro_began_us = clock_us();
+    sensors->baro_due_us = sensors->baro_began_us + barometer_conversion_us(&sensors->barometer);
 }
 
-uint8_t baro_read(Sensors *sensors, SensorReadings *readings) {
-    const uint8_t *bytes = sensors->bytes;
-    const uint16_t high = static_cast<uint16_t>(bytes[0] << 8 | bytes[1]);
-    if (sensors->baro_step == READ_TEMPERATURE) {
-        sensors->baro_b5 = bmp180_b5(&sensors->words, high);
-        sensors->baro_step = BEGIN_PRESSURE;
-        return 0;
+// The reading is that of the conversion's middle. A temperature alone is followed by its pressure.
+BarometerResult baro_read(Sensors *sensors, SensorReadings *readings) {
+    const uint16_t conversion_us = barometer_conversion_us(&sensors->barometer);
+    const BarometerResult result = barometer_take(&sensors->barometer, sensors->bytes, &readings->baro);
+    sensors->baro_converting = false;
+    if (result == BAROMETER_PRESSURE) {
+        readings->baro_us = sensors->baro_began_us + conversion_us / 2;
+        sensors->baro_due_us = sensors->baro_began_us + BARO_EVERY_US;
     }
-    const uint32_t raw = (static_cast<uint32_t>(high) << 8 | bytes[2]) >> (8 - BARO_OVERSAMPLING);
-    readings->baro_us = sensors->baro_at_us;
-    readings->pressure_centipa =
-        bmp180_pressure_centipa(&sensors->words, sensors->baro_b5, raw, BARO_OVERSAMPLING);
-    readings->temperature_ddegc = bmp180_temperature_ddegc(sensors->baro_b5);
-    sensors->baro_cycle = static_cast<uint8_t>((sensors->baro_cycle + 1) % PRESSURES_PER_TEMPERATURE);
-    sensors->baro_step = sensors->baro_cycle == 0 ? BEGIN_TEMPERATURE : BEGIN_PRESSURE;
-    sensors->baro_due_us = sensors->baro_at_us + (BARO_EVERY_US - PRESSURE_US / 2);
-    return SENSOR_NEWS_BARO;
-}
-
-void restart_baro(Sensors *sensors) {
-    sensors->baro_step = BEGIN_TEMPERATURE;
-    sensors->baro_due_us = clock_us() + BARO_EVERY_US;
+    return result;
 }
 
 uint8_t end_baro(Sensors *sensors, bool ok, SensorReadings *readings) {
-    note(&sensors->states[SENSOR_BARO], ok);
-    if (!ok) {
-        restart_baro(sensors);
-        return 0;
-    }
-    if (sensors->job == BARO_COMMAND) {
+    BarometerResult result = ok ? BAROMETER_TEMPERATURE : BAROMETER_BAD;
+    if (ok && sensors->job == BARO_COMMAND) {
         baro_commanded(sensors);
-        return 0;
+    } else if (ok) {
+        result = baro_read(sensors, readings);
     }
-    return baro_read(sensors, readings);
+    note(&sensors->states[SENSOR_BARO], result != BAROMETER_BAD);
+    if (result == BAROMETER_BAD) {
+        sensors->baro_converting = false;
+        sensors->baro_due_us = clock_us() + BARO_EVERY_US;
+    }
+    return result == BAROMETER_PRESSURE ? SENSOR_NEWS_BARO : 0;
 }
 
 uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
@@ -153,7 +121,7 @@ uint8_t end_job(Sensors *sensors, bool ok, SensorReadings *readings) {
             readings->imu_us = sensors->imu_taken_us;
             return ok ? SENSOR_NEWS_IMU : 0;
         case MAG_READ:
-            ok = ok && hmc5883l_read_bytes(sensors->bytes, readings->mag);
+            ok = ok && compass_read_bytes(*sensors->compass, sensors->bytes, readings->mag);
             note(&sensors->states[SENSOR_MAG], ok);
             return ok ? SENSOR_NEWS_MAG : 0;
         default:
@@ -181,7 +149,7 @@ void begin_job(Sensors *sensors, uint32_t now_us) {
         if (clock_passed(now_us, sensors->mag_due_us)) {
             sensors->mag_due_us = now_us + MAG_EVERY_US;  // it was away: do not catch up
         }
-        read(sensors, MAG_READ, HMC5883L_ADDRESS, HMC5883L_FROM, HMC5883L_SIZE);
+        read(sensors, MAG_READ, sensors->compass->address, sensors->compass->from, sensors->compass->size);
     } else if (sensors->states[SENSOR_BARO].answering && clock_passed(now_us, sensors->baro_due_us)) {
         begin_baro(sensors);
     } else {

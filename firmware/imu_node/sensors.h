@@ -9,8 +9,9 @@
 
 #include <stdint.h>
 
-#include "common/bmp180_math.h"
 #include "common/imu_reducer.h"
+#include "drivers/barometer.h"
+#include "drivers/compass.h"
 #include "drivers/imu.h"
 
 enum SensorIndex : uint8_t { SENSOR_IMU, SENSOR_MAG, SENSOR_BARO, SENSOR_COUNT };
@@ -24,8 +25,7 @@ struct SensorState {
 
 struct Sensors {
     uint8_t job;
-    uint8_t baro_step;
-    uint8_t baro_cycle;
+    bool baro_converting;
     bool self_test_failed;
     bool imu_silent;  // set up, but without an interrupt since
     uint8_t imu_id;   // WHO_AM_I
@@ -33,11 +33,13 @@ struct Sensors {
     uint32_t imu_taken_us;  // interrupt time of the reading last taken
     uint32_t mag_due_us;
     uint32_t baro_due_us;
-    uint32_t baro_at_us;  // middle of the conversion now running
-    int32_t baro_b5;
-    Bmp180Words words;
+    uint32_t baro_began_us;  // the conversion now running
+    const CompassChip *compass;
+    Barometer barometer;
     uint8_t bytes[IMU_DATA_SIZE];  // the transfer now running
 };
+static_assert(IMU_DATA_SIZE >= COMPASS_SIZE_MAX && IMU_DATA_SIZE >= BAROMETER_RESULT_SIZE_MAX,
+              "Sensors::bytes holds every transfer");
 
 // What a call of sensors_poll brought, one bit each.
 enum SensorNews : uint8_t {
@@ -51,8 +53,7 @@ struct SensorReadings {
     ImuReading imu;
     int16_t mag[3];
     uint32_t baro_us;
-    uint32_t pressure_centipa;
-    int16_t temperature_ddegc;
+    BarometerReading baro;
 };
 
 // Finds and sets up the sensors; with the self-test if the board started cold.

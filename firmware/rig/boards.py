@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 
 from firmware.rig.air import Air
+from firmware.rig.barometer import make_barometer
 from firmware.rig.bench import Bench, Timer
-from firmware.rig.bmp180 import Bmp180
-from firmware.rig.hmc5883l import Hmc5883l
+from firmware.rig.compass import make_compass
 from firmware.rig.i2c import I2cBus
 from firmware.rig.imu import IMU_CHIPS, Imu
 from firmware.rig.m8n import COMPUTING_S, M8n
@@ -28,6 +28,8 @@ class Parts:
     """Which chips are soldered to the boards."""
 
     imu: str = "MPU6050"
+    compass: str = "HMC5883L"
+    barometer: str = "BMP180"
 
 
 @dataclass
@@ -117,9 +119,13 @@ class ImuNode(Board):
         bench, world = setup.bench, setup.world
         chip = IMU_CHIPS[setup.parts.imu]
         self.imu = Imu(bench, world, setup.rng(), self._drive_imu_line, chip, noise)
-        self.hmc5883l = Hmc5883l(world, lambda: self.timer.now_ps, self.imu)
-        self.bmp180 = Bmp180(world, lambda: self.timer.now_ps)
-        self.bus = I2cBus(self.mcu, [self.imu, self.hmc5883l, self.bmp180])
+        parts, clock = setup.parts, self._clock
+        self.compass = make_compass(parts.compass, world, clock, self.imu)
+        self.barometer = make_barometer(parts.barometer, world, clock)
+        self.bus = I2cBus(self.mcu, [self.imu, self.compass, self.barometer])
+
+    def _clock(self) -> int:
+        return self.timer.now_ps
 
     def _drive_imu_line(self, high: bool) -> None:
         self.mcu.set_pin("D", _IMU_LINE, high)

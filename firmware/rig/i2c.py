@@ -36,7 +36,7 @@ class I2cBus:
     """Joins the slaves to the two-wire interface of a chip."""
 
     def __init__(self, mcu: Mcu, devices: Sequence[RegisterDevice]) -> None:
-        self._mcu, self._devices = mcu, devices
+        self._mcu, self.devices = mcu, list(devices)
         self._device: RegisterDevice | None = None
         self._pointer_next = False
         self._clocks_left = 0
@@ -78,7 +78,7 @@ class I2cBus:
 
     def _address(self, byte: int) -> int:
         self._device = next(
-            (d for d in self._devices if d.address == byte >> 1 and d.reachable()), None
+            (d for d in self.devices if d.address == byte >> 1 and d.reachable()), None
         )
         self._pointer_next = True
         return int(self._device is not None)
@@ -98,6 +98,11 @@ class I2cBus:
 def big_endian(value: int) -> tuple[int, int]:
     """Split a 16-bit two's complement number into its bytes."""
     return value >> 8 & 0xFF, value & 0xFF
+
+
+def little_endian(value: int) -> tuple[int, int]:
+    """Split a 16-bit two's complement number into its bytes."""
+    return value & 0xFF, value >> 8 & 0xFF
 
 
 def hold(value: float, low: int = -32768, high: int = 32767) -> int:

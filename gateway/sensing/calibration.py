@@ -149,20 +149,20 @@ def compose(left: Matrix3, right: Matrix3) -> Matrix3:
 
 
 def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
-    """Scale MPU6050 accelerometer counts to m/s2 in sensor axes."""
+    """Scale accelerometer counts to m/s2 in sensor axes."""
     scale = range_g * STANDARD_GRAVITY_MPS2 / FULL_SCALE_COUNTS
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
 def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
-    """Scale MPU6050 gyroscope counts to rad/s in sensor axes."""
+    """Scale gyroscope counts to rad/s in sensor axes."""
     per_count_dps = 1.0 / GYRO_LSB_PER_DPS.get(range_dps, FULL_SCALE_COUNTS / max(range_dps, 1))
     scale = per_count_dps * RAD_PER_DEG
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
 def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
-    """Scale HMC5883L counts to uT in sensor axes; None if an axis overflowed, or all are zero."""
+    """Scale magnetometer counts to uT in sensor axes; None on an overflow, or if all are zero."""
     if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw or not any(raw):
         return None
     scale = UT_PER_GAUSS / lsb_per_gauss
@@ -173,7 +173,7 @@ Number = TypeVar("Number", float, FloatArray)
 
 
 def temperature_from_counts(raw: Number) -> Number:
-    """Convert the MPU6050's temperature word, or many of them, to deg C."""
+    """Convert the IMU's temperature word, or many of them, to deg C."""
     return raw / 340.0 + 36.53
 
 

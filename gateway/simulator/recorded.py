@@ -49,7 +49,7 @@ from gateway.simulator.sensors import (
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.units import STANDARD_GRAVITY_MPS2, counted
-from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
+from gateway.wire.payloads import ACCEL_RANGES_G, HMC5883L_LSB_PER_GAUSS
 
 ROWS: Final = 2048
 """Rows that become payloads at once: bounds memory on long recordings."""
@@ -305,7 +305,7 @@ def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
     """Choose the codes of the finest ranges that hold the whole recording."""
     accel_limits = [g * STANDARD_GRAVITY_MPS2 * INT16_MAX / (INT16_MAX + 1) for g in ACCEL_RANGES_G]
     gyro_limits = [math.radians(INT16_MAX / lsb) for lsb in GYRO_LSB_PER_DPS]
-    mag_limits = [MAG_LIMIT * UT_PER_GAUSS / lsb for lsb in MAG_LSB_PER_GAUSS]
+    mag_limits = [MAG_LIMIT * UT_PER_GAUSS / lsb for lsb in HMC5883L_LSB_PER_GAUSS]
     return (
         _finest(accel_limits, flight.accel_b_mps2),
         _finest(gyro_limits, flight.gyro_b_radps),

@@ -24,8 +24,9 @@ PIPES: Final = 6
 
 ACCEL_RANGES_G: Final = (2, 4, 8, 16)
 GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
-MAG_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
-"""HMC5883L gain codes 0 to 7."""
+HMC5883L_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
+MAG_LSB_PER_GAUSS: Final = (*HMC5883L_LSB_PER_GAUSS, 3000, 3750)
+"""Scale codes: 0 to 7 the HMC5883L's gains, 8 the QMC5883L and 9 the QMC5883P at +-8 G."""
 
 
 class FrameKind(IntEnum):
@@ -75,7 +76,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
 
 
 class ImuPayload(msgspec.Struct, frozen=True, gc=False):
-    """Counts of MPU6050 and HMC5883L, and the codes of their ranges."""
+    """Counts of IMU and magnetometer, and the codes of their ranges."""
 
     accel: tuple[int, int, int]
     gyro: tuple[int, int, int]
@@ -89,7 +90,7 @@ class ImuPayload(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class BaroPayload:
-    """BMP180 reading, compensated on the node."""
+    """Barometer reading, compensated on the node."""
 
     pressure_centipa: int
     temperature_ddegc: int
@@ -330,6 +331,9 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
 
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
     ranges = words[11]
+    mag_gain = ranges >> _MAG_SHIFT
+    if mag_gain >= len(MAG_LSB_PER_GAUSS):
+        raise ValueError("unknown scale of the magnetometer")
     return ImuPayload(
         accel=(words[0], words[1], words[2]),
         gyro=(words[3], words[4], words[5]),
@@ -338,7 +342,7 @@ def _read_imu(words: tuple[int, ...]) -> ImuPayload:
         flags=_imu_flags(words[10]),
         accel_range=ranges & 3,
         gyro_range=ranges >> _GYRO_SHIFT & 3,
-        mag_gain=ranges >> _MAG_SHIFT & 7,
+        mag_gain=mag_gain,
     )
 
 

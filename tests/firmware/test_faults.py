@@ -104,10 +104,10 @@ def test_a_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBenc
 def test_a_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
-    node.hmc5883l.absent = True
+    node.compass.absent = True
     rig.run(0.6)
     pass_forty_minutes(rig, node)
-    node.hmc5883l.absent = False
+    node.compass.absent = False
     rig.run(0.5)
     new = [p for p in rig.payloads(ImuPayload, since_s=rig.now_s - 0.2) if MAG_NEW in p.flags]
     assert len(new) > 10

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware.rig.bmp180 import Words
+from firmware.rig.barometer import Words
 from firmware.rig.imu import PWR_MGMT_1, SELF_TEST
 from firmware.rig.world import Moment, World
 from gateway.records import ImuFlags
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 START_S = 0.45
 """Reset, self-test and set-up."""
 FILTERED = ImuFlags.ACCEL_FILTERED | ImuFlags.GYRO_FILTERED
-IMU, HMC5883L, BMP180 = 1, 2, 4
+IMU, MAG, BARO = 1, 2, 4
 
 MakeBench = Callable[..., Bench]
 
@@ -150,8 +150,8 @@ def test_a_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> 
 @pytest.mark.parametrize(
     ("absent", "flag", "bits"),
     [
-        ("hmc5883l", ImuFlags.MAG_ABSENT, HMC5883L),
-        ("bmp180", ImuFlags.BARO_ABSENT, BMP180),
+        ("compass", ImuFlags.MAG_ABSENT, MAG),
+        ("barometer", ImuFlags.BARO_ABSENT, BARO),
     ],
 )
 def test_an_absent_sensor_is_reported_and_found_when_it_comes(
@@ -179,7 +179,7 @@ def test_without_the_imu_barometer_and_status_still_come(bench: MakeBench) -> No
     assert not rig.payloads(ImuPayload)
     assert len(rig.payloads(BaroPayload)) > 20
     status = rig.last(NodeStatusPayload)
-    assert (status.sensors_present, status.sensors_failed) == (BMP180, IMU | HMC5883L)
+    assert (status.sensors_present, status.sensors_failed) == (BARO, IMU | MAG)
     node.imu.absent = False
     node.imu.power_cycle()
     rig.run(0.8)
@@ -201,7 +201,7 @@ def test_a_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -
     rig = bench(world=World(moment=lambda time_s: Moment(mag_ut=(22.0 + 10.0 * time_s, 1.5, 42.0))))
     node = rig.imu_node()
     rig.run(0.8)
-    node.hmc5883l.power_cycle()
+    node.compass.power_cycle()
     rig.run(0.6)
     last = rig.last(ImuPayload)
     assert last.mag[0] == pytest.approx(10.9 * (22.0 + 10.0 * rig.now_s), abs=5)
@@ -251,7 +251,7 @@ def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(0.8)
-    node.bmp180.refuse_bytes = 2
+    node.barometer.refuse_bytes = 2
     node.imu.refuse_bytes = 1
     rig.run(1.2)
     status = rig.last(NodeStatusPayload)
@@ -294,7 +294,7 @@ def test_other_calibration_words_give_the_same_pressure(
 ) -> None:
     rig = bench(world=still(pressure_pa=pressure_pa, temperature_degc=-8.0))
     node = rig.imu_node()
-    node.bmp180.__init__(  # type: ignore[misc]
+    node.barometer.__init__(  # type: ignore[misc]
         rig.setup.world,
         lambda: node.timer.now_ps,
         Words(7911, -1022, -14429, 33996, 25204, 16739, 5498, 57, -32768, -11786, 2723),

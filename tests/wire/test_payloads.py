@@ -40,8 +40,8 @@ def as_json(record: object) -> dict:
 
 
 def test_scales_are_those_of_the_data_sheets() -> None:
-    """HMC5883L, gain settings 0 to 7; MPU6050, full scales 0 to 3."""
-    assert MAG_LSB_PER_GAUSS == (1370, 1090, 820, 660, 440, 390, 330, 230)
+    """HMC5883L, gain settings 0 to 7; QMC5883L and QMC5883P, 8 G; MPU6050, full scales 0 to 3."""
+    assert MAG_LSB_PER_GAUSS == (1370, 1090, 820, 660, 440, 390, 330, 230, 3000, 3750)
     assert ACCEL_RANGES_G == (2, 4, 8, 16)
     assert GYRO_RANGES_DPS == (250, 500, 1000, 2000)
 
@@ -104,6 +104,16 @@ def test_imu_layout_by_hand() -> None:
         gyro_range=1,
         mag_gain=2,
     )
+
+
+@pytest.mark.parametrize("scale", range(16))
+def test_unknown_magnetometer_scale_is_a_fault(scale: int) -> None:
+    packet = bytes.fromhex("11 15 3412 78563412" + "00" * 22) + bytes([scale << 4])
+    decoded = decode_payload(packet)
+    if scale < len(MAG_LSB_PER_GAUSS):
+        assert decoded[1].mag_gain == scale
+    else:
+        assert decoded == Fault(FaultKind.VALUE, len(packet))
 
 
 FIX = GpsFixPayload(1000, 10, 20, 30, (1, 2, 3), GpsFixType.FIX_3D, True, 9)
