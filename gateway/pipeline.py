@@ -22,6 +22,7 @@ from gateway.records import (
     ImuCalibrated,
     Incoming,
     LinkReport,
+    LoggedRequest,
     NavState,
     RawRecord,
 )
@@ -248,6 +249,12 @@ class Pipeline:
     def refused(self) -> int:
         """Requests to change something from clients that may not."""
         return sum(aircraft.vehicle.refusals for aircraft in self._ever())
+
+    @property
+    def failed_requests(self) -> tuple[LoggedRequest, ...]:
+        """Requests of clients that were refused, failed or had no answer, the newest last."""
+        found = (entry for each in self._ever() for entry in each.vehicle.requests.entries)
+        return tuple(sorted(found, key=lambda entry: entry.time_us))
 
     @property
     def forged(self) -> int:

@@ -345,3 +345,18 @@ class Incoming(msgspec.Struct, frozen=True, gc=False):
     """Whether the settings let this client change state."""
     forwarded: bool = False
     """Whether it is forwarded to other systems too, and so recorded there."""
+
+
+class LoggedRequest(msgspec.Struct, frozen=True, gc=False):
+    """One kind of request of one sender, with one outcome."""
+
+    vehicle_id: int
+    system_id: int
+    component_id: int
+    request: str
+    """Message, and what it is about: `COMMAND_LONG REQUEST_MESSAGE 62`."""
+    outcome: str
+    """Reason, such as `UNSUPPORTED` or `no answer`."""
+    count: int
+    time_us: int
+    """When the newest was received, on the gateway clock."""

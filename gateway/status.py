@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gateway.hub.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.records import GpsFix, LinkReport, NavState, NodeStatus
+from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,3 +67,5 @@ class Snapshot:
     """Whether the receiver is the simulated one."""
     aircraft: tuple[AircraftStatus, ...] = ()
     recorder: RecorderStatus | None = None
+    requests: tuple[LoggedRequest, ...] = ()
+    """Requests of clients that were refused, failed or had no answer."""

@@ -176,11 +176,12 @@ def _link_line(snapshot: Snapshot) -> Text:
     line = Text(f"mavgate  up {up}  receiver ")
     state = ("connected", "green") if report.connected else ("not connected", "red")
     line.append(f"{report.port} {state[0]}", style=state[1])
-    line.append(f"  {counted(report.frames, 'frame')}, {report.frames_lost} lost on the line")
+    line.append(f"  serial {counted(report.frames, 'frame')}, {report.frames_lost} lost")
     for kind, count in report.faults:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     if report.receiver is not None:
-        line.append(f"  channel {report.receiver.channel}")
+        line.append(f"  radio {sum(node.lost for node in report.nodes)} lost")
+        line.append(f", channel {report.receiver.channel}")
         line.append(f", noise {report.receiver.noise_percent} %")
     return line
 

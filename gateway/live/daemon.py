@@ -53,12 +53,15 @@ from gateway.units import US_PER_S
 from gateway.vehicle.actions import RecordingRequest, Request, SavePlaces, SaveSettings
 from gateway.vehicle.home import Place
 from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
+from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 0.1
 """A sample may make something due sooner than was known when the timer was set."""
 SHORTEST_WAIT_S: Final = 0.001
+SECRET_MESSAGES: Final = frozenset({5, 256})
+"""CHANGE_OPERATOR_CONTROL and SETUP_SIGNING: a recording is shared more easily than a password."""
 
 
 class Daemon:
@@ -98,7 +101,7 @@ class Daemon:
             settings.hub,
             self._on_frame,
             self.now_us,
-            on_foreign=lambda frame: self._recorder.frame(frame),
+            on_foreign=lambda frame: self._record(frame),
             on_gone=self._on_gone,
             on_trouble=self._announce,
             seal=partial(self._pipeline.seal, now_us=self.now_us),
@@ -233,6 +236,7 @@ class Daemon:
             simulated=self._receiver is not None,
             aircraft=tuple(status_of(one) for _, one in aircraft),
             recorder=self._recorder.status(),
+            requests=self._pipeline.failed_requests,
         )
 
     def _serve_metrics(self) -> None:
@@ -294,8 +298,13 @@ class Daemon:
         # effect is recorded.
         kept = incoming.trusted or bool(actions)
         if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
-            self._recorder.frame(frame)
+            self._record(frame)
         self._perform(actions)
+
+    def _record(self, frame: bytes) -> None:
+        """Record a frame of another sender, unless it contains a key or a password."""
+        if message_id_of(frame) not in SECRET_MESSAGES:
+            self._recorder.frame(frame)
 
     def _on_gone(self, client_id: int) -> None:
         self._pipeline.forget_client(client_id)

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
 MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
+MAVLINK_MSG_ID_CONTROL_STATUS: Final = 512
 
 _Base: Any = mavlink.MAVLink_message
 
@@ -53,3 +54,12 @@ class ComponentMetadata(_Extra):
     msgname = "COMPONENT_METADATA"
     crc_extra = 182
     unpacker = struct.Struct("<II100s")
+
+
+class ControlStatus(_Extra):
+    """CONTROL_STATUS: flags, gcs_main, gcs_secondary."""
+
+    id = MAVLINK_MSG_ID_CONTROL_STATUS
+    msgname = "CONTROL_STATUS"
+    crc_extra = 21
+    unpacker = struct.Struct("<BB10s")

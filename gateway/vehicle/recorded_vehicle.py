@@ -44,7 +44,7 @@ from gateway.vehicle.services.parameters.parameter_service import (
     MAX_LISTENERS,
     UNKNOWN,
 )
-from gateway.vehicle.services.timing import TimingService
+from gateway.vehicle.services.queries import QueryService
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
 SHORTHANDS: Final = {
@@ -96,7 +96,7 @@ class RecordedVehicle:
         self._mavlink: Any = mavlink.MAVLink(None)
         self._missions = MissionService(lambda *_: [], lambda *_: [])
         self._ftp = FtpService({})
-        self._timing = TimingService()
+        self._queries = QueryService(lambda *_: [], lambda *_: [])
         self._lists: dict[int, list[bytes]] = {}
         self._due_us: int | None = None
         self._handlers = {
@@ -108,7 +108,7 @@ class RecordedVehicle:
             "SET_MODE": self._refuse_mode,
             **dict.fromkeys(self._missions.types, self._mission),
             **dict.fromkeys(self._ftp.types, self._ftp.handle),
-            **dict.fromkeys(self._timing.types, self._timing.handle),
+            **dict.fromkeys(("PING", "TIMESYNC"), self._queries.handle),
         }
 
     def handle(self, incoming: Incoming, now_us: int) -> list[RecordedAction]:

@@ -26,17 +26,18 @@ from gateway.vehicle.dialect import (
 from gateway.vehicle.encoder import Encoder
 from gateway.vehicle.home import Place
 from gateway.vehicle.reader import RequestReader
+from gateway.vehicle.request_log import RequestLog
 from gateway.vehicle.services.calibrator import Calibrator
 from gateway.vehicle.services.commands import ACCEPTED, FAILED, CommandService, read_command
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import IntervalService
-from gateway.vehicle.services.log_list import LogListService
 from gateway.vehicle.services.missions.places import PlaceService
+from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
 from gateway.vehicle.services.parameters.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
-from gateway.vehicle.services.parameters.parameter_service import ParameterService
+from gateway.vehicle.services.parameters.parameter_service import PACKED_PATH, ParameterService
 from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.services.queries import QueryService
 from gateway.vehicle.services.recording import RecordingService
-from gateway.vehicle.services.timing import TimingService
 from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
 from gateway.vehicle.stamp_book import StampBook
 from gateway.vehicle.stored import StoredPlaces
@@ -112,6 +113,7 @@ class Vehicle:
         self.system_id = system_id
         self.refusals = 0
         """Requests to change something that were refused."""
+        self.requests = RequestLog(system_id)
         self.health = Health(system_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = clock or SigningClock(0)
@@ -138,17 +140,28 @@ class Vehicle:
         )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService(
-            {GENERAL_PATH: self._metadata.general, PARAMETER_PATH: self._metadata.parameters}
+            {
+                GENERAL_PATH: lambda *_: self._metadata.general(),
+                PARAMETER_PATH: lambda *_: self._metadata.parameters(),
+                PACKED_PATH: self._parameters.packed,
+            }
         )
         self._calibrator = Calibrator(self.system_id, lambda: self.in_flight)
         self._recording = RecordingService(self._explain)
+        self._control = OperatorControl(
+            self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
+        )
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
-                self.system_id, self.health.boards.firmware
+                self.system_id, self.health.boards.firmware, self.telemetry.autopilot
             ),
             MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: identity.protocol_version(),
-            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(),
-            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(),
+            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(
+                self.telemetry.autopilot
+            ),
+            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(
+                self.telemetry.autopilot
+            ),
             MAVLINK_MSG_ID_COMPONENT_METADATA: self._metadata.announcement,
         }
         commands = CommandService(self._intervals, self._build, self._knows, self._explain)
@@ -156,6 +169,7 @@ class Vehicle:
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         self.places.register(commands)
         self._recording.register(commands)
+        commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)
         self._route(commands)
 
     def _route(self, commands: CommandService) -> None:
@@ -166,8 +180,8 @@ class Vehicle:
             self._parameters,
             self.places.missions,
             self._ftp,
-            TimingService(),
-            LogListService(),
+            QueryService(self._build, self._explain),
+            self._control,
         )
         self._services = {kind: service for service in services for kind in service.types}
         self._timed = (
@@ -177,6 +191,7 @@ class Vehicle:
             self._ftp,
             self._calibrator,
             self._recording,
+            self._control,
         )
 
     @property
@@ -253,14 +268,27 @@ class Vehicle:
         request = self._reader.read(incoming, now_us)
         if request is None:
             return []
+        self._control.on_request(request, now_us)
         service = self._services.get(request.message.get_type())
         if service is None:
+            if getattr(request.message, "target_system", None) == self.system_id:
+                self.requests.note(request, "no answer", now_us)
             return []
-        if request.may_change or not service.changes_state(request):
-            return self._finish(service.handle(request, now_us))
+        if service.changes_state(request):
+            if not request.may_change:
+                return self._refuse(service, request, "", now_us)
+            if not self._control.permits(request):
+                return self._refuse(service, request, f": {self._control.denial()}", now_us)
+        answers = service.handle(request, now_us)
+        self.requests.note_answers(request, answers, now_us)
+        return self._finish(answers)
+
+    def _refuse(self, service: Service, request: Request, reason: str, now_us: int) -> list[Action]:
+        """Answer and announce a request that the sender may not make."""
         self.refusals += 1
+        self.requests.note(request, f"refused{reason or ': not trusted'}", now_us)
         name = _describe(request)
-        status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}")
+        status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}{reason}")
         answers = service.refuse(request)
         answers += self._replies(self._refusal_texts.say(status, now_us))
         return self._finish(answers)
@@ -292,6 +320,7 @@ class Vehicle:
         self._parameters.forget_client(client_id)
         self.places.missions.forget_client(client_id)
         self._ftp.forget_client(client_id)
+        self._control.forget_client(client_id)
         self._recording.forget_client(client_id)
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
@@ -358,6 +387,7 @@ class Vehicle:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
         self.health.boards.supply_low_v = settings.supply_low_v
         self.telemetry.reconfigure(settings)
+        self._control.exclusive = settings.operator_control == "exclusive"
         self._sign_by(settings.signing_passphrase)
 
     def _sign_by(self, passphrase: str) -> None:

@@ -13,6 +13,11 @@ VehicleType = Literal[
 ]  # fmt: skip
 """The MAV_TYPE names that every ground station takes for a vehicle."""
 
+Autopilot = Literal["generic", "ardupilotmega", "px4"]
+"""The MAV_AUTOPILOT names that programs require."""
+
+OperatorControl = Literal["open", "exclusive"]
+
 ArmedWhen = Literal["flying", "recording", "flying_or_recording", "always", "never"]
 
 
@@ -49,6 +54,21 @@ class VehicleSettings(Settings, frozen=True):
     type: Annotated[
         VehicleType, setting("Vehicle type, by which ground stations choose icon and display.")
     ] = "fixed_wing"
+    autopilot: Annotated[
+        Autopilot,
+        setting(
+            "Autopilot that the vehicle reports in HEARTBEAT. Keep generic unless a program "
+            "accepts only the others (Cockpit): with those, ground stations show set-up pages, "
+            "modes and parameters of that autopilot, which do not exist here."
+        ),
+    ] = "generic"
+    operator_control: Annotated[
+        OperatorControl,
+        setting(
+            "Which ground stations may change things: open, every trusted one; exclusive, only the "
+            "one that has requested control, as QGroundControl 5 does."
+        ),
+    ] = "open"
     rates: RateSettings = RateSettings()
     armed_when: Annotated[
         ArmedWhen,

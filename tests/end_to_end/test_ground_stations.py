@@ -106,8 +106,10 @@ def test_qgroundcontrols_start_up(stations: Callable[..., Station]) -> None:
             qgroundcontrol(stations(kind, version))
 
 
-async def with_mavsdk(gateway: Gateway, use: Callable) -> None:
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+async def with_mavsdk(
+    gateway: Gateway, use: Callable, kind: ComponentType = ComponentType.GROUND_STATION
+) -> None:
+    configuration = Configuration.create_with_component_type(kind)
     async with Mavsdk(configuration) as mavsdk:
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
@@ -162,6 +164,68 @@ async def test_mavsdk_rates(gateway: Gateway) -> None:
                 break
 
     await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_derived_streams(gateway: Gateway) -> None:
+    async def use(system: System) -> None:
+        telemetry = TelemetryAsync(system)
+        for set_rate in (
+            telemetry.set_rate_position_velocity_ned,
+            telemetry.set_rate_altitude,
+            telemetry.set_rate_odometry,
+            telemetry.set_rate_raw_imu,
+            telemetry.set_rate_scaled_imu,
+        ):
+            await answered(set_rate, 10.0)
+        local = await anext(telemetry.subscribe_position_velocity_ned())
+        assert math.hypot(local.position.north_m, local.position.east_m) < 50_000.0
+        altitude = await anext(telemetry.subscribe_altitude())
+        assert altitude.altitude_relative_m == pytest.approx(altitude.altitude_local_m, abs=50.0)
+        odometry = await anext(telemetry.subscribe_odometry())
+        assert odometry.position_body.x_m == pytest.approx(local.position.north_m, abs=200.0)
+        for subscribe in (telemetry.subscribe_raw_imu, telemetry.subscribe_scaled_imu):
+            imu = await anext(subscribe())
+            assert math.isfinite(imu.acceleration_frd.down_m_s2)
+        origin = await answered(telemetry.get_gps_global_origin)
+        assert origin.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=1e-3)
+
+    await with_mavsdk(gateway, use)
+
+
+async def test_mavsdk_companion_that_shares_the_system_id(gateway: Gateway) -> None:
+    """A companion computer is 1/191: the vehicle answers it as any other client."""
+
+    async def use(system: System) -> None:
+        version = await answered(InfoAsync(system).get_version)
+        assert version.flight_sw_minor > 0
+        await answered(TelemetryAsync(system).set_rate_altitude, 5.0)
+
+    await with_mavsdk(gateway, use, ComponentType.COMPANION_COMPUTER)
+
+
+def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
+    """DroneKit knows only the older messages with floats."""
+    dronekit = pytest.importorskip("dronekit")
+    vehicle = dronekit.connect(
+        f"tcp:127.0.0.1:{gateway.listen_port}", wait_ready=False, heartbeat_timeout=START_LIMIT_S
+    )
+    try:
+        commands = vehicle.commands
+        commands.clear()
+        for seq in range(5):
+            lat_deg = HOME.home_lat_deg + 0.001 * seq
+            commands.add(
+                dronekit.Command(
+                    0, 0, 0, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_CMD_NAV_WAYPOINT,
+                    0, 1, 0, 0, 0, 0, lat_deg, HOME.home_lon_deg, 50.0 + seq,
+                )
+            )  # fmt: skip
+        commands.upload(timeout=START_LIMIT_S)
+        commands.download()
+        commands.wait_ready(timeout=START_LIMIT_S)
+        assert [round(command.z) for command in commands][-3:] == [52, 53, 54]
+    finally:
+        vehicle.close()
 
 
 async def test_mavsdk_parameters(gateway: Gateway) -> None:

@@ -81,7 +81,7 @@ def test_link_node_aircraft_and_client_are_shown() -> None:
     text = text_of(SNAPSHOT)
     for part in (
         "/dev/ttyUSB0 connected",
-        "1000 frames, 2 lost on the line, 7 crc faults",
+        "serial 1000 frames, 2 lost, 7 crc faults",
         "channel 76, noise 4 %",
         "1.0",
         "1.00",

@@ -16,6 +16,7 @@ OWN_MESSAGES = {
     397: ("COMPONENT_METADATA", 182),
     435: ("AVAILABLE_MODES", 134),
     436: ("CURRENT_MODE", 193),
+    512: ("CONTROL_STATUS", 21),
 }
 """What pymavlink's dialect lacks: name, and the CRC_EXTRA published with the standard."""
 

@@ -164,7 +164,10 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     ),
     # ftp.html: an answer to every opcode, with the request's opcode in it.
     "ftp/open": (ftp(4, b"/general.json"), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 4)}),
-    "ftp/not-there": (ftp(4, b"@PARAM/param.pck"), "FILE_TRANSFER_PROTOCOL", {"opcode": (129, 4)}),
+    "ftp/packed-parameters": (
+        ftp(4, b"@PARAM/param.pck?withdefaults=1"), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 4)},
+    ),
+    "ftp/not-there": (ftp(4, b"@SYS/threads.txt"), "FILE_TRANSFER_PROTOCOL", {"opcode": (129, 4)}),
     "ftp/list": (ftp(3, b"/"), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 3)}),
     "ftp/write": (ftp(6, b"/x"), "FILE_TRANSFER_PROTOCOL", {"opcode": (129, 6)}),
     "ftp/reset": (ftp(2, b""), "FILE_TRANSFER_PROTOCOL", {"opcode": (128, 2)}),
@@ -175,6 +178,31 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "log/list": (
         lambda: mavlink.MAVLink_log_request_list_message(*ME, 0, 0xFFFF),
         "LOG_ENTRY", {"id": 0, "num_logs": 0},
+    ),
+    "log/data": (
+        lambda: mavlink.MAVLink_log_request_data_message(*ME, 3, 90, 90),
+        "LOG_DATA", {"id": 3, "ofs": 90, "count": 0},
+    ),
+    # parameter_ext.html: there are none.
+    "parameter-ext/list": (
+        lambda: mavlink.MAVLink_param_ext_request_list_message(*ME),
+        "PARAM_EXT_VALUE", {"param_count": 0},
+    ),
+    "parameter-ext/set": (
+        lambda: mavlink.MAVLink_param_ext_set_message(*ME, b"X", b"1", 1),
+        "PARAM_EXT_ACK", {"param_result": mavlink.PARAM_ACK_FAILED},
+    ),
+    # terrain.html: spacing 0 is "not available here".
+    "terrain/check": (
+        lambda: mavlink.MAVLink_terrain_check_message(471_234_567, -87_654_321),
+        "TERRAIN_REPORT", {"lat": 471_234_567, "lon": -87_654_321, "spacing": 0, "pending": 0},
+    ),
+    "signing/setup": (
+        lambda: mavlink.MAVLink_setup_signing_message(*ME, [7] * 32, 0), "STATUSTEXT", {},
+    ),
+    "origin/set": (
+        lambda: mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0),
+        "GPS_GLOBAL_ORIGIN", {"latitude": 471_234_567},
     ),
 }  # fmt: skip
 
@@ -203,6 +231,7 @@ TOLD_TO_ALL = {
     "command/set-mode": {"STATUSTEXT"},
     "parameter/set-of-home": {"HOME_POSITION"},
     "mission/set-current-none": {"STATUSTEXT"},
+    "signing/setup": {"STATUSTEXT"},
 }
 """What changed, and why something was refused, concerns every ground station."""
 
@@ -212,7 +241,7 @@ def test_it_is_given_once_and_to_the_one_who_asked(station: GroundStation, row: 
     request, kind, _ = TABLE[row]
     found = station.send(request())
     # A list comes in tens; with home's height goes who set it.
-    expected = {"parameter/list": 10, "parameter/set-of-home": 2}.get(row, 1)
+    expected = {"parameter/list": 10, "parameter/set-of-home": 2, "signing/setup": 3}.get(row, 1)
     assert sum(m.get_type() == kind for m in found) == expected
     assert {frame.client_id for frame in station.frames} <= {7, None, RECORDED_ONLY}
     assert station.broadcasts == TOLD_TO_ALL.get(row, set())

@@ -11,6 +11,8 @@ from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.events import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from tests.conftest import ManualClock
+from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import (
     BARO,
     FIX,
@@ -117,6 +119,31 @@ def test_position_goes_on_while_dead_reckoned() -> None:
     for time_us in range(2 * ONE_S, 12 * ONE_S, 5_000):
         found += vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)
     assert names(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "autopilot", "custom_mode", "capability"),
+    [
+        ("generic", 0, 0, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
+        ("ardupilotmega", 3, 0, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST),
+        ("px4", 12, 1 << 16, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
+    ],
+)
+def test_autopilot_of_the_settings_is_reported(
+    clock: ManualClock, name: str, autopilot: int, custom_mode: int, capability: int
+) -> None:
+    station = GroundStation(make(autopilot=name), clock)
+    beat = next(m for m in station.wait(1.0) if m.get_type() == "HEARTBEAT")
+    assert (beat.autopilot, beat.custom_mode) == (autopilot, custom_mode)
+    assert bool(beat.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED) == (autopilot != 0)
+    [_, version] = station.request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    encodings = (
+        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+    )
+    assert version.capabilities & encodings == capability
+    [_, summary] = station.request(mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2)
+    assert (summary.autopilot, summary.custom_mode) == (autopilot, custom_mode >> 16)
 
 
 def test_last_position_is_repeated_when_gps_is_lost() -> None:
@@ -244,7 +271,7 @@ def test_a_node_that_keeps_restarting_is_reported_once() -> None:
         told += texts(vehicle.on_link(report(alive), now_us))
     assert told == [
         "Receiver connected: /dev/ttyUSB0",
-        "Node 0 keeps restarting, or two have its id",
+        "Node 0 keeps restarting, or two nodes share id 0",
         "Node 0 no longer restarts",
     ]
 

@@ -40,13 +40,26 @@ def register(app: typer.Typer) -> None:
     app.command(rich_help_panel=PANEL)(with_socket(reload))
 
 
-def status(*, json: JsonOption = False) -> None:
+def status(
+    *,
+    requests: Annotated[
+        bool,
+        typer.Option(
+            "--requests", help="Show the requests of clients that were refused or had no answer."
+        ),
+    ] = False,
+    json: JsonOption = False,
+) -> None:
     """Show the status of the gateway: receiver, nodes, aircraft, clients."""
     snapshot = ask("status")
     if json:
-        print_json(snapshot)
+        print_json(snapshot["requests"] if requests else snapshot)
         return
     console = console_of()
+    if requests:
+        found = snapshot["requests"]
+        console.print(_requests(found, snapshot["time_us"]) if found else "no failed requests")
+        return
     console.print(_summary(snapshot))
     if nodes := snapshot["report"]["nodes"]:
         console.print()
@@ -133,8 +146,10 @@ def _summary(snapshot: Record) -> str:
     up_s = snapshot["time_us"] // US_PER_S
     receiver = f"{report['port']} {'connected' if report['connected'] else 'not connected'}"
     up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
-    frames = f"{counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
-    lines = [f"up {up}, receiver {receiver}, {frames}"]
+    received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
+    serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
+    radio = f"radio: {counted(received, 'payload')}, {lost} lost"
+    lines = [f"up {up}, receiver {receiver}", f"{serial}; {radio}"]
     lines += [
         f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "
         f"{_number(state['alt_amsl_m'], '.1f')} m"
@@ -151,8 +166,22 @@ def _summary(snapshot: Record) -> str:
     lines.append("MAVLink frames: " + ", ".join(counts))
     requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
     if requests:
-        lines.append("requests: " + ", ".join(requests))
+        lines.append("requests: " + ", ".join(requests) + "; see mavgate status --requests")
     return "\n".join(lines)
+
+
+def _requests(found: Sequence[Record], now_us: int) -> Table:
+    table = table_of("aircraft", "sender", "request", "outcome", "count", "age s", left=4)
+    for entry in reversed(found):
+        table.add_row(
+            str(entry["vehicle_id"]),
+            f"{entry['system_id']}.{entry['component_id']}",
+            entry["request"],
+            entry["outcome"],
+            str(entry["count"]),
+            f"{(now_us - entry['time_us']) / US_PER_S:.1f}",
+        )
+    return table
 
 
 def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:

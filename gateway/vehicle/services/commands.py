@@ -139,10 +139,11 @@ class CommandService:
         for number in REFUSALS:
             self._handlers[number] = self._decline
 
-    def register(self, number: int, handler: Handler) -> None:
-        """Let another service carry out a command that changes state."""
+    def register(self, number: int, handler: Handler, *, changes_state: bool = True) -> None:
+        """Let another service carry out a command."""
         self._handlers[number] = handler
-        self._changing.add(number)
+        if changes_state:
+            self._changing.add(number)
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the command would change anything."""

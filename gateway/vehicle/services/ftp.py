@@ -1,4 +1,4 @@
-"""MAVLink FTP, for reading only: the component metadata and nothing else.
+"""MAVLink FTP, for reading only: the component metadata and the packed parameters.
 
 Everything else is refused with the protocol's own error, with the session, the sequence number and
 the opcode of the request echoed: a client that gets a proper refusal goes on at once, one that
@@ -143,18 +143,22 @@ class _Burst:
     """The next packet's sequence and offset, and the client's wish for the size."""
 
 
+FileMaker = Callable[[Request, str], bytes]
+
+
 class FtpService:
     """Files of one vehicle, generated each time they are opened.
 
     Parameters
     ----------
     files : mapping of str to callable
-        Absolute paths, and the functions that generate their content.
+        Absolute paths, and the functions that generate their content from the request and the
+        query of its path, such as `start=50&count=10`.
     """
 
     types = ("FILE_TRANSFER_PROTOCOL",)
 
-    def __init__(self, files: Mapping[str, Callable[[], bytes]]) -> None:
+    def __init__(self, files: Mapping[str, FileMaker]) -> None:
         self._files = dict(files)
         self._sessions: dict[int, _Session] = {}
         self._bursts: dict[int, _Burst] = {}
@@ -230,7 +234,7 @@ class FtpService:
         return packet.session, handler(request, packet)
 
     def _open(self, request: Request, packet: Packet) -> tuple[int, bytes]:
-        content = self._content(packet)
+        content = self._content(request, packet)
         self._make_room(request)
         number = next(n for n in range(MAX_SESSIONS) if n not in self._sessions)
         self._sessions[number] = _Session(request.client_id, request.may_change, content)
@@ -259,12 +263,15 @@ class FtpService:
         self.forget_client(request.client_id)
         return b""
 
-    def _list(self, _request: Request, packet: Packet) -> bytes:
-        if _path(packet) != "/":
+    def _list(self, request: Request, packet: Packet) -> bytes:
+        folder = _path(packet)[0].removesuffix("/") + "/"
+        found = [path for path in sorted(self._files) if path.rpartition("/")[0] + "/" == folder]
+        if not found:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
         data = b""
-        for path in sorted(self._files)[packet.offset :]:
-            entry = f"F{path.removeprefix('/')}\t{len(self._files[path]())}\0".encode()
+        for path in found[packet.offset :]:
+            size = len(self._files[path](request, ""))
+            entry = f"F{path.removeprefix(folder)}\t{size}\0".encode()
             if len(data) + len(entry) > MAX_DATA:
                 break
             data += entry
@@ -279,8 +286,8 @@ class FtpService:
         size = min(packet.size or MAX_DATA, MAX_DATA)
         return content[packet.offset : packet.offset + size]
 
-    def _crc32(self, _request: Request, packet: Packet) -> bytes:
-        return struct.pack("<I", crc32(self._content(packet)))
+    def _crc32(self, request: Request, packet: Packet) -> bytes:
+        return struct.pack("<I", crc32(self._content(request, packet)))
 
     def _begin_burst(self, request: Request, packet: Packet, now_us: int) -> list[Answer]:
         content = self._session(request, packet).content
@@ -314,11 +321,12 @@ class FtpService:
             raise _RefusedError(FtpError.INVALID_SESSION)
         return session
 
-    def _content(self, packet: Packet) -> bytes:
-        make = self._files.get(_path(packet))
+    def _content(self, request: Request, packet: Packet) -> bytes:
+        path, query = _path(packet)
+        make = self._files.get(path)
         if make is None:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
-        return make()
+        return make(request, query)
 
     def _remember(self, client_id: int, packet: Packet, reply: Reply) -> None:
         if client_id not in self._last and len(self._last) >= MAX_REMEMBERED:
@@ -331,15 +339,15 @@ def crc32(content: bytes) -> int:
     return ~binascii.crc32(content, 0xFFFFFFFF) & 0xFFFFFFFF
 
 
-def _path(packet: Packet) -> str:
-    """Read a path, however the client writes it.
+def _path(packet: Packet) -> tuple[str, str]:
+    """Read a path, however the client writes it, and the query behind it.
 
     QGroundControl makes `//general.json` of `mftp:///general.json`, MAVSDK sends it without a
     slash or as a URI with the component, MAVProxy lists `/`, an empty path or `.`.
     """
     text = packet.data.split(b"\0", 1)[0].decode("utf-8", "replace")
-    path = _SCHEME.sub("", text.strip())
-    return "/" + "/".join(part for part in path.split("/") if part not in ("", "."))
+    path, _, query = _SCHEME.sub("", text.strip()).partition("?")
+    return "/" + "/".join(part for part in path.split("/") if part not in ("", ".")), query
 
 
 def _answer(packet: Packet, opcode: int, session: int, data: bytes) -> Packet:

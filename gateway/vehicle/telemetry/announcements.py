@@ -184,7 +184,9 @@ class Announcements:
             name = self._health.node_name(node)
             text = StatusText(INFO, f"{name} no longer restarts")
             if is_often:
-                text = StatusText(CRITICAL, f"{name} keeps restarting, or two have its id")
+                text = StatusText(
+                    CRITICAL, f"{name} keeps restarting, or two nodes share id {node}"
+                )
             found += self._announcer.track(
                 f"restarts {node}", is_often, text, now_us, initially=False
             )

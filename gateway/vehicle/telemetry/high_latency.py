@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import to_euler
 from gateway.records import NAN, GpsFix, NavState
 from gateway.vehicle.home import is_3d
+from gateway.vehicle.identity import CUSTOM_MODES
 from gateway.vehicle.telemetry import fields
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 from gateway.vehicle.telemetry.messages import DEGE7, boot_ms, has_position
@@ -33,7 +34,12 @@ UNKNOWN_PERCENT: Final = -1
 
 
 def high_latency2(
-    kind: int, state: NavState | None, fix: GpsFix | None, health: Health, now_us: int
+    kind: int,
+    autopilot: int,
+    state: NavState | None,
+    fix: GpsFix | None,
+    health: Health,
+    now_us: int,
 ) -> Any:
     """Encode the state of the vehicle in 42 bytes.
 
@@ -44,6 +50,8 @@ def high_latency2(
     ----------
     kind : int
         A MAV_TYPE.
+    autopilot : int
+        A MAV_AUTOPILOT.
     state : NavState, optional
         The newest.
     fix : GpsFix, optional
@@ -67,8 +75,9 @@ def high_latency2(
     return mavlink.MAVLink_high_latency2_message(
         timestamp=boot_ms(now_us),
         type=kind,
-        autopilot=mavlink.MAV_AUTOPILOT_GENERIC,
-        custom_mode=0,
+        autopilot=autopilot,
+        # The upper half of PX4's, as PX4 sends it.
+        custom_mode=CUSTOM_MODES[autopilot] >> 16,
         latitude=fields.int32(state.lat_deg * DEGE7) if state is not None and known else 0,
         longitude=fields.int32(state.lon_deg * DEGE7) if state is not None and known else 0,
         altitude=fields.int16(state.alt_amsl_m) if state is not None and known else 0,

@@ -22,6 +22,7 @@ from gateway.records import (
     Vec3,
 )
 from gateway.vehicle.home import Home, Place, is_good_enough, place_of
+from gateway.vehicle.identity import AUTOPILOTS, CUSTOM_MODES
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
@@ -327,19 +328,28 @@ class Telemetry:
         kind: int = getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}")
         return kind
 
+    @property
+    def autopilot(self) -> int:
+        """The MAV_AUTOPILOT that is reported."""
+        return AUTOPILOTS[self.settings.autopilot]
+
     def _high_latency(self, now_us: int) -> Any:
-        return high_latency2(self._type, self.state, self.fix, self.health, now_us)
+        return high_latency2(self._type, self.autopilot, self.state, self.fix, self.health, now_us)
 
     def _heartbeat(self, now_us: int) -> Any:
         # The aircraft is flown by radio control; the gateway only watches.
         base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        autopilot = self.autopilot
+        if autopilot != mavlink.MAV_AUTOPILOT_GENERIC:
+            # Clients name a mode of these autopilots by its number only.
+            base_mode |= mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         return mavlink.MAVLink_heartbeat_message(
             self._type,
-            mavlink.MAV_AUTOPILOT_GENERIC,
+            autopilot,
             base_mode,
-            custom_mode=0,
+            custom_mode=CUSTOM_MODES[autopilot],
             system_status=self._system_status(now_us),
             mavlink_version=3,
         )

@@ -19,7 +19,15 @@ from gateway.cli.live import clients
 from gateway.config import load
 from gateway.hub.client_table import HubCounters, ListenerStats
 from gateway.live.control_socket import ControlError, ControlServer, NoParams, socket_path
-from gateway.records import LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
+from gateway.records import (
+    LinkReport,
+    LoggedRequest,
+    NavFlags,
+    NavState,
+    NodeId,
+    NodeLink,
+    NodeStatus,
+)
 from gateway.status import AircraftStatus, Snapshot, Way
 from tests.client_stats import TABLET
 
@@ -80,6 +88,11 @@ SNAPSHOT = Snapshot(
     ),
     listeners=(OPEN, CLOSED),
     refused=3,
+    requests=(
+        LoggedRequest(
+            1, 255, 190, "COMMAND_LONG REQUEST_MESSAGE 62", "UNSUPPORTED", 3, 3_720_000_000
+        ),
+    ),
 )
 
 
@@ -146,7 +159,8 @@ def run(*words: str) -> Any:
 
 def test_status_for_people(gateway: Gateway) -> None:
     text = run("status").output
-    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in text
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in text
+    assert "serial: 103 frames, 4 lost; radio: 100 payloads, 7 lost" in text
     assert "aircraft 1: 47.500000 —, — m" in text
     assert "aircraft 1: home 1234 m, 271°" in text
     assert "mark" not in text
@@ -159,6 +173,13 @@ def test_status_for_people(gateway: Gateway) -> None:
     assert ["1.2", "60", "100", "7", "1", "3.29", "12", "3", "450", "—", "1.4"] in rows
     assert ["udp-listen:0.0.0.0:14551", "open", "1", "0"] in rows
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
+
+
+def test_failed_requests_are_listed(gateway: Gateway) -> None:
+    rows = [line.split() for line in run("status", "--requests").output.splitlines()]
+    request = ["COMMAND_LONG", "REQUEST_MESSAGE", "62"]
+    assert ["1", "255.190", *request, "UNSUPPORTED", "3", "3.0"] in rows
+    assert json.loads(run("status", "--requests", "--json").output)[0]["count"] == 3
 
 
 def test_status_for_programs(gateway: Gateway) -> None:
@@ -203,7 +224,7 @@ def test_piped_tables_and_texts_are_never_wrapped(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     lines = run("status").output.splitlines()
-    assert "up 1:02:03, receiver /dev/ttyUSB0 connected, 103 frames, 4 lost" in lines
+    assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in lines
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
 
 

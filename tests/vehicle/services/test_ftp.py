@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from MAVProxy.modules.lib.param_ftp import ftp_param_decode
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32, decode_packet
 from gateway.vehicle.services.parameters.metadata import Metadata
 from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.services.parameters.test_parameters import values
 
@@ -130,7 +132,7 @@ def test_every_way_to_write_the_folder(ftp: Ftp, path: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", [b"@PARAM/param.pck", b"/../general.json", b"/general.json/x", b"/general"]
+    "path", [b"@SYS/threads.txt", b"@PARAM", b"/../general.json", b"/general.json/x", b"/general"]
 )
 def test_other_paths_are_not_there(ftp: Ftp, path: bytes) -> None:
     refused = ftp.ask(Opcode.OPEN_FILE_RO, path)
@@ -148,6 +150,28 @@ def test_every_key_of_the_metadata_is_of_the_schema(ftp: Ftp) -> None:
         assert len(parameter["name"]) <= 16
         assert len(parameter["shortDesc"]) <= 100
         assert all(len(value["description"]) <= 100 for value in parameter.get("values", ()))
+
+
+def test_packed_parameters_are_decoded_by_mavproxy(ftp: Ftp) -> None:
+    """MAVProxy and Mission Planner load the parameters by this file."""
+    wanted = values(ftp.station)
+    ftp.station.send(mavlink.MAVLink_param_set_message(1, 1, b"TUNING_CUTOFF", 12.5, 9))
+    for query in (b"", b"?withdefaults=1"):
+        found = ftp_param_decode(ftp.read(b"@PARAM/param.pck" + query))
+        values_of = {name.decode(): value for name, value, _ in found.params}
+        assert values_of == pytest.approx(wanted | {"TUNING_CUTOFF": 12.5})
+    defaults = {name.decode(): value for name, value, _ in found.defaults}
+    assert defaults["TUNING_CUTOFF"] == 10.0
+    part = ftp.read(b"@PARAM/param.pck?start=5&count=3")
+    assert struct.unpack("<HHH", part[:6]) == (0x671B, 3, len(wanted))
+    assert b"Fparam.pck" in ftp.ask(Opcode.LIST_DIRECTORY, b"@PARAM").data
+
+
+def test_client_that_read_the_packed_parameters_is_sent_changes(ftp: Ftp) -> None:
+    ftp.read(b"@PARAM/param.pck")
+    changed = VehicleSettings(takeoff_speed_mps=7.0)
+    [value] = ftp.station.receive(ftp.station.vehicle.take_settings("vehicle", changed))
+    assert (value.param_id, value.param_value) == ("VEH_TKOFF_SPEED", 7.0)
 
 
 def test_enumerations_are_integers_and_coordinates_have_seven_decimal_places(ftp: Ftp) -> None:
@@ -179,8 +203,8 @@ def test_the_crc_is_the_one_of_mavlink() -> None:
 
 
 def test_files_that_are_not_there_are_refused_with_everything_echoed(ftp: Ftp) -> None:
-    """MAVProxy begins by this question and waits for a quarter of a minute without the answer."""
-    request = ftp.packet(Opcode.OPEN_FILE_RO, b"@PARAM/param.pck?withdefaults=1", session=5)
+    """A client without an answer repeats its request for a quarter of a minute."""
+    request = ftp.packet(Opcode.OPEN_FILE_RO, b"@SYS/threads.txt", session=5)
     [answer] = ftp.send(request)
     assert answer == Packet(
         request.sequence + 1, 5, NAK, 1, Opcode.OPEN_FILE_RO, 0, 0, bytes([FtpError.FILE_NOT_FOUND])

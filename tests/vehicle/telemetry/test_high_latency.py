@@ -24,7 +24,7 @@ def well() -> Health:
 
 
 def decoded(state: NavState | None, fix: GpsFix | None, health: Health) -> Any:
-    message = high_latency2(mavlink.MAV_TYPE_FIXED_WING, state, fix, health, 1_500_000)
+    message = high_latency2(mavlink.MAV_TYPE_FIXED_WING, 0, state, fix, health, 1_500_000)
     link = mavlink.MAVLink(None, 1, 1)
     return mavlink.MAVLink(None).parse_buffer(message.pack(link))[0]
 

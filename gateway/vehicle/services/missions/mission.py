@@ -31,6 +31,11 @@ what is asked for again is the item after the one that came last.
 
 What is stored changes only when an upload is complete. A download has no state: each request is
 answered from the store.
+
+Old clients such as DroneKit know only MISSION_REQUEST and MISSION_ITEM, whose coordinates are
+floats. A client that has never used the INT form is answered by MISSION_ITEM. While the form of a
+client is not known, every third request of an upload is a MISSION_REQUEST. A client that refuses
+that (MAVSDK, when both requests before were lost) is asked by MISSION_REQUEST_INT only.
 """
 
 from collections.abc import Callable
@@ -50,12 +55,17 @@ from gateway.vehicle.services.missions.mission_items import (
     Item,
     check_item,
     read_item,
+    write_float_item,
     write_item,
 )
 
 REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S
 """Of an upload that stands still; longer than the way there and back on a slow link."""
+OLD_FORM_EVERY: Final = 3
+"""Of so many requests to a client of unknown form, one is in the older form."""
+MAX_CLIENTS: Final = 512
+"""Clients whose form is remembered."""
 CHECKS: Final = 3
 """The last item is asked for so many times more where the ACK may have been lost."""
 KINDS: Final = (MISSION, FENCE, RALLY)
@@ -66,6 +76,9 @@ CHANGING: Final = frozenset(
         "MISSION_SET_CURRENT", "MISSION_WRITE_PARTIAL_LIST",
     }
 )  # fmt: skip
+
+Sender = tuple[int, int, int]
+"""Client, system and component: several programs may share one client of the hub."""
 
 Changed = Callable[[int, int], list[Answer]]
 """Called with the mission type that was stored, cleared or advanced, and the time."""
@@ -104,6 +117,8 @@ class MissionService:
         self.current = 0
         self._changed = changed
         self._explain = explain
+        self._forms: dict[Sender, bool] = {}
+        """Whether a client has used the INT form; without an entry it is not known yet."""
         self._upload: _Upload | None = None
         self._finished: _Upload | None = None
         self._handlers: dict[str, Callable[[Request, int], list[Answer]]] = {
@@ -130,7 +145,12 @@ class MissionService:
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one message."""
-        handler = self._handlers.get(request.message.get_type())
+        kind = request.message.get_type()
+        if kind in ("MISSION_REQUEST_INT", "MISSION_ITEM_INT"):
+            self._note_form(request, uses_int=True)
+        elif kind in ("MISSION_REQUEST", "MISSION_ITEM"):
+            self._note_form(request, uses_int=self._forms.get(_sender(request), False))
+        handler = self._handlers.get(kind)
         if handler is None:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         return handler(request, now_us)
@@ -165,6 +185,14 @@ class MissionService:
         for upload in (self._upload, self._finished):
             if upload is not None and upload.request.client_id == client_id:
                 self._upload = self._finished = None
+        for sender in [sender for sender in self._forms if sender[0] == client_id]:
+            del self._forms[sender]
+
+    def _note_form(self, request: Request, *, uses_int: bool) -> None:
+        sender = _sender(request)
+        if sender not in self._forms and len(self._forms) >= MAX_CLIENTS:
+            self._forms.pop(next(iter(self._forms)))
+        self._forms[sender] = uses_int
 
     def set_current(self, sequence: int, now_us: int) -> list[Answer] | None:
         """Make an item the current one; None if there is no such item."""
@@ -197,7 +225,8 @@ class MissionService:
             return [mission_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
         target = (request.system_id, request.component_id)
         current = kind == MISSION and sequence == self.current
-        item = write_item(self.items[kind][sequence], sequence, kind, target, current)
+        write = write_item if self._forms[_sender(request)] else write_float_item
+        item = write(self.items[kind][sequence], sequence, kind, target, current)
         return [request.reply(item)]
 
     def _begin(self, request: Request, now_us: int) -> list[Answer]:
@@ -222,9 +251,11 @@ class MissionService:
     def _ask(self, upload: _Upload, now_us: int) -> list[Answer]:
         upload.due_us = now_us + REPEAT_US
         request = upload.request
-        wanted = mavlink.MAVLink_mission_request_int_message(
-            request.system_id, request.component_id, upload.wanted, upload.kind
-        )
+        request_of = mavlink.MAVLink_mission_request_int_message
+        probes_old = upload.repeats % OLD_FORM_EVERY == OLD_FORM_EVERY - 1
+        if not self._forms.get(_sender(request), not probes_old):
+            request_of = mavlink.MAVLink_mission_request_message
+        wanted = request_of(request.system_id, request.component_id, upload.wanted, upload.kind)
         return [request.reply(wanted)]
 
     def _take_item(self, request: Request, now_us: int) -> list[Answer]:
@@ -291,16 +322,25 @@ class MissionService:
             return self._explain(f"No mission item {request.message.seq}", now_us)
         return answers
 
-    def _end(self, request: Request, _now_us: int) -> list[Answer]:
+    def _end(self, request: Request, now_us: int) -> list[Answer]:
         """Handle a client's MISSION_ACK: the end of its download, or of its own upload.
 
         What it accepts is a download, also if that comes late, after the begin of an upload.
         """
         upload = self._upload
         is_own = upload is not None and upload.request.client_id == request.client_id
-        if is_own and request.message.type != ACCEPTED:
-            self._upload = None
+        if upload is None or not is_own or request.message.type == ACCEPTED:
+            return []
+        is_probed = _sender(request) not in self._forms and upload.repeats >= OLD_FORM_EVERY - 1
+        if request.message.type == mavlink.MAV_MISSION_UNSUPPORTED and is_probed:
+            self._note_form(request, uses_int=True)
+            return self._ask(upload, now_us)
+        self._upload = None
         return []
+
+
+def _sender(request: Request) -> Sender:
+    return (request.client_id, request.system_id, request.component_id)
 
 
 def mission_ack(request: Request, result: int) -> Reply:

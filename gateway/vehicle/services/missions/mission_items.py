@@ -52,6 +52,13 @@ PLACED_COMMANDS: Final = (
 
 ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
 
+FLOAT_FRAMES: Final = {
+    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
+}
+"""The frames of MISSION_ITEM that correspond to those of integer coordinates."""
+
 
 @dataclass(frozen=True, slots=True)
 class Item:
@@ -114,6 +121,26 @@ def write_item(item: Item, sequence: int, kind: int, target: tuple[int, int], cu
         *item.params,
         item.x,
         item.y,
+        item.z,
+        kind,
+    )
+
+
+def write_float_item(
+    item: Item, sequence: int, kind: int, target: tuple[int, int], current: bool
+) -> Any:
+    """Encode an item as the older MISSION_ITEM, whose coordinates are floats in degrees."""
+    scale = DEGE7 if item.frame in GLOBAL_FRAMES else 1.0
+    return mavlink.MAVLink_mission_item_message(
+        *target,
+        sequence,
+        FLOAT_FRAMES.get(item.frame, item.frame),
+        item.command,
+        int(current),
+        item.autocontinue,
+        *item.params,
+        item.x / scale,
+        item.y / scale,
         item.z,
         kind,
     )

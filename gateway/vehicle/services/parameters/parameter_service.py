@@ -23,7 +23,12 @@ from gateway.vehicle.services.commands import (
     Outcome,
     whole,
 )
-from gateway.vehicle.services.parameters.parameters import Parameter, ParameterTable, decode_value
+from gateway.vehicle.services.parameters.parameters import (
+    Parameter,
+    ParameterTable,
+    decode_value,
+    packed_parameters,
+)
 
 BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
@@ -31,6 +36,8 @@ BATCH_INTERVAL_US: Final = 10_000
 MAX_LISTENERS: Final = 512
 """Clients that may request lists and be sent changes."""
 BY_NAME: Final = -1
+PACKED_PATH: Final = "/@PARAM/param.pck"
+"""The list as a file, which MAVProxy and Mission Planner read first."""
 
 WRITE: Final = 1
 RESET: Final = 2
@@ -158,6 +165,11 @@ class ParameterService:
     def values(self) -> list[Answer]:
         """Return every parameter, for all clients."""
         return [Reply(self._value(parameter)) for parameter in self.table.parameters]
+
+    def packed(self, request: Request, query: str) -> bytes:
+        """Return the file of ArduPilot's parameters; who reads it is sent changes from then on."""
+        self.listen(request.client_id)
+        return packed_parameters(self.table, query)
 
     def _changed(self, parameter: Parameter) -> list[Answer]:
         """Send the value of a parameter to the clients that listen; record it if none does."""

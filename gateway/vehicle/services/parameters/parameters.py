@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import takewhile
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -31,6 +32,12 @@ RotationAngles = tuple[
     Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
     Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
 ]
+
+PACKED: Final = 0x671B
+PACKED_WITH_DEFAULTS: Final = 0x671C
+PACKED_FLOAT: Final = 4
+PACKED_COMMON: Final = 15
+"""Magic numbers, type and longest shared name of the packed file."""
 
 INTEGER_CODES: Final = {
     mavlink.MAV_PARAM_TYPE_UINT8: "<Bxxx",
@@ -184,6 +191,55 @@ class ParameterTable:
             return value
         matrix, angles = self._angles.get((parameter.section, *parameter.path), (None, None))
         return angles if matrix == value else euler_deg_from_matrix(value)
+
+
+def packed_parameters(table: ParameterTable, query: str) -> bytes:
+    """Pack parameters as ArduPilot's file `@PARAM/param.pck`.
+
+    A header of magic, count and total, then for each parameter: its type in the lower and a flag
+    for a default in the upper four bits; how many characters its name shares with the one before
+    in the lower, and the number of others less one in the upper four bits; the other characters;
+    the value; the default, if the flag is set. The padding at block boundaries in [1]_ is left
+    out: it protects against values that change between two reads, and a file here is fixed when it
+    is opened.
+
+    Parameters
+    ----------
+    table : ParameterTable
+    query : str
+        `start`, `count` and `withdefaults`, each optional, as `start=50&count=10`.
+
+    Returns
+    -------
+    bytes
+
+    References
+    ----------
+    .. [1] ArduPilot, libraries/AP_Filesystem/README.md, "The @PARAM VFS"
+    """
+    wanted = dict(part.partition("=")[::2] for part in query.split("&"))
+    start = _number(wanted.get("start"), 0)
+    count = _number(wanted.get("count"), len(table.parameters))
+    with_defaults = _number(wanted.get("withdefaults"), 0) != 0
+    chosen = table.parameters[start : start + count]
+    magic = PACKED_WITH_DEFAULTS if with_defaults else PACKED
+    packed = struct.pack("<HHH", magic, len(chosen), len(table.parameters))
+    last = ""
+    for parameter in chosen:
+        name, number = parameter.name, table.number(parameter)
+        default = parameter.to_number(parameter.field.default)
+        flag = int(with_defaults and default != number)
+        same = (a == b for a, b in zip(last, name, strict=False))
+        common = min(sum(takewhile(bool, same)), PACKED_COMMON, len(name) - 1)
+        rest = name[common:].encode()
+        packed += bytes([PACKED_FLOAT | flag << 4, common | len(rest) - 1 << 4]) + rest
+        packed += struct.pack("<f", number) + (struct.pack("<f", default) if flag else b"")
+        last = name
+    return packed
+
+
+def _number(text: str | None, missing: int) -> int:
+    return int(text) if text and text.isascii() and text.isdecimal() else missing
 
 
 @cache

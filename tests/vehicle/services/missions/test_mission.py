@@ -105,6 +105,51 @@ def test_up_and_down_over_a_lossy_link(station: GroundStation, seed: int) -> Non
     assert [content(m) for m in download(station)] == [content(m) for m in items]
 
 
+def old_item(seq: int) -> mavlink.MAVLink_mission_item_message:
+    return mavlink.MAVLink_mission_item_message(
+        1, 1, seq, 3, WAYPOINT, 0, 1, 1.5, 0.0, 0.0, math.nan, 47.1 + seq, -8.7, 50.0, MISSION
+    )
+
+
+def test_client_without_the_int_form_is_asked_and_answered_in_the_older_one(
+    station: GroundStation,
+) -> None:
+    """DroneKit ignores MISSION_REQUEST_INT, and reads MISSION_ITEM only."""
+    station.send(count(2))
+    station.wait(0.9)
+    wanted = [m.get_type() for m in station.inbox if "MISSION_REQUEST" in m.get_type()]
+    assert wanted == ["MISSION_REQUEST_INT"] * 2 + ["MISSION_REQUEST"]
+    [second] = station.send(old_item(0))
+    assert (second.get_type(), second.seq) == ("MISSION_REQUEST", 1)
+    assert kinds(station.send(old_item(1)))[0] == "MISSION_ACK"
+    [first] = station.send(mavlink.MAVLink_mission_request_message(1, 1, 1, MISSION))
+    assert (first.get_type(), first.frame) == ("MISSION_ITEM", 3)
+    assert (first.x, first.y, first.z) == pytest.approx((48.1, -8.7, 50.0), abs=1e-5)
+    [again] = station.send(count(1))
+    assert again.get_type() == "MISSION_REQUEST", "the form is remembered"
+
+
+def test_client_of_the_int_form_is_never_answered_in_the_older_one(station: GroundStation) -> None:
+    upload(station, [item(0)])
+    [found] = station.send(mavlink.MAVLink_mission_request_message(1, 1, 0, MISSION))
+    assert found.get_type() == "MISSION_ITEM_INT"
+    other = GroundStation(station.vehicle, station.clock, client_id=9)
+    [found] = other.send(mavlink.MAVLink_mission_request_message(1, 1, 0, MISSION))
+    assert found.get_type() == "MISSION_ITEM"
+
+
+def test_client_that_refuses_the_older_form_is_asked_in_the_int_form_again(
+    station: GroundStation,
+) -> None:
+    """MAVSDK answers MISSION_REQUEST by MISSION_ACK unsupported."""
+    station.send(count(1))
+    station.wait(0.9)
+    unsupported = mavlink.MAV_MISSION_UNSUPPORTED
+    [wanted] = station.send(mavlink.MAVLink_mission_ack_message(1, 1, unsupported, MISSION))
+    assert wanted.get_type() == "MISSION_REQUEST_INT"
+    assert kinds(station.send(item(0)))[0] == "MISSION_ACK"
+
+
 def test_items_are_asked_for_in_order_and_at_once(station: GroundStation) -> None:
     for seq in range(3):
         [wanted] = station.send(count(3) if seq == 0 else item(seq - 1))
@@ -116,7 +161,8 @@ def test_items_are_asked_for_in_order_and_at_once(station: GroundStation) -> Non
 
 def asked_in(station: GroundStation, seconds: float) -> list[int]:
     """Let time pass; the items that are asked for meanwhile."""
-    return [m.seq for m in station.wait(seconds) if m.get_type() == "MISSION_REQUEST_INT"]
+    wanted = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
+    return [m.seq for m in station.wait(seconds) if m.get_type() in wanted]
 
 
 def test_a_lost_item_is_asked_for_again_for_five_seconds(station: GroundStation) -> None:
@@ -230,7 +276,7 @@ def test_items_are_judged(
 
 
 def test_the_older_messages_with_floats(station: GroundStation) -> None:
-    """MISSION_ITEM is taken, and MISSION_REQUEST answered by MISSION_ITEM_INT."""
+    """MISSION_ITEM is stored, and MISSION_REQUEST answered by MISSION_ITEM."""
     station.version = 1
     station.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
     older = mavlink.MAVLink_mission_item_message(
@@ -239,8 +285,8 @@ def test_the_older_messages_with_floats(station: GroundStation) -> None:
     [ack] = station.send(older)
     assert ack.type == ACCEPTED
     [found] = station.send(mavlink.MAVLink_mission_request_message(1, 1, 0))
-    assert found.get_type() == "MISSION_ITEM_INT"
-    assert (found.x, found.y) == pytest.approx((471_000_000, -87_000_000), abs=40)
+    assert found.get_type() == "MISSION_ITEM"
+    assert (found.x, found.y) == pytest.approx((47.1, -8.7), abs=1e-5)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -1e30])

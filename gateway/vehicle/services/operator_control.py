@@ -1,0 +1,211 @@
+"""Operator control: with "exclusive" one ground station at a time changes things.
+
+| request | while                                  | answer                    |
+| ------- | -------------------------------------- | ------------------------- |
+| control | open                                   | accepted, nothing changes |
+| control | nobody, or the sender, is in control   | accepted                  |
+| control | another is, and allows a takeover      | accepted                  |
+| control | another is, and does not               | failed; it is notified    |
+| release | the sender is in control, or open      | accepted                  |
+| release | another is, or nobody                  | denied                    |
+| any     | the sender is not trusted              | denied                    |
+
+The station in control is known by its MAVLink system id. It loses control when its link closes, and
+when nothing was received from it for `TIMEOUT_US`. CONTROL_STATUS reports who is in control; it is
+sent with "exclusive" only, since a ground station that has received one expects to need control.
+
+References
+----------
+.. [1] MAV_CMD_REQUEST_OPERATOR_CONTROL and CONTROL_STATUS in MAVLink's development.xml
+.. [2] CHANGE_OPERATOR_CONTROL in MAVLink's common.xml
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.units import US_PER_S
+from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.dialect import ControlStatus
+from gateway.vehicle.services.commands import (
+    ACCEPTED,
+    DENIED,
+    FAILED,
+    Command,
+    Explain,
+    Outcome,
+    whole,
+)
+
+REQUEST_OPERATOR_CONTROL: Final = 32100
+"""MAV_CMD_REQUEST_OPERATOR_CONTROL, which pymavlink's dialects lack."""
+SYSTEM_MANAGER: Final = 1
+TAKEOVER_ALLOWED: Final = 2
+"""GCS_CONTROL_STATUS_FLAGS."""
+INTERVAL_US: Final = 2 * US_PER_S
+TIMEOUT_US: Final = 30 * US_PER_S
+
+LEGACY_ACK: Final = 0
+LEGACY_DENIED: Final = 1
+LEGACY_BAD_VERSION: Final = 2
+LEGACY_TAKEN: Final = 3
+"""Values of CHANGE_OPERATOR_CONTROL_ACK; 1 is "wrong passkey"."""
+
+
+@dataclass(slots=True)
+class _Operator:
+    client_id: int
+    system_id: int
+    component_id: int
+    heard_us: int
+    allows_takeover: bool
+
+
+class OperatorControl:
+    """The ground station that controls one vehicle.
+
+    Parameters
+    ----------
+    explain : callable
+        Announces to all who has control.
+    exclusive : bool
+        Whether only the station in control may change things.
+    """
+
+    types = ("CHANGE_OPERATOR_CONTROL",)
+
+    def __init__(self, explain: Explain, *, exclusive: bool) -> None:
+        self.exclusive = exclusive
+        self._explain = explain
+        self._operator: _Operator | None = None
+        self._due_us = 0
+
+    def permits(self, request: Request) -> bool:
+        """Return whether the sender may change things now."""
+        return not self.exclusive or self._is_operator(request)
+
+    def denial(self) -> str:
+        """Return why another station may not change things."""
+        if self._operator is None:
+            return "no station is in control"
+        return f"system {self._operator.system_id} is in control"
+
+    def on_request(self, request: Request, now_us: int) -> None:
+        """Note that a station is alive."""
+        if self._operator is not None and self._is_operator(request):
+            self._operator.heard_us = now_us
+
+    def changes_state(self, _request: Request) -> bool:
+        """Return False: untrusted clients are denied by the acknowledgement itself."""
+        return False
+
+    def refuse(self, _request: Request) -> list[Answer]:
+        """Return nothing; never called."""
+        return []
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Answer CHANGE_OPERATOR_CONTROL, the older request, which has no takeover."""
+        message = request.message
+        is_release = message.control_request != 0
+        answers: list[Answer] = []
+        result = LEGACY_ACK
+        if not request.may_change:
+            result = LEGACY_DENIED
+        elif message.version != 0:
+            result = LEGACY_BAD_VERSION
+        elif is_release:
+            outcome, answers = self._release(request, now_us)
+            result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_DENIED
+        else:
+            outcome, answers = self._request(request, now_us, allows_takeover=False)
+            result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_TAKEN
+        ack = mavlink.MAVLink_change_operator_control_ack_message(
+            request.system_id, message.control_request, result
+        )
+        return [request.reply(ack), *answers]
+
+    def command(self, command: Command, now_us: int) -> Outcome:
+        """Carry out MAV_CMD_REQUEST_OPERATOR_CONTROL."""
+        request, (action, takeover, timeout_s, system_id) = command.request, command.params
+        if not request.may_change or whole(system_id) not in (0, request.system_id):
+            return DENIED, []
+        if whole(action) == 0:
+            return self._release(request, now_us)
+        result, answers = self._request(request, now_us, allows_takeover=whole(takeover) == 1)
+        operator = self._operator
+        if result == FAILED and operator is not None:
+            notice = mavlink.MAVLink_command_long_message(
+                operator.system_id,
+                operator.component_id,
+                REQUEST_OPERATOR_CONTROL,
+                0,
+                1.0,
+                takeover,
+                timeout_s,
+                float(request.system_id),
+                0.0,
+                0.0,
+                0.0,
+            )
+            answers = [*answers, Reply(notice, operator.client_id)]
+        return result, answers
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Send CONTROL_STATUS, and release the control of a station that is not heard any more."""
+        if not self.exclusive or now_us < self._due_us:
+            return []
+        operator = self._operator
+        if operator is not None and now_us - operator.heard_us > TIMEOUT_US:
+            return self._change(None, f"System {operator.system_id} lost control: timeout", now_us)
+        self._due_us = now_us + INTERVAL_US
+        return [Reply(self.status())]
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to send."""
+        return self._due_us if self.exclusive else None
+
+    def forget_client(self, client_id: int) -> None:
+        """Release the control of a station whose link has closed."""
+        if self._operator is not None and self._operator.client_id == client_id:
+            self._operator = None
+            self._due_us = 0
+
+    def status(self) -> Any:
+        """Encode CONTROL_STATUS."""
+        operator = self._operator
+        if operator is None:
+            return ControlStatus(SYSTEM_MANAGER | TAKEOVER_ALLOWED, 0, b"")
+        takeover = TAKEOVER_ALLOWED if operator.allows_takeover else 0
+        return ControlStatus(SYSTEM_MANAGER | takeover, operator.system_id, b"")
+
+    def _is_operator(self, request: Request) -> bool:
+        return self._operator is not None and self._operator.system_id == request.system_id
+
+    def _request(self, request: Request, now_us: int, *, allows_takeover: bool) -> Outcome:
+        if not self.exclusive:
+            return ACCEPTED, []
+        operator = self._operator
+        is_own = self._is_operator(request)
+        if operator is not None and not is_own and not operator.allows_takeover:
+            return FAILED, self._explain(
+                f"System {request.system_id} requests control; {self.denial()}", now_us
+            )
+        fresh = _Operator(
+            request.client_id, request.system_id, request.component_id, now_us, allows_takeover
+        )
+        text = "" if is_own else f"System {request.system_id} is in control"
+        return ACCEPTED, self._change(fresh, text, now_us)
+
+    def _release(self, request: Request, now_us: int) -> Outcome:
+        if not self.exclusive:
+            return ACCEPTED, []
+        if not self._is_operator(request):
+            return DENIED, []
+        return ACCEPTED, self._change(None, f"System {request.system_id} released control", now_us)
+
+    def _change(self, operator: _Operator | None, text: str, now_us: int) -> list[Answer]:
+        self._operator = operator
+        self._due_us = now_us + INTERVAL_US
+        explained = self._explain(text, now_us) if text else []
+        return [Reply(self.status()), *explained]

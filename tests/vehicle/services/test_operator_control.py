@@ -1,0 +1,175 @@
+"""Operator control: which station may change things, and how control passes on."""
+
+import struct
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.generator.mavcrc import x25crc
+
+from gateway.records import Incoming, Outgoing
+from gateway.vehicle.dialect import ControlStatus
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.conftest import ManualClock
+from tests.vehicle.ground_station import GroundStation, kinds
+from tests.vehicle.services.parameters.test_parameters import set_message
+
+REQUEST_CONTROL = 32100
+ACCEPTED, DENIED, FAILED = 0, 2, 4
+RELEASE, REQUEST = 0, 1
+
+
+@pytest.fixture
+def first(clock: ManualClock) -> GroundStation:
+    vehicle = Vehicle(VehicleSettings(operator_control="exclusive"), 1)
+    return GroundStation(vehicle, clock, client_id=7, system_id=255)
+
+
+@pytest.fixture
+def second(first: GroundStation) -> GroundStation:
+    return GroundStation(first.vehicle, first.clock, client_id=8, system_id=254)
+
+
+def control(station: GroundStation, action: int = REQUEST, takeover: int = 0) -> int:
+    """Send the command as QGroundControl does; return the result."""
+    found = station.command(REQUEST_CONTROL, action, takeover, 10, station.mav.srcSystem)
+    return next(m.result for m in found if m.get_type() == "COMMAND_ACK")
+
+
+def changes(station: GroundStation) -> bool:
+    found = station.send(set_message("RATE_ATT", 7.0))
+    return "PARAM_ERROR" not in kinds(found)
+
+
+def statuses(station: GroundStation, since: int = 0) -> list[tuple[int, int]]:
+    """Return flags and controlling system of every CONTROL_STATUS that was sent."""
+    frames = [f.frame for f in station.frames[since:] if f.message_id == 512]
+    return [(frame[10], frame[11] if frame[1] > 1 else 0) for frame in frames]
+
+
+def test_control_status_is_laid_out_as_the_xml_defines_it() -> None:
+    """The CRC is computed from the definition by the rule of the generator."""
+    crc = x25crc()
+    crc.accumulate_str("CONTROL_STATUS ")
+    for kind, name, length in (
+        ("uint8_t", "flags", 0),
+        ("uint8_t", "gcs_main", 0),
+        ("uint8_t", "gcs_secondary", 10),
+    ):
+        crc.accumulate_str(f"{kind} {name} ")
+        crc.accumulate([length] if length else [])
+    assert ControlStatus.crc_extra == (crc.crc & 0xFF) ^ (crc.crc >> 8)
+    assert struct.calcsize(ControlStatus.unpacker.format) == 12
+
+
+def test_station_without_control_changes_nothing(
+    first: GroundStation, second: GroundStation
+) -> None:
+    assert not changes(first)
+    assert control(first) == ACCEPTED
+    assert changes(first)
+    assert not changes(second)
+    texts = "".join(m.text for m in second.inbox if m.get_type() == "STATUSTEXT")
+    assert "Refused PARAM_SET of system 254: system 255 is in control" in texts
+    assert second.command(512, 148)[0].result == ACCEPTED, "reading stays free"
+
+
+def test_takeover_needs_the_consent_of_the_station_in_control(
+    first: GroundStation, second: GroundStation
+) -> None:
+    control(first)
+    actions = second.vehicle.handle(incoming(second, REQUEST_CONTROL, REQUEST, 1, 10, 254), 0)
+    [notice] = [
+        first.decode(a.frame)
+        for a in actions
+        if isinstance(a, Outgoing) and a.client_id == first.client_id
+    ]
+    assert (notice.get_type(), notice.command) == ("COMMAND_LONG", REQUEST_CONTROL)
+    assert (notice.target_system, notice.target_component) == (255, 190)
+    assert (notice.param1, notice.param2, notice.param3, notice.param4) == (1, 1, 10, 254)
+    assert control(second) == FAILED
+    assert control(first, takeover=1) == ACCEPTED
+    assert control(second) == ACCEPTED
+    assert changes(second)
+    assert not changes(first)
+
+
+def incoming(station: GroundStation, number: int, *params: float) -> Incoming:
+    padded = [*params, *[0.0] * (7 - len(params))]
+    frame = station.frame(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded))
+    return Incoming(station.client_id, frame, station.trusted)
+
+
+def test_release_is_for_the_station_in_control(first: GroundStation, second: GroundStation) -> None:
+    control(first)
+    assert control(second, RELEASE) == DENIED
+    assert control(first, RELEASE) == ACCEPTED
+    assert control(second) == ACCEPTED
+
+
+@pytest.mark.parametrize("how", ["gone", "silent"])
+def test_control_ends_with_the_link_of_the_station(
+    first: GroundStation, second: GroundStation, how: str
+) -> None:
+    control(first)
+    if how == "gone":
+        first.vehicle.forget_client(first.client_id)
+    else:
+        second.wait(33.0)
+        assert "System 255 lost control: timeout" in [
+            m.text for m in second.inbox if m.get_type() == "STATUSTEXT"
+        ]
+    assert control(second) == ACCEPTED
+
+
+def test_heartbeats_keep_control(first: GroundStation, second: GroundStation) -> None:
+    control(first)
+    for _ in range(60):
+        first.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+        first.wait(1.0)
+    assert control(second) == FAILED
+
+
+def test_control_status_is_sent_regularly_and_at_every_change(first: GroundStation) -> None:
+    first.wait(5.0)
+    assert statuses(first)[-1] == (3, 0)
+    control(first)
+    assert statuses(first)[-1] == (1, 255)
+    control(first, takeover=1)
+    assert statuses(first)[-1] == (3, 255)
+    before = len(statuses(first))
+    first.wait(20.0)
+    assert len(statuses(first)) - before == pytest.approx(10, abs=1)
+
+
+def test_nothing_of_it_is_sent_while_control_is_open(station: GroundStation) -> None:
+    station.wait(10.0)
+    assert control(station) == ACCEPTED
+    assert control(station, RELEASE) == ACCEPTED
+    assert statuses(station) == []
+
+
+@pytest.mark.parametrize(
+    ("version", "trusted", "taken", "ack"),
+    [(0, True, False, 0), (1, True, False, 2), (0, False, False, 1), (0, True, True, 3)],
+)
+def test_older_request(
+    first: GroundStation, second: GroundStation, version: int, trusted: bool, taken: bool, ack: int
+) -> None:
+    if taken:
+        control(first)
+    second.trusted = trusted
+    message = mavlink.MAVLink_change_operator_control_message(1, 0, version, b"secret")
+    [answer] = [m for m in second.send(message) if m.get_type() == "CHANGE_OPERATOR_CONTROL_ACK"]
+    assert (answer.gcs_system_id, answer.control_request, answer.ack) == (254, 0, ack)
+    assert changes(second) == (ack == 0)
+
+
+def test_untrusted_client_cannot_take_control_or_act_for_another(
+    first: GroundStation, second: GroundStation
+) -> None:
+    second.trusted = False
+    assert control(second) == DENIED
+    second.trusted = True
+    found = second.command(REQUEST_CONTROL, REQUEST, 0, 10, 255)
+    assert found[0].result == DENIED
