@@ -2,45 +2,45 @@
 
 import asyncio
 import errno
-import hashlib
 import inspect
 import logging
 import os
 import socket
 import ssl
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import uvicorn
 from fastapi import FastAPI
+from fastapi.middleware.gzip import GZipMiddleware
+from nicegui import app as pages
 from nicegui import ui
 from starlette.requests import Request
+from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
 from gateway.live.attachment import on_end_signals, on_parent_gone
+from gateway.panel.access import ROLE, AccessControl, Logins
+from gateway.panel.api.rest import RestApi
+from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
+from gateway.panel.content_policy import ScriptNonces
 from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
-from gateway.panel.doors.rest_door import RestDoor
 from gateway.panel.gateway_watch import GatewayWatch
+from gateway.panel.map_tiles import MapTiles
+from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.recording_files import add_recording_files
 from gateway.panel.recording_player import Playback
-from gateway.panel.serving import feed
-from gateway.panel.serving.feed import TelemetryFeed
-from gateway.panel.serving.map_tiles import MapTiles
-from gateway.panel.serving.page_guard import ROLE, PageGuard
-from gateway.panel.serving.page_lock import PageLock
-from gateway.panel.serving.path_api import add_paths
-from gateway.panel.serving.recording_files import add_recording_files
-from gateway.panel.shell import build_page
 from gateway.panel.state.field_history import FieldHistory
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.sample_memory import SampleMemory
+from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
 from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, PanelParts
 
@@ -48,7 +48,8 @@ log = logging.getLogger(__name__)
 
 NICENESS: Final = 5
 """The gateway has priority over the panel."""
-MAX_CONNECTIONS: Final = 256
+WS_QUEUE: Final = 4
+"""Messages of a WebSocket that may wait to be handled, of at most 1 MB each."""
 RECONNECT_S: Final = 30.0
 """A browser that reconnects within this time keeps its page."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
@@ -96,22 +97,27 @@ def run_panel(
     parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
     logging.getLogger("uvicorn.error").addFilter(without_traceback)
-    lock = PageLock(settings.password, settings.viewer_password)
+    limits = ConnectionLimits()
+    logins = Logins(settings.password, settings.viewer_password)
     config = uvicorn.Config(
-        PageGuard(app, settings, lock),
+        AccessControl(app, settings, logins, limits.authenticate),
+        http=LimitedProtocol,
         log_config=None,  # the log is the one of every command
         log_level="warning",
         access_log=False,
         server_header=False,
-        limit_concurrency=MAX_CONNECTIONS,
+        # Behind a proxy of this machine a client could name any address as its own.
+        proxy_headers=False,
         ws_max_size=1 << 20,
+        ws_max_queue=WS_QUEUE,
         timeout_graceful_shutdown=1,
         ssl_certfile=certificate,
         ssl_keyfile=key,
     )
     config.load()
     on_open = partial(on_link, _link(settings, sock))
-    asyncio.run(_serve(config, sock, parts, on_open, attached=attached))
+    server = LimitedServer(config, limits)
+    asyncio.run(_serve(server, sock, parts, on_open, attached=attached))
 
 
 def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
@@ -180,25 +186,31 @@ def make_parts(
 def make_app(parts: PanelParts) -> FastAPI:
     """Build the web application."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
-    for router in RestDoor(parts.uplink).routers():
+    for router in RestApi(parts.uplink).routers():
         app.include_router(router)
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
-    @app.websocket(feed.PATH)
+    @app.websocket(PATH)
     async def _telemetry(websocket: WebSocket) -> None:
         await telemetry.serve(websocket)
 
-    add_paths(app, parts.fleet)
+    add_tracks(app, parts.fleet)
     MapTiles(parts.settings).serve(app)
     add_recording_files(app, parts)
-    app.mount("/web", StaticFiles(directory=WEB))
-    app.mount("/leaflet", StaticFiles(directory=LEAFLET))
-    version = _version_of(WEB)
+    app.mount("/web", _CheckedFiles(directory=WEB))
+    app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))
+    ui.add_head_html('<link rel="stylesheet" href="/web/panel.css">', shared=True)
+    ui.add_head_html('<link rel="stylesheet" href="/web/tools.css">', shared=True)
+    ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
+    ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
 
     @ui.page("/")
     def _page(request: Request) -> None:
-        build_page(parts, request.scope[ROLE], version)
+        build_page(parts, request.scope[ROLE])
 
+    # The nonces are put into the text, which is then compressed: the last one added is outermost.
+    pages.add_middleware(ScriptNonces)
+    pages.add_middleware(GZipMiddleware)
     ui.run_with(
         app,
         title="mavgate",
@@ -209,19 +221,19 @@ def make_app(parts: PanelParts) -> FastAPI:
         binding_refresh_interval=None,
         reconnect_timeout=RECONNECT_S,
         tailwind=False,
+        gzip_middleware_factory=None,
     )
     return app
 
 
 async def _serve(
-    config: uvicorn.Config,
+    server: LimitedServer,
     sock: socket.socket,
     parts: PanelParts,
     on_open: Callable[[], None],
     *,
     attached: bool,
 ) -> None:
-    server = _Server(config)
     on_end_signals(partial(setattr, server, "should_exit", True))
     if attached:
         on_parent_gone(partial(setattr, server, "should_exit", True))
@@ -229,13 +241,8 @@ async def _serve(
     parts.dialogues.start()
     if parts.uplink.is_local:
         parts.watch.start()
-    serving = asyncio.create_task(server.serve(sockets=[sock]))
-    while not server.started and not serving.done():
-        await asyncio.sleep(0.01)
-    if server.started:
-        on_open()
     try:
-        await serving
+        await server.serve_on(sock, on_open)
     finally:
         parts.dialogues.close()
         parts.playback.close()
@@ -243,13 +250,14 @@ async def _serve(
         parts.uplink.close()
 
 
-class _Server(uvicorn.Server):
-    """Server without signal handlers: re-raised signals would kill the process too soon."""
+class _CheckedFiles(StaticFiles):
+    """Files that a browser may keep but asks for again, so that it never uses old ones."""
 
-    @contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
-        yield
+    def file_response(self, *args: Any, **named: Any) -> Response:
+        """Return the response of a file."""
+        response = super().file_response(*args, **named)
+        response.headers["cache-control"] = "no-cache"
+        return response
 
 
 def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:
@@ -274,11 +282,3 @@ def _link(settings: PanelSettings, sock: socket.socket) -> str:
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()
     return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
-
-
-def _version_of(folder: Path) -> str:
-    """Return a checksum of cacheable files, so that browsers fetch changed ones again."""
-    digest = hashlib.sha256()
-    for file in sorted(folder.iterdir()):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]

@@ -28,13 +28,13 @@ Colours and sizes are the CSS variables of `web/panel.css` (`--ink`, `--paper`, 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
 from nicegui import ui
 
 from gateway.clock import GatewayClock
+from gateway.panel.access import Role
 from gateway.panel.control_client import READING, ControlClient
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.gateway_watch import GatewayWatch
@@ -49,13 +49,6 @@ from gateway.panel.uplink import Uplink
 
 WEB: Final = Path(__file__).parent / "web"
 """The components' JavaScript and the style sheet."""
-
-
-class Role(StrEnum):
-    """Role of a page's user."""
-
-    OPERATOR = "operator"
-    VIEWER = "viewer"
 
 
 class NotAllowedError(Exception):

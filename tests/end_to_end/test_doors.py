@@ -22,10 +22,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 from websockets.sync.client import connect as follow
 
-from gateway.panel.doors.message_json import template
+from gateway.panel.api.messages import template
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
 from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
-from tests.panel.doors.test_message_json import as_pymavlink_tells
+from tests.panel.api.test_messages import as_pymavlink_tells
 from tests.ports import free_port
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

@@ -4,11 +4,11 @@ import asyncio
 import json
 from typing import Any, cast
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
-from gateway.panel.serving.feed import GRANTS, TelemetryFeed
 from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.telemetry_feed import GRANTS, TelemetryFeed
 from tests.panel.messages import position
 
 LIMIT_S = 60.0
@@ -25,11 +25,11 @@ class Browser:
     async def accept(self) -> None:
         pass
 
-    async def receive_text(self) -> str:
+    async def receive(self) -> dict[str, Any]:
         grant = await self.grants.get()
         if grant is None:
-            raise WebSocketDisconnect
-        return grant
+            return {"type": "websocket.disconnect"}
+        return {"type": "websocket.receive", "text": grant}
 
     async def send_text(self, text: str) -> None:
         self.frames.append(json.loads(text))

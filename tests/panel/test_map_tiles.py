@@ -14,8 +14,8 @@ import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
+from gateway.panel.map_tiles import MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
-from gateway.panel.serving.map_tiles import MapTiles, tidy
 
 pytestmark = pytest.mark.io
 

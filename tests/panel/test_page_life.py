@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from gateway.live.control_socket import request
-from gateway.panel.serving.page_lock import hash_password
+from gateway.panel.access import hash_password
 from tests.panel.browsing import (
     CONFIG,
     START_LIMIT_MS,

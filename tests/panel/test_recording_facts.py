@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.panel.serving.recording_facts import RecordingFacts
+from gateway.panel.recording_facts import RecordingFacts
 from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
 from gateway.season.statistics.flight_facts import FlightFacts
 

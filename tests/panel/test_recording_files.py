@@ -13,8 +13,8 @@ from fastapi import FastAPI
 from pymavlink.dialects.v20 import common as mavlink
 from starlette.types import Receive, Scope, Send
 
-from gateway.panel.serving.page_guard import ROLE
-from gateway.panel.serving.recording_files import add_recording_files
+from gateway.panel.access import ROLE
+from gateway.panel.recording_files import add_recording_files
 from gateway.panel.view_context import Role
 
 pytestmark = pytest.mark.io

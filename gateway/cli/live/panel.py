@@ -54,7 +54,7 @@ def panel(
     except ModuleNotFoundError as error:
         refuse(f"the panel is an extra, and {error.name} is missing: {how_to_add('panel')}")
     if hash_password:
-        from gateway.panel.serving.page_lock import hash_password as hashed
+        from gateway.panel.access import hash_password as hashed
 
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return

@@ -2,14 +2,13 @@
 
 import math
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from nicegui import ui
+from nicegui.element import Element
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.instruments.field_sphere import FieldSphere
-from gateway.panel.instruments.pose_picture import NAMES, pose_svg
 from gateway.panel.state.dialogue.calibration_run import (
     SIDES,
     CalibrationRun,
@@ -17,13 +16,27 @@ from gateway.panel.state.dialogue.calibration_run import (
     RunState,
 )
 from gateway.panel.state.dialogue.parameter_client import ListState
+from gateway.panel.state.dialogue.sphere_cover import CELLS
+from gateway.panel.state.field_history import FloatArray
 from gateway.panel.uplink import CommandFailedError
-from gateway.panel.view_context import ViewContext
+from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.widgets.prompts import heading
+from gateway.panel.widgets.table import DataTable
+from gateway.printable import printable
 
 REFRESH_S: Final = 0.2
 STORE: Final = 1.0
 """PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 MIN_CELLS: Final = 60
+SIDE_NAMES: Final = {
+    "down": "level",
+    "up": "upside down",
+    "left": "on its left side",
+    "right": "on its right side",
+    "front": "nose down",
+    "back": "tail down",
+}
+"""By the side that lies below; see `calibration_run.SIDES`."""
 LIVE: Final = "live"
 
 TITLES: Final = {
@@ -40,6 +53,27 @@ WHAT_TO_DO: Final = {
     CalibrationStep.MAG: "Away from iron, turn it slowly about all its axes, upside down too, "
     "until the sphere is covered.",
 }
+
+
+class FieldSphere(Element, component=WEB / "field_sphere.js"):
+    """The magnetometer's samples on a sphere that can be turned, and directions not covered yet."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._props["cells"] = CELLS.round(4).tolist()
+
+    def show(self, points: FloatArray, seen: list[bool]) -> None:
+        """Show these samples.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, 3)
+            In radii of the sphere, from its centre; body FRD.
+        seen : list of bool
+            By cell; see `seen_cells`.
+        """
+        rounded: Any = points.round(3).tolist()
+        self.run_method("show", rounded, seen)
 
 
 def build(context: ViewContext) -> None:
@@ -109,8 +143,9 @@ class _CalibrationView:
                     card.props("aria-current=step")
                 with card:
                     ui.icon(icon)
-                    ui.html(f"<b>{title}</b>", sanitize=False)
-                    ui.label(outcome).classes(f"state {look}")
+                    with ui.element("b"):
+                        ui.label(title)
+                    ui.label(outcome).classes("state").classes(look)
                     ui.label(short).classes("soft")
 
     def _show(self, step: CalibrationStep) -> None:
@@ -124,7 +159,7 @@ class _CalibrationView:
     def _build_guide(self, run: CalibrationRun | None, *, ready: bool) -> None:
         self._guide.clear()
         with self._guide:
-            ui.html(f"<h2>{TITLES[self._step][0]}</h2>", sanitize=False)
+            heading(TITLES[self._step][0])
             self._now = ui.label(self._what_now(run, ready=ready)).classes("now")
             if run is not None and run.state.is_over:
                 self._now.classes("good" if run.state is RunState.DONE else "bad")
@@ -149,7 +184,7 @@ class _CalibrationView:
             waits = "" if ready else " Reading the parameters first, so that it can be undone …"
             return WHAT_TO_DO[self._step] + waits
         if run.state is RunState.FAILED:
-            return f"Not calibrated: {run.trouble}. Nothing has changed; try again."
+            return f"Not calibrated: {printable(run.trouble)}. Nothing has changed; try again."
         if run.state is RunState.CHECKING:
             return "Done. Measuring the remaining error; leave it as it is for a moment."
         if run.state is RunState.DONE:
@@ -160,9 +195,12 @@ class _CalibrationView:
         self._poses = {}
         with ui.element("div").classes("poses"):
             for side in SIDES:
-                with ui.element("div").classes("pose").props(f"data-side={side}") as pose:
-                    ui.html(pose_svg(side), sanitize=False)
-                    ui.label(NAMES[side])
+                with ui.element("div").classes("pose") as pose:
+                    pose.props["data-side"] = side
+                    picture = ui.element("img").classes("pose-picture")
+                    picture.props["src"] = f"/web/pose-{side}.svg"
+                    picture.props["alt"] = f"Aircraft {SIDE_NAMES[side]}"
+                    ui.label(SIDE_NAMES[side])
                     state = ui.label("still to do").classes("state")
                 self._poses[side] = (pose, state)
 
@@ -170,7 +208,13 @@ class _CalibrationView:
         self._sent = -1
         with ui.element("div").classes("cloud"):
             self._sphere = FieldSphere()
-            self._figures = ui.html("", sanitize=False)
+            self._figures = {}
+            with ui.element("dl").classes("figures"):
+                for name in ("Samples", "Directions seen", "Centre (hard iron)", "Strength"):
+                    with ui.element("dt"):
+                        ui.label(name)
+                    with ui.element("dd"):
+                        self._figures[name] = ui.label()
 
     def _build_buttons(self, run: CalibrationRun | None, *, ready: bool) -> None:
         vehicle = self._context.vehicle
@@ -195,12 +239,10 @@ class _CalibrationView:
     def _build_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
         found += [(name, old, new) for name, (old, new) in self._changes().items()]
-        rows = "".join(
-            f"<tr><td>{name}</td><td>{_figure(old)}</td><td>{_figure(new)}</td></tr>"
-            for name, old, new in found
+        table = DataTable(("", "before", "after")).classes("residuals")
+        table.show(
+            {name: ((name, ""), (_figure(old), ""), (_figure(new), "")) for name, old, new in found}
         )
-        head = "<tr><th></th><th>before</th><th>after</th></tr>"
-        ui.html(f'<table class="residuals">{head}{rows}</table>', sanitize=False)
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         """Return the parameters that the calibration changed."""
@@ -221,7 +263,7 @@ class _CalibrationView:
                 done = side in run.sides_done
                 now = side == run.side_now and not done and run.state is RunState.RUNNING
                 look = "done" if done else "now" if now else ""
-                pose.classes(replace=f"pose {look}".strip())
+                pose.classes(replace="pose").classes(look)
                 state.set_text("done ✓" if done else "hold still …" if now else "still to do")
         if run.step is CalibrationStep.MAG:
             self._move_cloud(run)
@@ -237,12 +279,14 @@ class _CalibrationView:
             self._sphere.show((points - (x, y, z)) / radius, seen)
         left = len(seen) - sum(seen)
         enough = "well covered" if sum(seen) >= MIN_CELLS else f"{left} directions uncovered"
-        self._figures.set_content(
-            f'<dl class="figures"><dt>Samples</dt><dd>{len(points)}</dd>'
-            f"<dt>Directions seen</dt><dd>{sum(seen)} of {len(seen)}, {enough}</dd>"
-            f"<dt>Centre (hard iron)</dt><dd>{x:.1f}, {y:.1f}, {z:.1f} µT</dd>"
-            f"<dt>Strength</dt><dd>{radius:.1f} µT</dd></dl>"
+        texts = (
+            str(len(points)),
+            f"{sum(seen)} of {len(seen)}, {enough}",
+            f"{x:.1f}, {y:.1f}, {z:.1f} µT",
+            f"{radius:.1f} µT",
         )
+        for label, text in zip(self._figures.values(), texts, strict=True):
+            label.set_text(text)
 
     async def _start(self) -> None:
         context, system_id = self._context, self._context.system_id

@@ -1,6 +1,5 @@
 """View 8: the aircraft's texts with time and severity; and the page's banners."""
 
-import html
 from datetime import datetime
 from typing import Any, Final
 
@@ -11,6 +10,8 @@ from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
 from gateway.panel.state.gateway_alerts import with_status
 from gateway.panel.state.status_texts import TimedText
 from gateway.panel.view_context import ViewContext
+from gateway.panel.widgets.table import Cells, DataTable
+from gateway.printable import printable
 
 REFRESH_S: Final = 0.5
 LIVE: Final = "live"
@@ -55,8 +56,8 @@ def _build_alert(alert: Alert) -> None:
     grave = alert.level is AlertLevel.CRITICAL
     with ui.element("div").classes("banner bad" if grave else "banner warn"):
         ui.icon("report" if grave else "warning")
-        ui.label(alert.title).classes("banner-title")
-        ui.label(alert.detail)
+        ui.label(printable(alert.title)).classes("banner-title")
+        ui.label(printable(alert.detail))
 
 
 class _EventsView:
@@ -75,7 +76,8 @@ class _EventsView:
             ui.element("div").classes("spring")
             save = ui.button("Save as CSV", icon="table_view", on_click=self._save)
             save.props("flat dense no-caps")
-        self._table = ui.html("", sanitize=False).classes("card events")
+        with ui.element("div").classes("card events"):
+            self._table = DataTable(("Time", "Severity", "Text"), "No texts yet.")
         self._context.on_select(self._refresh)
         self._context.every(REFRESH_S, self._refresh)
         self._refresh()
@@ -97,12 +99,7 @@ class _EventsView:
         if state == self._drawn:
             return
         self._drawn = state
-        rows = "".join(_row(text, self._when(text)) for text in texts)
-        empty = "" if rows else '<p class="empty">No texts yet.</p>'
-        self._table.set_content(
-            '<table><thead><tr><th scope="col">Time</th><th scope="col">Severity</th>'
-            f'<th scope="col">Text</th></tr></thead><tbody>{rows}</tbody></table>{empty}'
-        )
+        self._table.show({str(text.number): _row(text, self._when(text)) for text in texts})
 
     def _when(self, text: TimedText) -> datetime:
         unix_us = unix_time_us() - self._context.now_us + text.time_us
@@ -121,10 +118,10 @@ def _severity(text: TimedText) -> str:
     return SEVERITIES[min(max(text.severity, 0), len(SEVERITIES) - 1)]
 
 
-def _row(text: TimedText, when: datetime) -> str:
+def _row(text: TimedText, when: datetime) -> Cells:
     look = LOOKS[min(max(text.severity, 0), len(LOOKS) - 1)]
     return (
-        f'<tr class="{look}"><td class="number">{when:%H:%M:%S}</td>'
-        f'<td><i class="q-icon material-icons" aria-hidden="true">{ICONS[look]}</i>'
-        f" {_severity(text)}</td><td>{html.escape(text.text)}</td></tr>"
+        (f"{when:%H:%M:%S}", "soft"),
+        (_severity(text), look, ICONS[look]),
+        (text.text, look if look in ("bad", "soft") else ""),
     )

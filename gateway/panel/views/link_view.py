@@ -5,9 +5,9 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.panel.live_table import Cells, LiveTable, RowButton
-from gateway.panel.page_prompts import confirm, heading, notify_failure
 from gateway.panel.view_context import ViewContext
+from gateway.panel.widgets.prompts import confirm, heading, notify_failure
+from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
@@ -35,7 +35,7 @@ class LinkView:
             with ui.element("div").classes("card padded"):
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
-                self._nodes = LiveTable(
+                self._nodes = DataTable(
                     ("Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age"),
                     "No node was heard.",
                 )
@@ -44,10 +44,10 @@ class LinkView:
                 self._build_clients()
             with ui.element("div").classes("card padded"):
                 heading("Listening")
-                self._ports = LiveTable(("Port", "State", "Clients", "Turned away"), "No port.")
+                self._ports = DataTable(("Port", "State", "Clients", "Turned away"), "No port.")
             with ui.element("div").classes("card padded"):
                 heading("Aircraft over MAVLink")
-                self._vehicles = LiveTable(
+                self._vehicles = DataTable(
                     ("Aircraft", "Heartbeat", "Attitude", "Position", "Messages"),
                     "No aircraft was heard.",
                 )
@@ -56,7 +56,7 @@ class LinkView:
 
     def _build_clients(self) -> None:
         may = self._context.may_change
-        self._clients = LiveTable(
+        self._clients = DataTable(
             ("Client", "State", "Sent", "Rate", "Dropped", "Received", "Trip", "Heard", "Trust"),
             "No client.",
             buttons=[RowButton("close", "Remove this client", self._ask_remove)] if may else (),

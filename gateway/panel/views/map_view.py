@@ -11,9 +11,9 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.page_prompts import closing, named_dialog, notify_failure
 from gateway.panel.state.instant import Spot
 from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.widgets.prompts import closing, named_dialog, notify_failure
 
 LEAFLET: Final = ui.leaflet
 """The map library is that of NiceGUI's own map, whose import registers it with the page."""

@@ -5,8 +5,8 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.panel.instruments.live_chart import LiveChart
 from gateway.panel.view_context import ViewContext
+from gateway.panel.widgets.charts import LiveChart
 
 REFRESH_S: Final = 0.25
 CHOICES_S: Final = 2.0
@@ -74,7 +74,7 @@ class _PlotsView:
     def _set_paused(self, *, paused: bool) -> None:
         self._paused = paused
         self._pause.set_text("Go on" if paused else "Pause")
-        self._pause.props(f"icon={'play_arrow' if paused else 'pause'}")
+        self._pause.props["icon"] = "play_arrow" if paused else "pause"
         for strip in self._strips:
             strip.chart.element.pause(paused=paused)
 
@@ -140,6 +140,7 @@ class _Strip:
         ui.download.content(await self.chart.table(), "plot.csv", "text/csv")
 
 
-def _icon_button(icon: str, what: str, on_click: Any) -> None:
+def _icon_button(icon: str, title: str, on_click: Any) -> None:
     button = ui.button(icon=icon, on_click=on_click).props("flat round dense")
-    button.props(f'aria-label="{what}"').tooltip(what)
+    button.props["aria-label"] = title
+    button.tooltip(title)

@@ -12,12 +12,13 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from gateway.edges.disk.recordings import delete_recording, list_recordings
-from gateway.panel.live_table import Cells, LiveTable, RowButton
-from gateway.panel.page_prompts import confirm, heading, notify_failure
 from gateway.panel.recorded_aircraft import Profile
+from gateway.panel.recording_facts import RecordingFacts
 from gateway.panel.recording_player import SPEEDS, Playback
-from gateway.panel.serving.recording_facts import RecordingFacts
 from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.widgets.prompts import confirm, heading, notify_failure
+from gateway.panel.widgets.table import Cells, DataTable, RowButton
+from gateway.printable import printable
 from gateway.season.catalogue.catalogue_file import Row
 
 REFRESH_S: Final = 1.0
@@ -62,10 +63,10 @@ class RecordingsView:
                     self._search.props('dense outlined clearable aria-label="Search recordings"')
                     if context.may_change:
                         upload = UploadButton()
-                        upload.props(f":limit={context.parts.settings.upload_limit_mb * 1_000_000}")
+                        upload.props["limit"] = context.parts.settings.upload_limit_mb * 1_000_000
                         upload.on("uploaded", self._on_upload)
                 self._trouble = ui.label().classes("soft")
-                self._table = LiveTable(
+                self._table = DataTable(
                     ("Name", "Last written (UTC)", "Size", "Files", *FACTS),
                     "Nothing was recorded yet.",
                     buttons=self._buttons(),
@@ -110,7 +111,7 @@ class RecordingsView:
             self._toggle.props('round dense aria-label="Play or pause"')
             for icon, to, title in (("replay_10", "-10", "Back"), ("forward_10", "+10", "Ahead")):
                 button = ui.button(icon=icon, on_click=partial(self._play, "seek", to=to))
-                button.props(f'flat round dense aria-label="{title} ten seconds"')
+                button.props("flat round dense").props["aria-label"] = f"{title} ten seconds"
             self._speed = ui.select(
                 {speed: f"{speed:g}×" for speed in SPEEDS}, value=1, on_change=self._on_speed
             )
@@ -126,7 +127,7 @@ class RecordingsView:
             self._detail.set_text(str(self._context.parts.recordings))
         else:
             self._state.set_text(recorder["state"])
-            self._state.classes(replace=f"chip {STATES.get(recorder['state'], '')}")
+            self._state.classes(replace="chip").classes(STATES.get(recorder["state"], ""))
             self._detail.set_text(_detail_of(recorder))
         facts, search = self._facts, (self._search.value or "").strip()
         folder = self._context.parts.recordings_folder
@@ -144,10 +145,10 @@ class RecordingsView:
         self._player.set_visibility(status is not None)
         if status is None:
             return
-        self._title.set_text(playback.name)
+        self._title.set_text(printable(playback.name))
         self._fused_again.set_value(playback.has_fused_again)
         playing = status["state"] == "playing"
-        self._toggle.props(f"icon={'pause' if playing else 'play_arrow'}")
+        self._toggle.props["icon"] = "pause" if playing else "play_arrow"
         new = {
             "curves": _curves_of(playback, self._context.system_id),
             "duration": status["duration_s"],
@@ -189,21 +190,22 @@ class RecordingsView:
                 delete_recording(context.parts.recordings_folder, name)
             else:
                 await context.ask("record.delete", name=name)
-            ui.notify(f"{name} is deleted", type="positive")
+            ui.notify(f"{printable(name)} is deleted", type="positive")
             await self.refresh()
 
     def _download(self, name: str) -> None:
         ui.download.from_url(f"/recordings/{quote(name)}")
 
     async def _on_upload(self, event: GenericEventArguments) -> None:
-        ui.notify(event.args["text"], type="positive" if event.args["ok"] else "negative")
+        text = printable(str(event.args["text"]))
+        ui.notify(text, type="positive" if event.args["ok"] else "negative")
         await self.refresh()
 
     async def _open(self, name: str, *, fused_again: bool = False) -> None:
         context = self._context
         with notify_failure(context):
             context.check_may_change()
-            ui.notify(f"Opening {name}…")
+            ui.notify(f"Opening {printable(name)}…")
             await context.parts.playback.open(
                 context.parts.recordings_folder, name, fused_again=fused_again
             )

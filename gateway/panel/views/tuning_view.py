@@ -6,13 +6,15 @@ from nicegui import ui
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.instruments.comparison_card import ComparisonCard
-from gateway.panel.instruments.live_chart import LiveChart
-from gateway.panel.instruments.parameter_row import ParameterRow
 from gateway.panel.state.dialogue.parameter_client import ListState
 from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import ViewContext
+from gateway.panel.widgets.charts import LiveChart
+from gateway.panel.widgets.comparison import ComparisonCard
+from gateway.panel.widgets.parameter_row import ParameterRow
+from gateway.panel.widgets.prompts import heading
+from gateway.printable import printable
 from gateway.units import counted
 
 REFRESH_S: Final = 0.25
@@ -79,7 +81,7 @@ class _TuningView:
     def _build_effect(self) -> None:
         with ui.element("div").classes("card"):
             with ui.element("div").classes("tools"):
-                ui.html("<h2>Effect</h2>", sanitize=False)
+                heading("Effect")
                 ui.element("div").classes("spring")
                 choice = ui.select(list(EFFECTS), value="attitude")
                 choice.props('dense borderless options-dense aria-label="What is plotted"')
@@ -139,7 +141,7 @@ class _TuningView:
                 group = _group_of(name, dialogue.metas)
                 if group != last:
                     last = group
-                    ui.label(group).classes("group")
+                    ui.label(printable(group)).classes("group")
                 meta = metas[name] or ParameterMeta(name=name)
                 self._rows[name] = ParameterRow(self._context, dialogue, meta)
             if len(names) > MAX_ROWS:

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The magnetic field as it was measured, on the sphere that a calibrated compass would draw. Cells
 // that were seen are filled, the others only outlined and hatched: by shape, not colour alone.
 // It turns slowly by itself, and by hand or the arrow keys.

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The primary flight display. The page's feed brings a moment some 25 times a second; between two of
 // them the attitude turns on by the body's rates and the other values glide, so that the picture
 // moves at the screen's own rate. Nothing is drawn while nothing moves.

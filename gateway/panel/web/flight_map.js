@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The map: fused track and GPS fixes apart, home, mark, accuracy; a metric grid below everything.
 import { leaflet as L } from "nicegui-leaflet";
 

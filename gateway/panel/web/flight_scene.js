@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The aircraft in 3D from two viewpoints: one world, drawn twice.
 //
 // World: metres, x east, y north, z up; its origin is home, or the first reported position.

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A strip chart of several fields over the last minutes. Python appends what came since; following
 // the present, pausing, zooming and the picture to save are done here, where the pixels are.
 import { echarts } from "nicegui-echart";

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The page's telemetry: one WebSocket, the newest state of every aircraft, and who wants to know.
 (() => {
   const FACTORS = {

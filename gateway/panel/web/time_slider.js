@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A slider through a recording, with the altitudes of its aircraft drawn in it: that of the chosen
 // one filled, those of the others as lines.
 export default {

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Brings a recording from the browser's machine, as a plain PUT that can be watched.
 export default {
   template: `

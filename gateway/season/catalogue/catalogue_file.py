@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,19 @@ BUSY_S: Final = 10.0
 MAX_STEPS: Final = 20_000_000
 """Of SQLite's machine for one query; some seconds."""
 _STEPS: Final = 100_000
+MAX_QUERY_S: Final = 5.0
+MAX_QUERY_LENGTH: Final = 10_000
+"""Characters of a condition."""
+MAX_VALUE_BYTES: Final = 100_000
+"""Of any value that a condition computes."""
+FUNCTIONS: Final = frozenset(
+    {
+        "abs", "coalesce", "date", "datetime", "glob", "ifnull", "instr", "julianday", "length",
+        "like", "lower", "ltrim", "max", "min", "nullif", "round", "rtrim", "strftime", "substr",
+        "time", "trim", "unixepoch", "upper",
+    }
+)  # fmt: skip
+"""A condition may call these: none of them makes a value much larger than its arguments."""
 
 _FILE_COLUMNS: Final = {
     "path": "TEXT NOT NULL", "name": "TEXT NOT NULL", "kind": "TEXT", "size": "INTEGER NOT NULL",
@@ -221,35 +235,46 @@ def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
 
 def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[Any, ...]]:
     """Run a query that can read columns of flights, call functions, and nothing else."""
-    steps = 0
+    steps, selects, deadline_s = 0, 0, time.monotonic() + MAX_QUERY_S
+    timed_out = False
 
     def allow(action: int, table: str | None, column: str | None, *_: object) -> int:
+        nonlocal selects
+        selects += action == sqlite3.SQLITE_SELECT
+        if selects > 1:
+            # A subquery could sort and store products of the table.
+            return sqlite3.SQLITE_DENY
         if action == sqlite3.SQLITE_FUNCTION:
-            return sqlite3.SQLITE_DENY if column == "load_extension" else sqlite3.SQLITE_OK
+            return sqlite3.SQLITE_OK if column in FUNCTIONS else sqlite3.SQLITE_DENY
         own = action != sqlite3.SQLITE_READ or table == "flights"
         return sqlite3.SQLITE_OK if action in _ALLOWED and own else sqlite3.SQLITE_DENY
 
     def is_too_long() -> int:
-        nonlocal steps
+        nonlocal steps, timed_out
         steps += _STEPS
-        return int(steps > MAX_STEPS)
+        timed_out = steps > MAX_STEPS or time.monotonic() > deadline_s
+        return int(timed_out)
 
+    length = db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
     db.set_authorizer(allow)
     db.set_progress_handler(is_too_long, _STEPS)
     condition = f"WHERE ({where}\n)" if where.strip() else ""
     try:
+        if len(where) > MAX_QUERY_LENGTH:
+            raise ValueError(f"it has more than {MAX_QUERY_LENGTH} characters")  # noqa: TRY301
         return db.execute(
             f"SELECT {columns} FROM flights {condition} ORDER BY began, path"
         ).fetchall()
     except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
-        text = "it takes too long" if steps > MAX_STEPS else str(error)
+        text = "it takes too long" if timed_out else str(error)
         raise CatalogueError(
-            f"--where {where!r}: {text}; write a condition such as "
+            f"--where {where[:200]!r}: {text}; write a condition such as "
             f"'duration > 300 and loss > 0.05', of {', '.join(COLUMNS)}"
         ) from error
     finally:
         db.set_authorizer(None)
         db.set_progress_handler(None, 0)
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, length)
 
 
 @contextmanager

@@ -1,0 +1,477 @@
+"""Access control of the page: hosts, origins, logins, roles, response headers, and size limits.
+
+Any page that the operator's browser has open may send requests to this one. Two headers that no
+page can forge distinguish them: `Host`, which must be a name of ours (against DNS rebinding), and
+`Origin`, which must be this page.
+"""
+
+import asyncio
+import base64
+import hashlib
+import hmac
+import ipaddress
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from enum import StrEnum
+from http import HTTPStatus
+from typing import Final
+from urllib.parse import SplitResult, parse_qs, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, cookie_parser
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from gateway.panel.connections import Client, address_group
+from gateway.panel.panel_settings import LOOPBACK, PanelSettings
+
+COOKIE: Final = "mavgate_panel"
+ROLE: Final = "mavgate.role"
+"""Key of the scope with the user's role."""
+MAX_BODY: Final = 1 << 20
+MAX_LOGIN_BODY: Final = 1 << 13
+LOGIN_S: Final = 10.0
+"""Longest time for the body of a login request."""
+UPLOAD: Final = "/recordings/"
+"""Paths below it accept a whole recording."""
+MAX_DIGITS: Final = 18
+"""Of a length; Python reads no number of more than some thousand."""
+WS_POLICY_VIOLATION: Final = 1008
+
+COST: Final = 1 << 15
+"""scrypt's N with r = 8 and p = 1: 32 MB and some 0.1 s, once a login."""
+BLOCK: Final = 8
+MEMORY: Final = 64 << 20
+SALT_BYTES: Final = 16
+SESSION_S: Final = 12 * 3600
+MAX_SESSIONS: Final = 64
+MAX_ATTEMPTS: Final = 5
+"""Attempts of one address within `ATTEMPT_WINDOW_S`; a right password clears them."""
+ATTEMPT_WINDOW_S: Final = 60.0
+MAX_PEERS: Final = 256
+
+NO_SCRIPT_POLICY: Final = (
+    "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'"
+)
+"""Content-Security-Policy of every response that sets none itself, see `content_policy.py`."""
+HEADERS: Final = {
+    "x-frame-options": "DENY",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), geolocation=(), microphone=(), usb=(), serial=()",
+}
+
+LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>mavgate</title>
+<link rel="stylesheet" href="/web/panel.css">
+<body class="login"><form method="post" action="/login">
+<h1>mavgate</h1><p role="alert">{word}</p>
+<label>Password <input type="password" name="password" autocomplete="current-password" autofocus>
+</label><button>Open the panel</button></form></body></html>"""
+
+
+class Role(StrEnum):
+    """Role of a page's user."""
+
+    OPERATOR = "operator"
+    VIEWER = "viewer"
+
+
+def hash_password(password: str) -> str:
+    """Hash a password for the settings file: `scrypt$N$salt$hash`."""
+    salt = secrets.token_bytes(SALT_BYTES)
+    return "$".join(("scrypt", str(COST), _text(salt), _text(_derive(password, salt, COST))))
+
+
+def matches(password: str, hashed: str) -> bool:
+    """Return whether a password matches a hash; an invalid hash matches none."""
+    try:
+        kind, cost, salt, digest = hashed.split("$")
+        derived = _derive(password, base64.b64decode(salt), int(cost))
+        return kind == "scrypt" and hmac.compare_digest(derived, base64.b64decode(digest))
+    except (ValueError, MemoryError):
+        return False
+
+
+@dataclass(slots=True)
+class Logins:
+    """Sessions, and the attempts of each address.
+
+    Parameters
+    ----------
+    operator_hash, viewer_hash : str
+        From the settings; without the first no password is needed.
+    """
+
+    operator_hash: str
+    viewer_hash: str
+    _sessions: dict[str, tuple[Role, float]] = field(default_factory=dict)
+    _attempts: dict[str, deque[float]] = field(default_factory=dict)
+    _hashing: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no password is needed."""
+        return not self.operator_hash
+
+    def role_of(self, token: str) -> Role | None:
+        """Return the role of a session; None if there is no such session."""
+        if self.is_open:
+            return Role.OPERATOR
+        role, until_s = self._sessions.get(token, (None, 0.0))
+        return role if time.monotonic() < until_s else None
+
+    def may_attempt(self, host: str) -> bool:
+        """Return whether an address may attempt a login, and count the attempt.
+
+        It is counted before the password is checked, which takes time: parallel attempts must not
+        all be checked.
+        """
+        group, now_s = address_group(host), time.monotonic()
+        attempts = self._attempts.get(group)
+        if attempts is None:
+            if len(self._attempts) >= MAX_PEERS:
+                self._attempts.pop(next(iter(self._attempts)))
+            attempts = self._attempts[group] = deque(maxlen=MAX_ATTEMPTS)
+        if len(attempts) == MAX_ATTEMPTS and now_s - attempts[0] < ATTEMPT_WINDOW_S:
+            return False
+        attempts.append(now_s)
+        return True
+
+    async def check(self, host: str, password: str) -> Role | None:
+        """Return the role of a password; one password is hashed at a time, in a thread."""
+        async with self._hashing:
+            role = await asyncio.to_thread(self._role_of_password, password)
+        if role is not None:
+            self._attempts.pop(address_group(host), None)
+        return role
+
+    def open_session(self, role: Role) -> str:
+        """Open a session and return its token."""
+        if len(self._sessions) >= MAX_SESSIONS:
+            self._sessions.pop(next(iter(self._sessions)))
+        token = secrets.token_urlsafe(32)
+        self._sessions[token] = (role, time.monotonic() + SESSION_S)
+        return token
+
+    def close_session(self, token: str) -> None:
+        """End a session."""
+        self._sessions.pop(token, None)
+
+    def _role_of_password(self, password: str) -> Role | None:
+        if matches(password, self.operator_hash):
+            return Role.OPERATOR
+        return Role.VIEWER if matches(password, self.viewer_hash) else None
+
+
+class _TooLargeError(Exception):
+    """A request that is too large."""
+
+
+class AccessControl:
+    """ASGI middleware in front of the whole page.
+
+    Parameters
+    ----------
+    app : ASGI application
+        The application to protect.
+    settings : PanelSettings
+        Names, passwords and limits.
+    logins : Logins
+        Sessions.
+    on_authenticated : callable
+        Called with address and port of every connection whose request is passed on.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        settings: PanelSettings,
+        logins: Logins,
+        on_authenticated: Callable[[Client], None] = lambda _: None,
+    ) -> None:
+        self.app = app
+        self._logins = logins
+        self._on_authenticated = on_authenticated
+        self._is_local = settings.address in LOOPBACK
+        self._names = {*LOOPBACK, settings.address, *settings.hosts}
+        self._secure = bool(settings.certificate)
+        self._upload_limit = settings.upload_limit_mb * 1_000_000
+        self._sockets: dict[str, set[_SessionSocket]] = {}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        if refusal := self._refusal(headers):
+            await _refuse(scope, receive, send, HTTPStatus.FORBIDDEN, refusal)
+            return
+        token = _token(headers)
+        role = self._logins.role_of(token)
+        if scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
+            await self._serve_login(scope, receive, _with_headers(send))
+        elif role is not None or scope["path"] == "/web/panel.css":
+            scope[ROLE] = role
+            if role is not None and scope.get("client"):
+                self._on_authenticated(tuple(scope["client"]))
+            await self._pass_on(scope, receive, send, token)
+        elif scope["type"] == "http" and scope["path"] == "/":
+            answer = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+            await answer(scope, receive, _with_headers(send))
+        else:
+            await _refuse(scope, receive, send, HTTPStatus.UNAUTHORIZED, "log in first")
+
+    def _refusal(self, headers: Headers) -> str:
+        """Return why a request is not from this page; empty if it is."""
+        host = headers.get("host", "")
+        if not self._is_ours(host):
+            return f"this panel is not called {host!r}; settings: panel.hosts"
+        origin = headers.get("origin")
+        if origin is not None and _split(origin).netloc.lower() != host.lower():
+            return f"a page of {origin!r} may not use this panel"
+        if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") not in (
+            "navigate",
+            None,
+        ):
+            return "another page may not use this panel"
+        return ""
+
+    def _is_ours(self, host: str) -> bool:
+        name = _split(f"//{host}").hostname or ""
+        if name in self._names:
+            return True
+        # An IP address cannot be rebound, as a name can.
+        return not self._is_local and _is_number(name)
+
+    async def _pass_on(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
+        if scope["type"] == "websocket":
+            await self._pass_websocket(scope, receive, send, token)
+            return
+        if scope.get("method") == "HEAD":
+            # Answered as GET; the server, which has the scope itself, leaves the body out.
+            scope = {**scope, "method": "GET"}
+        limit = self._upload_limit if scope["path"].startswith(UPLOAD) else MAX_BODY
+        answer = PlainTextResponse(
+            f"too large: at most {limit} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+        )
+        length = Headers(scope=scope).get("content-length", "").lstrip("0")
+        if len(length) > MAX_DIGITS or int(length or 0) > limit:
+            await answer(scope, receive, _with_headers(send))
+            return
+        began, received = False, 0
+
+        async def counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > limit:
+                raise _TooLargeError
+            return message
+
+        async def noted(message: Message) -> None:
+            nonlocal began
+            began = began or message["type"] == "http.response.start"
+            await send(message)
+
+        try:
+            await _answer(self.app, scope, counted, _with_headers(noted))
+        except _TooLargeError:
+            if not began:
+                await answer(scope, receive, _with_headers(send))
+
+    async def _pass_websocket(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
+        """Pass a WebSocket on for as long as its session lasts."""
+        socket = _SessionSocket(receive, send, lambda: self._logins.role_of(token) is not None)
+        sockets = self._sockets.setdefault(token, set())
+        sockets.add(socket)
+        try:
+            await self.app(scope, socket.receive, socket.send)
+        finally:
+            sockets.discard(socket)
+            if not sockets and self._sockets.get(token) is sockets:
+                del self._sockets[token]
+
+    async def _serve_login(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["method"] == "POST" and scope["path"] == "/logout":
+            token = _token(Headers(scope=scope))
+            self._logins.close_session(token)
+            if not self._logins.is_open:
+                for socket in tuple(self._sockets.get(token, ())):
+                    await socket.close()
+            response: Response = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+            response.delete_cookie(COOKIE)
+        elif scope["method"] == "POST":
+            response = await self._log_in(scope, receive)
+        else:
+            response = HTMLResponse(LOGIN_PAGE.format(word=""))
+        await response(scope, receive, send)
+
+    async def _log_in(self, scope: Scope, receive: Receive) -> Response:
+        peer = str((scope.get("client") or ("",))[0])
+        try:
+            async with asyncio.timeout(LOGIN_S):
+                body = await _small_body(receive)
+        except (TimeoutError, _TooLargeError, ClientDisconnect):
+            return PlainTextResponse("the request is too large or too slow", HTTPStatus.BAD_REQUEST)
+        if not self._logins.may_attempt(peer):
+            word = "Too many attempts; wait a minute."
+            return HTMLResponse(LOGIN_PAGE.format(word=word), HTTPStatus.TOO_MANY_REQUESTS)
+        password = parse_qs(body.decode(errors="replace")).get("password", [""])[0]
+        role = await self._logins.check(peer, password)
+        if role is None:
+            word = "That is not the password."
+            return HTMLResponse(LOGIN_PAGE.format(word=word), HTTPStatus.UNAUTHORIZED)
+        response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
+        response.set_cookie(
+            COOKIE,
+            self._logins.open_session(role),
+            httponly=True,
+            samesite="strict",
+            secure=self._secure,
+        )
+        return response
+
+
+class _SessionSocket:
+    """A WebSocket that ends with the session of its user.
+
+    Parameters
+    ----------
+    receive, send : callable
+        Of the connection.
+    is_valid : callable
+        Returns whether the session lasts.
+    """
+
+    def __init__(self, receive: Receive, send: Send, is_valid: Callable[[], bool]) -> None:
+        self._receive = receive
+        self._send = send
+        self._is_valid = is_valid
+        self._is_closed = False
+
+    async def receive(self) -> Message:
+        """Return the next message; a disconnect once the session has ended."""
+        message = await self._receive()
+        if message["type"] == "websocket.receive" and (self._is_closed or not self._is_valid()):
+            await self.close()
+            return {"type": "websocket.disconnect", "code": WS_POLICY_VIOLATION}
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Send a message unless the session has ended."""
+        if self._is_closed:
+            return
+        if not self._is_valid():
+            await self.close()
+            return
+        self._is_closed = message["type"] == "websocket.close"
+        await self._send(message)
+
+    async def close(self) -> None:
+        """Close the connection if it is still open."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        with suppress(OSError, RuntimeError):
+            await self._send(
+                {"type": "websocket.close", "code": WS_POLICY_VIOLATION, "reason": "logged out"}
+            )
+
+
+async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Let a request be answered, unless the browser leaves meanwhile."""
+    left = False
+
+    async def heard() -> Message:
+        nonlocal left
+        message = await receive()
+        left = message["type"] == "http.disconnect"
+        return message
+
+    try:
+        await app(scope, heard, send)
+    except ClientDisconnect:
+        return
+    except RuntimeError:
+        # Starlette's middleware misses an answer that nobody waits for any more.
+        if not left:
+            raise
+
+
+def _with_headers(send: Send) -> Send:
+    """Return a `send` that adds the security headers to a response."""
+
+    async def dressed(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            headers.update(HEADERS)
+            headers.setdefault("content-security-policy", NO_SCRIPT_POLICY)
+        await send(message)
+
+    return dressed
+
+
+async def _small_body(receive: Receive) -> bytes:
+    body = bytearray()
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        body += message.get("body", b"")
+        if len(body) > MAX_LOGIN_BODY:
+            raise _TooLargeError
+        if not message.get("more_body"):
+            return bytes(body)
+
+
+async def _refuse(
+    scope: Scope, receive: Receive, send: Send, status: HTTPStatus, text: str
+) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": WS_POLICY_VIOLATION, "reason": text[:100]})
+    else:
+        await PlainTextResponse(text, status)(scope, receive, _with_headers(send))
+
+
+def _token(headers: Headers) -> str:
+    # The browser sends the cookies of all programs of this host, with whatever names they have.
+    for value in headers.getlist("cookie"):
+        if (token := cookie_parser(value).get(COOKIE)) is not None:
+            return token
+    return ""
+
+
+def _split(url: str) -> SplitResult:
+    """Return the parts of a URL; none if it is not valid."""
+    try:
+        parts = urlsplit(url)
+        _ = parts.hostname
+    except ValueError:
+        return urlsplit("")
+    return parts
+
+
+def _is_number(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _derive(password: str, salt: bytes, cost: int) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, n=cost, r=BLOCK, p=1, maxmem=MEMORY)
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()

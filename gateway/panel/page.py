@@ -1,0 +1,195 @@
+"""The page itself: its header with aircraft and state, its views, its keys.
+
+A view is one entry of `VIEWS`; see `view_context.py` for the interface of its file.
+"""
+
+import math
+from typing import Any, Final
+
+from nicegui import ui
+from nicegui.element import Element
+
+from gateway.panel.access import Role
+from gateway.panel.added_views import ADDED_VIEWS, View
+from gateway.panel.state.shown_units import ShownUnits
+from gateway.panel.view_context import WEB, PanelParts, ViewContext
+from gateway.panel.views import (
+    calibration_view,
+    events_view,
+    flight_view,
+    link_view,
+    map_view,
+    plots_view,
+    recordings_view,
+    tuning_view,
+)
+from gateway.panel.widgets.prompts import notify_failure
+
+STATE_S: Final = 0.5
+SILENT_S: Final = 3.0
+THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
+
+
+VIEWS: Final = (
+    View("flight", "Flight", "flight", flight_view.build),
+    View("map", "Map", "map", map_view.build),
+    View("link", "Link", "cell_tower", link_view.build),
+    View("recordings", "Recordings", "video_library", recordings_view.build),
+    View("calibration", "Calibration", "tune", calibration_view.build),
+    View("tuning", "Tuning", "settings", tuning_view.build),
+    View("plots", "Plots", "show_chart", plots_view.build),
+    View("events", "Events", "notifications", events_view.build),
+)
+"""In the order of the rail, and of the keys 1 to 9, which added views follow."""
+
+
+def build_page(parts: PanelParts, role: Role) -> None:
+    """Build the page for one browser.
+
+    Parameters
+    ----------
+    parts : PanelParts
+        Parts shared by all pages.
+    role : Role
+        Role of its user.
+    """
+    _Page(ViewContext(parts, role, ShownUnits(parts.settings.units))).build()
+
+
+class PageRail(Element, component=WEB / "page_rail.js"):
+    """The choice of views, drawn by the browser, which also handles the page's keys.
+
+    It emits `show` with the key of a view, `theme`, and `toggle` for the space bar.
+    """
+
+
+class _Page:
+    """The elements of one browser's page."""
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._views = {view.key: view for view in (*VIEWS, *ADDED_VIEWS.values())}
+        self._built: set[str] = set()
+        self._panels: dict[str, ui.element] = {}
+        self._dark = ui.dark_mode(None)
+        self._names: dict[int, str] = {}
+        self._chips: list[tuple[str, str]] = []
+
+    def build(self) -> None:
+        """Build everything; a view is built when it is first shown."""
+        with ui.element("div").classes("shell"):
+            self._build_head()
+            events_view.build_banner(self._context)
+            self._build_rail()
+            with ui.element("div").classes("stage"):
+                for view in self._views.values():
+                    panel = self._panels[view.key] = ui.element("section").classes("view")
+                    panel.props["data-view"] = view.key
+                    panel.props["aria-label"] = view.title
+        ui.timer(STATE_S, self._refresh)
+        self._refresh()
+        self.show(VIEWS[0].key)
+
+    def show(self, key: str) -> None:
+        """Note that the browser shows a view; fill it at the first time."""
+        if key not in self._views:
+            return
+        self._context.show(key)
+        if key not in self._built:
+            self._built.add(key)
+            self._context.building(key)
+            with self._panels[key]:
+                self._views[key].build(self._context)
+
+    def _build_head(self) -> None:
+        with ui.element("header").classes("head"):
+            with ui.element("h1").classes("brand"):
+                ui.label("mavgate")
+            self._choice = ui.select({}, on_change=self._on_choice).classes("choice")
+            self._choice.props('dense options-dense borderless aria-label="Aircraft"')
+            self._state = ui.element("div").classes("chips").props("role=status")
+            ui.element("div").classes("spring")
+            if self._context.role is Role.VIEWER:
+                ui.label("viewer").classes("chip warn")
+            units = ui.select(
+                {"metric": "metric", "imperial": "imperial", "aviation": "aviation"},
+                value=self._context.units.system,
+                on_change=self._on_units,
+            ).classes("choice")
+            units.props('dense options-dense borderless aria-label="Units"')
+            self._theme = ui.button(icon=THEMES[None], on_click=self._next_theme)
+            self._theme.props('flat round dense aria-label="Light or dark"')
+
+    def _build_rail(self) -> None:
+        self._rail = PageRail()
+        self._rail.props["views"] = [
+            {"key": view.key, "title": view.title, "icon": view.icon}
+            for view in self._views.values()
+        ]
+        self._rail.props["units"] = self._context.units.system
+        self._rail.on("show", lambda event: self.show(event.args))
+        self._rail.on("theme", self._next_theme)
+        self._rail.on("toggle", self._on_space)
+
+    async def _on_space(self) -> None:
+        if not self._context.parts.playback.name:
+            return
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            await self._context.parts.playback.toggle()
+
+    def _next_theme(self) -> None:
+        order = list(THEMES)
+        self._dark.value = order[(order.index(self._dark.value) + 1) % len(order)]
+        self._theme.props["icon"] = THEMES[self._dark.value]
+
+    def _on_units(self, event: Any) -> None:
+        self._context.units.system = event.value
+        self._rail.props["units"] = event.value
+
+    def _on_choice(self, event: Any) -> None:
+        self._context.select(event.value)
+        self._rail.props["system_id"] = event.value
+
+    def _refresh(self) -> None:
+        fleet, context = self._context.fleet, self._context
+        names = {key: fleet.vehicles[key].title for key in sorted(fleet.vehicles)}
+        if names != self._names:
+            played = [key for key in names.keys() - self._names.keys() if key in fleet.origins]
+            self._names = names
+            wanted = min(played, default=context.system_id)
+            first = next(iter(names), None)
+            self._choice.set_options(names, value=wanted if wanted in names else first)
+        if (chips := _state_of(context)) != self._chips:
+            self._chips = chips
+            self._state.clear()
+            with self._state:
+                for text, kind in chips:
+                    ui.label(text).classes("chip").classes(kind)
+
+
+def _mode_of(context: ViewContext) -> str:
+    """Return where the data comes from."""
+    vehicle, status = context.vehicle, context.parts.watch.status
+    if vehicle is not None and vehicle.origin != "live":
+        return "recording"
+    if status is None:
+        return "MAVLink"
+    return "simulation" if status["simulated"] else "serial"
+
+
+def _state_of(context: ViewContext) -> list[tuple[str, str]]:
+    """Summarise the state of the selected aircraft: texts and their severity."""
+    vehicle = context.vehicle
+    if vehicle is None:
+        return [("waiting for an aircraft", "warn")]
+    now = vehicle.instant(context.now_us)
+    if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
+        return [(f"silent for {now.silent_s:.0f} s", "bad")]
+    has_fix = now.fix_type >= 3
+    fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
+    chips = [("link", "good"), (_mode_of(context), ""), (fix, "good" if has_fix else "bad")]
+    recorder = context.parts.watch.recorder
+    if recorder is not None and recorder["state"] != "idle":
+        chips.append(("● REC" if recorder["state"] == "recording" else "not recording", "bad"))
+    return chips

@@ -1,0 +1,168 @@
+"""Download of recordings as one archive, and checked uploads.
+
+File names from the browser are always checked: a recording must be one of the existing ones, and
+an upload gets a name that follows the rules of recordings. An upload is written to a temporary
+file, checked, and only then becomes a recording. A download is packed while it is sent, so it needs
+no space on the disk.
+"""
+
+import os
+import secrets
+import stat
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import suppress
+from http import HTTPStatus
+from pathlib import Path
+from typing import BinaryIO, Final
+from urllib.parse import quote
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
+
+from fastapi import FastAPI
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+
+from gateway.edges.disk.recording_streams import FileKind, kind_of
+from gateway.edges.disk.recordings import RecordingError, check_free, find_recording
+from gateway.flightlog.table.row import TableRow
+from gateway.flightlog.table.table import TableReader
+from gateway.flightlog.tlog.tlog import TlogScanner
+from gateway.panel.access import ROLE, UPLOAD, Role
+from gateway.panel.view_context import PanelParts
+
+LOOKED_AT: Final = 1 << 20
+CHUNK: Final = 1 << 18
+KINDS: Final[dict[FileKind | None, str]] = {FileKind.TLOG: "_01.tlog", FileKind.TABLE: "_01_v1.csv"}
+"""Kinds that can be uploaded, and the ending of their files."""
+
+
+def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
+    """Serve `GET /recordings/NAME` (a ZIP of its files) and `PUT /recordings/NAME`.
+
+    Parameters
+    ----------
+    app : FastAPI
+        The page's.
+    parts : PanelParts
+        With their folder.
+    """
+
+    @app.get(UPLOAD + "{name}")
+    async def _download(name: str) -> Response:
+        try:
+            files = [
+                file
+                for file in find_recording(parts.recordings_folder, name).files
+                if file.is_file() and not file.is_symlink()
+            ]
+        except RecordingError as error:
+            return PlainTextResponse(str(error), HTTPStatus.NOT_FOUND)
+        if not files:
+            text = f"{name}: links and devices are not sent"
+            return PlainTextResponse(text, HTTPStatus.FORBIDDEN)
+        disposition = f"attachment; filename*=utf-8''{quote(f'{name}.zip')}"
+        return StreamingResponse(
+            zip_stream(files),
+            media_type="application/zip",
+            headers={"content-disposition": disposition},
+        )
+
+    @app.put(UPLOAD + "{name}")
+    async def _upload(name: str, request: Request) -> Response:
+        if request.scope[ROLE] is not Role.OPERATOR:
+            return PlainTextResponse("viewers have read-only access", HTTPStatus.FORBIDDEN)
+        try:
+            folder = parts.recordings_folder
+            check_free(folder, name)
+            stored = await _store(folder, name, request.stream())
+        except ClientDisconnect:
+            return PlainTextResponse("interrupted", HTTPStatus.BAD_REQUEST)
+        except (RecordingError, ValueError) as error:
+            return PlainTextResponse(str(error), HTTPStatus.BAD_REQUEST)
+        except OSError as error:
+            text = f"cannot be stored: {error.strerror}"
+            return PlainTextResponse(text, HTTPStatus.INSUFFICIENT_STORAGE)
+        return PlainTextResponse(stored.name, HTTPStatus.CREATED)
+
+
+def zip_stream(files: Sequence[Path]) -> Iterator[bytes]:
+    """Pack files into a ZIP archive, piece by piece; links and devices are left out."""
+    sink = _Sink()
+    with ZipFile(sink, "w", ZIP_DEFLATED) as packed:  # type: ignore[call-overload]
+        for path in files:
+            with suppress(OSError), open_regular(path) as file:
+                info = ZipInfo.from_file(path, path.name, strict_timestamps=False)
+                info.compress_type = ZIP_DEFLATED
+                with packed.open(info, "w", force_zip64=True) as entry:
+                    while chunk := file.read(CHUNK):
+                        entry.write(chunk)
+                        yield sink.take()
+    yield sink.take()
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading; raises OSError for a link, a pipe or a device."""
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(f"{path} is no regular file")
+    return os.fdopen(handle, "rb")
+
+
+class _Sink:
+    """A file that can be written but not sought, and gives away what was written."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        self._parts.append(bytes(data))
+        return len(data)
+
+    def flush(self) -> None:
+        """Do nothing: the data is in memory."""
+
+    def take(self) -> bytes:
+        data = b"".join(self._parts)
+        self._parts.clear()
+        return data
+
+
+async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
+    """Write an upload beside the recordings, and rename it if it is a recording.
+
+    Raises
+    ------
+    ValueError
+        If it is no recording.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    fresh = folder / f".upload-{secrets.token_hex(8)}"
+    try:
+        # Not by `tempfile`, whose files have the mode 0600 whatever the umask is.
+        with fresh.open("xb") as file:
+            async for chunk in chunks:
+                file.write(chunk)
+        suffix = KINDS.get(_kind(fresh))
+        if suffix is None:
+            allowed = " and ".join(str(kind) for kind in KINDS)
+            raise ValueError(f"this is no recording: {allowed} are taken")
+        target = folder / f"{name}{suffix}"
+        # A file that was created meanwhile is never overwritten.
+        target.touch(exist_ok=False)
+        fresh.replace(target)
+        return target
+    finally:
+        with suppress(FileNotFoundError):
+            fresh.unlink()
+
+
+def _kind(path: Path) -> FileKind | None:
+    """Return the kind of an upload by its first bytes; None if it is no recording."""
+    kind = kind_of(path)
+    with path.open("rb") as file:
+        head = file.read(LOOKED_AT)
+    if kind is FileKind.TLOG:
+        batch = TlogScanner().feed(head, final=True)
+        return kind if len(batch) else None
+    rows = (event for event in TableReader().feed(head) if isinstance(event, TableRow))
+    return kind if kind is FileKind.TABLE and next(rows, None) is not None else None

@@ -1,1 +1,0 @@
-"""Data that the panel serves besides its page, and access control."""

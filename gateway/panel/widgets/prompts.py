@@ -1,0 +1,78 @@
+"""Headings, and prompts around a request: why it failed, a question before it cannot be undone."""
+
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from nicegui import ui
+
+from gateway.edges.disk.recordings import RecordingError
+from gateway.live.control_socket import ControlError
+from gateway.panel.recording_player import PlaybackError
+from gateway.panel.uplink import CommandFailedError
+from gateway.panel.view_context import NotAllowedError, ViewContext
+from gateway.printable import printable
+
+FAILURES: Final = (
+    ControlError, CommandFailedError, NotAllowedError, PlaybackError, RecordingError, OSError,
+)  # fmt: skip
+
+
+def heading(text: str) -> ui.label:
+    """Add the heading of a card, which a screen reader finds as one."""
+    return ui.label(text).classes("title").props("role=heading aria-level=2")
+
+
+@contextmanager
+def notify_failure(context: ViewContext) -> Iterator[None]:
+    """Show on the page why a request was not carried out."""
+    try:
+        yield
+    except FAILURES as error:
+        text = printable(str(error))
+        if context.parts.uplink.is_local or not isinstance(error, ControlError):
+            ui.notify(text, type="negative", multi_line=True)
+        else:
+            ui.notify(f"only a gateway on this machine can: {text}", type="negative")
+
+
+def named_dialog(name: str) -> ui.dialog:
+    """Create a dialog that a screen reader announces by its name."""
+    dialog = ui.dialog()
+    dialog.props["aria-label"] = name
+    return dialog
+
+
+def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
+    """Return what closes a dialog and then acts, for a button in it.
+
+    What it shows is shown on the page: the dialog is deleted before a slow link has answered.
+    """
+    page = ui.context.client
+
+    async def run() -> None:
+        dialog.close()
+        with page:
+            await act()
+
+    return run
+
+
+def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
+    """Ask for confirmation, and act on a yes.
+
+    Parameters
+    ----------
+    question : str
+        The question.
+    word : str
+        Label of the confirming button: the verb.
+    act : callable
+        Called on a yes.
+    """
+    with named_dialog(question) as dialog, ui.card().classes("asks"):
+        ui.label(printable(question)).classes("title")
+        ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+    dialog.on("hide", dialog.delete)
+    dialog.open()

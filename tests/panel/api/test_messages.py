@@ -1,0 +1,182 @@
+"""Every message as JSON and back, beside pymavlink's own reading of its fields."""
+
+import json
+import math
+import random
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.api.messages import (
+    CLASSES,
+    BadMessageError,
+    from_json,
+    template,
+    to_json,
+)
+
+LIMITS = {"int8_t": 7, "int16_t": 15, "int32_t": 31, "int64_t": 53}
+UNSIGNED = {"uint8_t": 8, "uint16_t": 16, "uint32_t": 32, "uint64_t": 53}
+
+
+def random_message(kind: Any, chance: random.Random) -> Any:
+    """Fill a message with values that its fields can have, and let pymavlink read it back."""
+
+    def value(form: str, name: str) -> Any:
+        enum = kind.fieldenums_by_name.get(name)
+        if enum and kind.fielddisplays_by_name.get(name) != "bitmask" and chance.random() < 0.8:
+            return chance.choice([entry for entry in mavlink.enums[enum] if fits(entry, form)])
+        if form in ("float", "double"):
+            return chance.choice([0.0, -1.5, chance.uniform(-1e6, 1e6), math.nan, math.inf])
+        if form in UNSIGNED:
+            return chance.randrange(1 << UNSIGNED[form])
+        return chance.randrange(-(1 << LIMITS[form]), 1 << LIMITS[form])
+
+    given = {}
+    for name, form in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
+        if form == "char":
+            letters = chance.choices("ABCxyz_09", k=chance.randint(0, length) if length else 1)
+            given[name] = "".join(letters).encode()
+        elif length:
+            given[name] = [value(form, name) for _ in range(length)]
+        else:
+            given[name] = value(form, name)
+    link = mavlink.MAVLink(None, 1, 1)
+    return link.decode(bytearray(kind(**given).pack(link)))
+
+
+def fits(number: int, form: str) -> bool:
+    bits = UNSIGNED.get(form) or LIMITS[form]
+    return 0 <= number < 1 << bits
+
+
+def as_pymavlink_tells(message: Any) -> dict[str, Any]:
+    """Write pymavlink's own `to_dict` in the form that the door gives."""
+    found = message.to_dict()
+    expected = {"type": found.pop("mavpackettype")}
+    for name, value in found.items():
+        key = "mavtype" if name == "type" else name
+        form = message.fieldtypes[message.fieldnames.index(name)]
+        length = message.array_lengths[message.ordered_fieldnames.index(name)]
+        if form == "char" and length:
+            expected[key] = [*value, *"\0" * (length - len(value))]
+        elif isinstance(value, list):
+            expected[key] = [as_value(message, name, item) for item in value]
+        else:
+            expected[key] = as_value(message, name, value)
+    return expected
+
+
+def as_value(message: Any, name: str, item: Any) -> Any:
+    enum = message.fieldenums_by_name.get(name)
+    if isinstance(item, float) and not math.isfinite(item):
+        return None
+    if enum is None:
+        return item
+    if message.fielddisplays_by_name.get(name) == "bitmask":
+        return {"bits": item}
+    entry = mavlink.enums[enum].get(item)
+    return {"type": entry.name} if entry else item
+
+
+def test_every_message_tells_what_pymavlink_reads() -> None:
+    link = mavlink.MAVLink(None, 1, 1)
+    for name in sorted(CLASSES):
+        chance = random.Random(name)
+        for _ in range(2):
+            message = random_message(CLASSES[name], chance)
+            told = to_json(message)
+            assert told == as_pymavlink_tells(message)
+            again = json.loads(json.dumps(told, allow_nan=False))
+            back = link.decode(bytearray(from_json(again).pack(link)))
+            assert to_json(back) == told
+
+
+def test_every_template_can_be_sent() -> None:
+    for name in sorted(CLASSES):
+        assert from_json(template(name)).pack(mavlink.MAVLink(None, 255, 0))
+    message = from_json(template("ATTITUDE_QUATERNION"))
+    assert {getattr(message, name) for name in ("time_boot_ms", "q1", "yawspeed")} == {0}
+
+
+def test_a_heartbeat_as_mavlink2rest_shows_it() -> None:
+    heartbeat = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_GENERIC, 81, 7, 4, 3
+    )
+    assert to_json(heartbeat) == {
+        "type": "HEARTBEAT",
+        "mavtype": {"type": "MAV_TYPE_FIXED_WING"},
+        "autopilot": {"type": "MAV_AUTOPILOT_GENERIC"},
+        "base_mode": {"bits": 81},
+        "custom_mode": 7,
+        "system_status": {"type": "MAV_STATE_ACTIVE"},
+        "mavlink_version": 3,
+    }
+
+
+COMMAND = {
+    "type": "COMMAND_LONG",
+    "command": {"type": "MAV_CMD_COMPONENT_ARM_DISARM"},
+    **{f"param{n}": 0.0 for n in range(1, 8)},
+    "target_system": 1,
+    "target_component": 1,
+    "confirmation": 0,
+}
+
+
+def test_a_command_as_its_readme_sends_it() -> None:
+    message = from_json({**COMMAND, "param1": 1})
+    assert (message.command, message.param1, message.target_system) == (400, 1.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "number"),
+    [
+        ("base_mode", "MAV_MODE_FLAG_SAFETY_ARMED | MAV_MODE_FLAG_CUSTOM_MODE_ENABLED", 129),
+        ("base_mode", 129, 129),
+        ("base_mode", {"bits": 129}, 129),
+        ("base_mode", "", 0),
+        ("mavtype", "MAV_TYPE_GCS", 6),
+        ("mavtype", 6, 6),
+        ("custom_mode", 7.0, 7),
+    ],
+)
+def test_other_ways_to_write_a_value(field: str, value: Any, number: int) -> None:
+    message = from_json({**template("HEARTBEAT"), field: value})
+    assert getattr(message, field.removeprefix("mav")) == number
+
+
+@pytest.mark.parametrize("text", ["SPEED", list("SPEED"), list("SPEED") + ["\0"] * 11])
+def test_ways_to_write_a_text(text: Any) -> None:
+    message = from_json({**template("PARAM_SET"), "param_id": text})
+    link = mavlink.MAVLink(None, 1, 1)
+    assert link.decode(bytearray(message.pack(link))).param_id == "SPEED"
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ([], "'type'"),
+        ({}, "called None"),
+        ({"type": ["ATTITUDE"]}, "called"),
+        ({"type": "NO_SUCH"}, "NO_SUCH"),
+        ({key: value for key, value in COMMAND.items() if key != "param3"}, "param3 is missing"),
+        ({**COMMAND, "command": {"type": "MAV_CMD_FLY"}}, "MAV_CMD_FLY"),
+        ({**COMMAND, "command": {}}, "COMMAND_LONG.command"),
+        ({**COMMAND, "command": 70_000}, "0 to 65535"),
+        ({**COMMAND, "target_system": -1}, "0 to 255"),
+        ({**COMMAND, "target_system": 1.5}, "whole number"),
+        ({**COMMAND, "target_system": True}, "whole number"),
+        ({**COMMAND, "param1": "1"}, "no number"),
+        ({**COMMAND, "param1": 1e300}, "param1"),
+        ({**template("PARAM_SET"), "param_id": "A" * 17}, "16 bytes"),
+        ({**template("PARAM_SET"), "param_id": [1]}, "param_id"),
+        ({**template("HOME_POSITION"), "q": [1, 0, 0]}, "array of 4"),
+        ({**template("HOME_POSITION"), "q": 1}, "array of 4"),
+    ],
+)
+def test_what_is_no_message_is_reported(fields: Any, words: str) -> None:
+    with pytest.raises(BadMessageError, match=words):
+        from_json(fields)

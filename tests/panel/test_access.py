@@ -1,0 +1,376 @@
+"""Who may reach the page: tested on the guard alone, before an application that grants all."""
+
+import asyncio
+import contextlib
+import http
+import logging
+import re
+import subprocess
+import threading
+from collections import Counter
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import httpx
+import pytest
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.types import Message, Receive, Scope, Send
+
+from gateway.panel import access
+from gateway.panel.access import (
+    COOKIE,
+    HEADERS,
+    MAX_ATTEMPTS,
+    MAX_BODY,
+    MAX_LOGIN_BODY,
+    ROLE,
+    AccessControl,
+    Logins,
+    hash_password,
+    matches,
+)
+from gateway.panel.content_policy import ScriptNonces
+from gateway.panel.panel_server import PanelError, tls_files, without_traceback
+from gateway.panel.panel_settings import PanelSettings
+
+HERE = "http://127.0.0.1:14590"
+OPERATOR, VIEWER = hash_password("tower"), hash_password("visitor")
+
+
+async def grants_all(scope: Scope, receive: Receive, send: Send) -> None:
+    body = await Request(scope, receive).body()
+    text = f"{scope[ROLE]} {len(body)}"
+    await PlainTextResponse(text)(scope, receive, send)
+
+
+def guarded(settings: PanelSettings | None = None) -> AccessControl:
+    settings = settings or PanelSettings()
+    lock = Logins(settings.password, settings.viewer_password)
+    return AccessControl(grants_all, settings, lock)
+
+
+def client_of(guard: AccessControl, base: str = HERE) -> httpx.AsyncClient:
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app=guard), base_url=base)
+
+
+@pytest.fixture
+async def locked() -> AsyncIterator[httpx.AsyncClient]:
+    settings = PanelSettings(
+        address="0.0.0.0", password=OPERATOR, viewer_password=VIEWER, insecure=True
+    )
+    async with client_of(guarded(settings), "http://192.168.1.7:14590") as client:
+        yield client
+
+
+async def websocket_answer(guard: AccessControl, **headers: str) -> str:
+    """Ask for the telemetry as a page would; what the guard says first."""
+    said: list[str] = []
+
+    async def receive() -> dict[str, str]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: dict[str, object]) -> None:
+        said.append(str(message["type"]))
+
+    async def accept(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "websocket.accept"})
+
+    guard.app = accept
+    raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "websocket", "path": "/telemetry", "headers": raw, "client": ("127.0.0.1", 1)}
+    await guard(scope, receive, send)
+    return said[0]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:14590", "localhost:14590", "[::1]:14590"])
+async def test_own_names_are_let_in(host: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.get("/", headers={"host": host})
+    assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
+    assert answer.headers["x-frame-options"] == "DENY"
+
+
+async def test_head_is_answered_as_get_is() -> None:
+    """Its body is left out by the server in front of the guard."""
+
+    async def tells_the_method(scope: Scope, receive: Receive, send: Send) -> None:
+        await PlainTextResponse(scope["method"])(scope, receive, send)
+
+    guard = guarded()
+    guard.app = tells_the_method
+    async with client_of(guard) as client:
+        answer = await client.head("/")
+    assert answer.headers["content-length"] == str(len("GET"))
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+async def test_a_browser_that_leaves_unanswered_is_no_error(leaves: bool) -> None:
+    async def says_nothing(scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect" if leaves else "http.request"}
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    async def pass_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        return await call_next(request)
+
+    guard = guarded()
+    guard.app = BaseHTTPMiddleware(says_nothing, pass_on)
+    head = [(b"host", b"127.0.0.1:14590")]
+    scope = {"type": "http", "method": "GET", "path": "/favicon.ico", "headers": head}
+    with contextlib.nullcontext() if leaves else pytest.raises(RuntimeError):
+        await guard(scope, receive, send)
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", "", "[::1", "[x]"]
+)
+async def test_foreign_name_that_points_here_is_refused(host: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.get("/", headers={"host": host})
+    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "http://127.0.0.1:8080", "null", "http://[::1"]
+)
+async def test_other_page_of_the_same_browser_cannot_steer(origin: str) -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.post("/", headers={"origin": origin})
+    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+
+
+async def test_own_page_may_post() -> None:
+    async with client_of(guarded()) as client:
+        answer = await client.post("/", headers={"origin": HERE})
+    assert answer.status_code == http.HTTPStatus.OK
+
+
+async def test_websocket_asks_for_the_origin_too() -> None:
+    host = "127.0.0.1:14590"
+    assert await websocket_answer(guarded(), host=host, origin=HERE) == "websocket.accept"
+    evil = await websocket_answer(guarded(), host=host, origin="http://evil.example")
+    assert evil == "websocket.close"
+    assert await websocket_answer(guarded(), host="evil.example", origin=HERE) == "websocket.close"
+
+
+async def test_named_host_is_let_in() -> None:
+    async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
+        answer = await client.get("/", headers={"host": "ground.local:14590"})
+    assert answer.status_code == http.HTTPStatus.OK
+
+
+async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
+    async def chunks() -> AsyncIterator[bytes]:
+        for _ in range(20):
+            yield bytes(MAX_BODY // 10)
+
+    async with client_of(guarded()) as client:
+        told = await client.post("/x", content=bytes(MAX_BODY + 1))
+        untold = await client.post("/x", content=chunks())
+        fitting = await client.post("/x", content=bytes(MAX_BODY))
+        endless = await client.post("/x", headers={"content-length": "9" * 5000})
+    assert told.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert untold.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert endless.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert fitting.text == f"operator {MAX_BODY}"
+
+
+async def test_nothing_is_shown_without_the_password(locked: httpx.AsyncClient) -> None:
+    assert (await locked.get("/")).headers["location"] == "/login"
+    assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
+    locked.cookies.set(COOKIE, "forged")
+    assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
+
+
+async def test_websocket_needs_the_password() -> None:
+    settings = PanelSettings(password=OPERATOR)
+    answer = await websocket_answer(guarded(settings), host="127.0.0.1:14590", origin=HERE)
+    assert answer == "websocket.close"
+
+
+@pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("visitor", "viewer")])
+async def test_password_tells_the_role(locked: httpx.AsyncClient, password: str, role: str) -> None:
+    answer = await locked.post("/login", data={"password": password})
+    assert answer.status_code == http.HTTPStatus.SEE_OTHER
+    assert "HttpOnly" in answer.headers["set-cookie"]
+    assert "SameSite=strict" in answer.headers["set-cookie"]
+    assert (await locked.get("/")).text.startswith(role)
+    await locked.post("/logout")
+    assert (await locked.get("/")).headers["location"] == "/login"
+
+
+async def test_cookies_of_other_programs_do_no_harm(locked: httpx.AsyncClient) -> None:
+    """A browser sends those of every port of the host, and their names may be odd."""
+    await locked.post("/login", data={"password": "tower"})
+    token = locked.cookies[COOKIE]
+    locked.cookies.clear()
+    answer = await locked.get("/", headers={"cookie": f"a/b=c; {{d}}=e; {COOKIE}={token}"})
+    assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
+
+
+async def test_only_a_few_parallel_attempts_of_an_address_are_checked(
+    locked: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed: list[str] = []
+    monkeypatch.setattr(access, "matches", lambda password, _: hashed.append(password))
+    answers = await asyncio.gather(
+        *(locked.post("/login", data={"password": f"guess {n}"}) for n in range(100))
+    )
+    counts = Counter(answer.status_code for answer in answers)
+    assert counts[http.HTTPStatus.UNAUTHORIZED] == MAX_ATTEMPTS
+    assert counts[http.HTTPStatus.TOO_MANY_REQUESTS] == 100 - MAX_ATTEMPTS
+    assert len(set(hashed)) == MAX_ATTEMPTS
+    answer = await locked.post("/login", data={"password": "tower"})
+    assert answer.status_code == http.HTTPStatus.TOO_MANY_REQUESTS
+
+
+async def test_one_password_is_hashed_at_a_time(
+    locked: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running: list[int] = []
+    peak: list[int] = []
+
+    def slow(password: str, hashed: str) -> bool:
+        running.append(1)
+        peak.append(len(running))
+        threading.Event().wait(0.01)
+        running.pop()
+        return False
+
+    monkeypatch.setattr(access, "matches", slow)
+    await asyncio.gather(*(locked.post("/login", data={"password": "x"}) for _ in range(4)))
+    assert max(peak) == 1
+
+
+async def test_right_password_clears_the_attempts(locked: httpx.AsyncClient) -> None:
+    for _ in range(2):
+        for _ in range(MAX_ATTEMPTS - 1):
+            await locked.post("/login", data={"password": "guess"})
+        answer = await locked.post("/login", data={"password": "tower"})
+        assert answer.status_code == http.HTTPStatus.SEE_OTHER
+
+
+async def test_login_body_is_limited(locked: httpx.AsyncClient) -> None:
+    answer = await locked.post("/login", content=b"password=" + b"x" * MAX_LOGIN_BODY)
+    assert answer.status_code == http.HTTPStatus.BAD_REQUEST
+
+
+@pytest.mark.parametrize("path", ["/", "/login", "/logout", "/path/1", "/web/panel.css", "/x"])
+@pytest.mark.parametrize("host", ["192.168.1.7:14590", "evil.example"])
+async def test_every_response_has_the_security_headers(
+    locked: httpx.AsyncClient, path: str, host: str
+) -> None:
+    answer = await locked.get(path, headers={"host": host})
+    assert {name: answer.headers[name] for name in HEADERS} == HEADERS
+    assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+    assert "script-src" not in answer.headers["content-security-policy"]
+
+
+async def test_inline_scripts_of_a_page_get_the_nonce_of_their_response() -> None:
+    page = b"<script>one()</script><p>&lt;script&gt;</p><script src=/x defer></script><scripts>"
+    seen = set()
+    for _ in range(2):
+        app = ScriptNonces(HTMLResponse(page))
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app=app), base_url=HERE) as http:
+            answer = await http.get("/")
+        policy = answer.headers["content-security-policy"]
+        nonce = re.search(r"'nonce-([\w-]{22})'", policy)
+        assert nonce is not None
+        seen.add(nonce[1])
+        assert answer.text.count(f'<script nonce="{nonce[1]}"') == 2
+        assert answer.text.endswith("<scripts>")
+        assert "'unsafe-inline'" not in policy.partition("script-src")[2].partition(";")[0]
+    assert len(seen) == 2
+
+
+async def test_upload_that_is_interrupted_is_no_error() -> None:
+    async def reads_all(scope: Scope, receive: Receive, send: Send) -> None:
+        await Request(scope, receive).body()
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    guard = guarded()
+    guard.app = reads_all
+    head = [(b"host", b"127.0.0.1:14590")]
+    scope = {"type": "http", "method": "PUT", "path": "/recordings/a", "headers": head}
+    await guard(scope, receive, send)
+
+
+def test_hash_matches_its_password_alone() -> None:
+    assert matches("tower", OPERATOR)
+    assert not matches("Tower", OPERATOR)
+    assert hash_password("tower") != OPERATOR
+    for broken in ("", "scrypt$", "scrypt$x$y$z", "scrypt$7$AAAA$AAAA", "md5$1$AAAA$AAAA"):
+        assert not matches("tower", broken)
+
+
+@pytest.mark.parametrize(
+    ("settings", "missing"),
+    [
+        ({"address": "0.0.0.0"}, "password"),
+        ({"address": "192.168.1.7", "password": OPERATOR}, "certificate"),
+        ({"address": "::", "insecure": True}, "password"),
+        ({"certificate_key": "panel.key"}, "certificate"),
+    ],
+)
+def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: str) -> None:
+    with pytest.raises(ValueError, match=missing):
+        PanelSettings(**settings)
+
+
+@pytest.mark.io
+@pytest.mark.parametrize(
+    ("certificate", "key", "told"),
+    [
+        ("gone.pem", "here.pem", r"^\S*gone.pem: No such file"),
+        ("here.pem", "gone.pem", r"^\S*gone.pem: No such file"),
+        ("here.pem", "", r"here.pem and \S*here.pem must be a certificate and its key"),
+    ],
+)
+def test_a_certificate_that_cannot_be_used_is_named(
+    tmp_path: Path, certificate: str, key: str, told: str
+) -> None:
+    (tmp_path / "here.pem").write_text("junk")
+    settings = PanelSettings(
+        certificate=str(tmp_path / certificate),
+        certificate_key=str(tmp_path / key) if key else "",
+    )
+    with pytest.raises(PanelError, match=told):
+        tls_files(settings)
+
+
+@pytest.mark.io
+def test_a_key_may_be_in_the_certificates_file_but_needs_no_password(tmp_path: Path) -> None:
+    key, certificate, locked = (tmp_path / name for name in ("key", "certificate", "locked"))
+    for words in (
+        ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
+         "-days", "30", "-subj", "/CN=mavgate", "-keyout", key, "-out", certificate],
+        ["ec", "-in", key, "-aes256", "-passout", "pass:secret", "-out", locked],
+    ):  # fmt: skip
+        subprocess.run(["openssl", *words], check=True, capture_output=True)
+    settings = PanelSettings(certificate=str(certificate), certificate_key=str(locked))
+    with pytest.raises(PanelError, match=r"without a password$"):
+        tls_files(settings)
+    certificate.write_text(certificate.read_text() + key.read_text())
+    assert tls_files(PanelSettings(certificate=str(certificate))) == (certificate, certificate)
+
+
+@pytest.mark.parametrize(
+    ("error", "is_kept"),
+    [(UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no text"), False), (OSError("another"), True)],
+)
+def test_what_is_no_text_is_one_line_in_the_log(error: Exception, is_kept: bool) -> None:
+    cause = (type(error), error, None)
+    record = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Invalid", (), cause)
+    assert without_traceback(record)
+    assert (record.exc_info is not None) == is_kept

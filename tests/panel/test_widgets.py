@@ -1,0 +1,163 @@
+"""Parts of the page that stay the same while they are refreshed, built without a browser."""
+
+import asyncio
+import errno
+import os
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nicegui import Client
+from nicegui.page import page
+
+from gateway.panel.dialogues import Dialogue
+from gateway.panel.estimator_trial import ComparisonError
+from gateway.panel.state.dialogue.parameter_client import ParameterEntry
+from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+from gateway.panel.widgets import comparison
+from gateway.panel.widgets.charts import StripChart
+from gateway.panel.widgets.comparison import ComparisonCard
+from gateway.panel.widgets.parameter_row import ParameterRow
+from gateway.panel.widgets.table import DataTable, RowButton
+
+NAME = "CAL_GYRO_BIAS_Z"
+
+
+@pytest.fixture(autouse=True)
+def _page() -> Iterator[None]:
+    with Client(page("/"), request=None):
+        yield
+
+
+def test_button_of_a_row_acts_on_that_row_only_while_it_is_shown() -> None:
+    pressed: list[str] = []
+    table = DataTable(("Name",), "None.", buttons=[RowButton("close", "Remove", pressed.append)])
+    table.show({"b": (("1", ""),), "d": (("2", "bad", "error"),)})
+    assert table.props["rows"] == [
+        {"key": "b", "cells": [["1", ""]]},
+        {"key": "d", "cells": [["2", "bad", "error"]]},
+    ]
+    for key in ("d", "gone"):
+        asyncio.run(table._on_act(SimpleNamespace(args=[0, key])))  # type: ignore[arg-type]
+    assert pressed == ["d"]
+
+
+def test_table_shows_control_characters_escaped_and_keeps_the_key() -> None:
+    table = DataTable(("Name",))
+    table.show({"a\x1b[2J": (("a\x1b[2J", ""),)})
+    assert table.props["rows"] == [{"key": "a\x1b[2J", "cells": [["a\\x1b[2J", ""]]}]
+
+
+def row_of(sent: list[float]) -> tuple[ParameterRow, Dialogue]:
+    """Build a row of a parameter that is 0, of an aircraft that never answers."""
+    dialogue = Dialogue(1)
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.0, 9, 0)
+
+    def change(_: int, name: str, value: float) -> None:
+        sent.append(value)
+        dialogue.parameters.change(name, value, 0)
+
+    dialogues = SimpleNamespace(of=lambda _: dialogue, change=change)
+    context: Any = SimpleNamespace(
+        may_change=True, check_may_change=lambda: None, parts=SimpleNamespace(dialogues=dialogues)
+    )
+    return ParameterRow(context, dialogue, ParameterMeta(name=NAME)), dialogue
+
+
+def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answered() -> None:
+    sent: list[float] = []
+    row, _ = row_of(sent)
+    for value in (0.0, 0.8, 0.0):
+        row._set(value)
+    assert sent == [0.8, 0.0]
+
+
+def test_what_is_typed_is_not_written_over_by_its_own_answer() -> None:
+    sent: list[float] = []
+    row, dialogue = row_of(sent)
+    row._field.set_value(0.8)
+    row._set(0.8)
+    # As 32 bits have it.
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.800000011920929, 9, 0)
+    dialogue.parameters._changes.clear()
+    row.refresh(dialogue)
+    assert row._field.value == 0.8
+    row._set(0.8)
+    assert sent == [0.8]
+    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.5, 9, 0)
+    row.refresh(dialogue)
+    assert row._field.value == 0.5
+
+
+def test_a_browser_that_is_slow_to_draw_a_picture_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limits_s: list[float] = []
+    answers = {"range": [1.0, 2.0], "picture": "data:"}
+
+    async def run(name: str, *, timeout: float = 1.0) -> object:
+        limits_s.append(timeout)
+        return answers[name]
+
+    chart = StripChart()
+    monkeypatch.setattr(chart, "run_method", run)
+    assert asyncio.run(chart.span_ms()) == (1.0, 2.0)
+    assert asyncio.run(chart.picture()) == "data:"
+    assert min(limits_s) >= 60.0
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (BrokenProcessPool("the process ended"), "Cannot be compared: the process ended."),
+        (
+            OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
+            "Cannot be compared: Cannot allocate memory.",
+        ),
+        (MemoryError(), "Cannot be compared: MemoryError."),
+    ],
+)
+def test_a_comparison_that_fails_says_why_and_may_be_tried_again(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, text: str
+) -> None:
+    card, failures = comparison_of(monkeypatch, [error, ComparisonError("no samples")])
+    with pytest.raises(type(error)):
+        asyncio.run(card._compare())
+    assert (card._story.text, card._button.enabled) == (text, True)
+    asyncio.run(card._compare())
+    again = "no samples. Samples are being collected; try again in a moment."
+    assert (card._story.text, card._button.enabled) == (again, True)
+    assert failures == []
+
+
+@pytest.mark.parametrize("may_change", [True, False])
+def test_a_comparison_asks_for_more_samples_where_it_may(
+    monkeypatch: pytest.MonkeyPatch, *, may_change: bool
+) -> None:
+    card, _ = comparison_of(monkeypatch, [ComparisonError("no samples")])
+    asked: list[int] = []
+    context: Any = card._context
+    context.may_change = may_change
+    context.parts.dialogues.ask_for_samples = asked.append
+    asyncio.run(card._compare())
+    assert asked == [1] * may_change
+
+
+def comparison_of(
+    monkeypatch: pytest.MonkeyPatch, failures: list[Exception]
+) -> tuple[ComparisonCard, list[Exception]]:
+    """Build a card whose comparisons fail in these ways, one after the other."""
+    dialogues = SimpleNamespace(of=lambda _: Dialogue(1))
+    samples = SimpleNamespace(frames=lambda _: [])
+    parts = SimpleNamespace(dialogues=dialogues, samples=samples)
+    context: Any = SimpleNamespace(system_id=1, may_change=False, parts=parts)
+    card = ComparisonCard(context)
+
+    async def fail(*_: object) -> None:
+        assert not card._button.enabled
+        raise failures.pop(0)
+
+    monkeypatch.setattr(comparison, "compare_apart", fail)
+    return card, failures
