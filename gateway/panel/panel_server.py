@@ -16,8 +16,8 @@ import msgspec
 import uvicorn
 from fastapi import FastAPI
 from fastapi.middleware.gzip import GZipMiddleware
+from nicegui import Client, ui
 from nicegui import app as pages
-from nicegui import ui
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
@@ -50,6 +50,7 @@ NICENESS: Final = 5
 """The gateway has priority over the panel."""
 WS_QUEUE: Final = 4
 """Messages of a WebSocket that may wait to be handled, of at most 1 MB each."""
+MAX_PENDING_PAGES: Final = 16
 RECONNECT_S: Final = 30.0
 """A browser that reconnects within this time keeps its page."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
@@ -204,8 +205,11 @@ def make_app(parts: PanelParts) -> FastAPI:
     ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
     ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
 
+    pending = _PendingPages()
+
     @ui.page("/")
     def _page(request: Request) -> None:
+        pending.add(ui.context.client)
         build_page(parts, request.scope[ROLE])
 
     # The nonces are put into the text, which is then compressed: the last one added is outermost.
@@ -248,6 +252,23 @@ async def _serve(
         parts.playback.close()
         parts.watch.close()
         parts.uplink.close()
+
+
+class _PendingPages:
+    """Pages that were loaded and have not connected yet, of which the oldest are deleted.
+
+    NiceGUI keeps each for a minute, and a client could load pages without running their scripts.
+    """
+
+    def __init__(self) -> None:
+        self._pages: dict[str, Client] = {}
+
+    def add(self, page: Client) -> None:
+        while len(self._pages) >= MAX_PENDING_PAGES:
+            self._pages.pop(next(iter(self._pages))).delete()
+        self._pages[page.id] = page
+        page.on_connect(lambda: self._pages.pop(page.id, None))
+        page.on_delete(lambda: self._pages.pop(page.id, None))
 
 
 class _CheckedFiles(StaticFiles):

@@ -106,11 +106,11 @@ def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None
     expect(view.locator(".now")).to_contain_text("do not touch it until this is done")
     view.get_by_role("button", name="Start").click()
     expect(view.locator(".now")).to_contain_text("Keep it for good?")
-    rate = view.locator("table.residuals tr", has_text="Rate at rest")
+    rate = view.locator(".residuals tr", has_text="Rate at rest")
     before, after = (float(cell) for cell in rate.locator("td").all_inner_texts()[1:])
     assert before == pytest.approx(1.26, abs=0.1)
     assert after < 0.05
-    expect(view.locator("table.residuals")).to_contain_text("CAL_GYRO_BIAS_X")
+    expect(view.locator(".residuals")).to_contain_text("CAL_GYRO_BIAS_X")
     assert desk.kept == ""
     view.get_by_role("button", name="Store it").click()
     expect(view.locator(".step", has_text="Gyroscope")).to_contain_text("stored")
@@ -166,7 +166,7 @@ def test_parameter_is_found_changed_live_and_shown_against_its_default(desk: Des
 def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
     view = desk.view("tuning")
     card = view.locator("[data-card=comparison]")
-    rows = card.locator("table.residuals tr")
+    rows = card.locator(".residuals tr")
 
     enough_us = desk.begun_us + (LEAST_S + 1.0) * US_PER_S
     desk.page.wait_for_function(f"mavgate.state.time_us > {enough_us}")

@@ -1,7 +1,9 @@
 """`mavgate panel`: the page in a browser."""
 
 import logging
+import sys
 from pathlib import Path
+from types import TracebackType
 from typing import Annotated
 
 import typer
@@ -9,13 +11,12 @@ from msgspec.structs import replace
 
 from gateway.cli.support.asking import SocketOption
 from gateway.cli.support.errors import how_to_add, refuse
-from gateway.cli.support.panel_process import LINK
+from gateway.cli.support.panel_process import LINK, OneLineFormatter
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
 from gateway.hub.endpoint import parse_endpoint
-from gateway.printable import PrintableFormatter
 
 log = logging.getLogger(__name__)
 
@@ -59,10 +60,12 @@ def panel(
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
     if attached:
-        # Its important lines come into the gateway's own log, which stamps them.
+        # Its important lines come into the gateway's own log, which stamps them; so does the
+        # traceback of what ends it.
+        sys.excepthook = _log_uncaught
         logging.getLogger().setLevel(logging.WARNING)
         for handler in logging.getLogger().handlers:
-            handler.setFormatter(PrintableFormatter("%(message)s"))
+            handler.setFormatter(OneLineFormatter("%(message)s"))
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = Path(settings.recording.folder).expanduser()
@@ -72,6 +75,12 @@ def panel(
         run_panel(wanted, folder, connect, socket, _show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))
+
+
+def _log_uncaught(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    log.critical("the panel failed", exc_info=(kind, error, trace))
 
 
 def _show_link(link: str) -> None:

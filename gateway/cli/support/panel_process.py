@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.live.attachment import own_command
+from gateway.printable import LONGEST, PrintableFormatter
 
 log = logging.getLogger(__name__)
 
@@ -19,6 +20,10 @@ RESTART_S: Final = 5.0
 LONGEST_RESTART_S: Final = 300.0
 """Longest pause between restarts, so that repeated failures do not fill the log."""
 
+LINE_BREAK: Final = "\x1e"
+"""Between the lines of one record of the panel's log, whose own control characters are escaped."""
+LONGEST_RECORD: Final = 15_000
+"""Characters of a record, which fit into a line of 64 kB; of a longer one the end is kept."""
 END_S: Final = 3.0
 """Within which it ends by itself when asked to; the loop must not close before it has."""
 
@@ -26,6 +31,18 @@ END_S: Final = 3.0
 def is_installed() -> bool:
     """Return whether the extra is installed."""
     return find_spec("nicegui") is not None
+
+
+class OneLineFormatter(PrintableFormatter):
+    """Formats each record as one line, so that the gateway logs a traceback as one record."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        text = super().format(record)
+        if len(text) > LONGEST_RECORD:
+            head = text.partition("\n")[0][:LONGEST]
+            text = f"{head}\n…\n{text[-LONGEST_RECORD:]}"
+        return text.replace("\n", LINE_BREAK)
 
 
 class PanelProcess:
@@ -104,4 +121,4 @@ class PanelProcess:
                 self.link = text.removeprefix(LINK)
                 log.info("panel: %s", self.link)
             elif text:
-                log.warning("panel: %s", text)
+                log.warning("panel: %s", text.replace(LINE_BREAK, "\n"))

@@ -1,13 +1,16 @@
 """The panel ends with the gateway, before the event loop does."""
 
 import asyncio
+import logging
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from gateway.cli.support import panel_process
-from gateway.cli.support.panel_process import PanelProcess
+from gateway.cli.support.panel_process import LONGEST_RECORD, OneLineFormatter, PanelProcess
+from gateway.live.log_limit import LogLimit
 
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
 SAYING = "import time; print('panel: here', flush=True); time.sleep(100)"
@@ -50,3 +53,39 @@ async def test_it_is_closed_while_it_waits_for_the_gateway() -> None:
     await asyncio.sleep(0)
     await panel.close()
     assert panel._child is None
+
+
+def deep(depth: int) -> None:
+    """Raise an error under many frames, no two of which are alike and so folded into one."""
+    if depth:
+        deeper(depth - 1)
+    else:
+        raise OSError("the reason, with \x1b[2J and a\nline break")
+
+
+def deeper(depth: int) -> None:
+    deep(depth)
+
+
+@pytest.mark.parametrize("depth", [3, 20, 150])
+async def test_traceback_of_the_panel_is_one_record_that_ends_with_its_error(
+    depth: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    try:
+        deep(depth)
+    except OSError as error:
+        cause = (OSError, error, error.__traceback__)
+    record = logging.LogRecord("x", logging.ERROR, "", 0, "It failed", (), cause)
+    line = OneLineFormatter("%(message)s").format(record)
+    assert "\n" not in line
+    assert len(line) < LONGEST_RECORD + 100
+    stream = asyncio.StreamReader()
+    stream.feed_data(line.encode() + b"\n")
+    stream.feed_eof()
+    limit = LogLimit()
+    caplog.handler.addFilter(limit)
+    await PanelProcess(None)._read(SimpleNamespace(stdout=stream))  # type: ignore[arg-type]
+    caplog.handler.removeFilter(limit)
+    (logged,) = caplog.records
+    assert logged.getMessage().startswith("panel: It failed\nTraceback")
+    assert logged.getMessage().endswith("OSError: the reason, with \\x1b[2J and a\nline break")
