@@ -23,8 +23,9 @@ log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS: Final = 256
 """Of all clients; a page needs up to eight."""
-MAX_ANONYMOUS: Final = 96
-MAX_ANONYMOUS_OF_ADDRESS: Final = 32
+MAX_ANONYMOUS: Final = 128
+MAX_ANONYMOUS_OF_ADDRESS: Final = 64
+"""A user behind the same address still gets in: the oldest ones are closed first."""
 HEADER_S: Final = 10.0
 """Longest time for a TLS handshake, and for a complete request header."""
 MAX_HEADER: Final = 1 << 16

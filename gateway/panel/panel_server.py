@@ -111,6 +111,8 @@ def run_panel(
         proxy_headers=False,
         ws_max_size=1 << 20,
         ws_max_queue=WS_QUEUE,
+        # Unpacking would take a multiple of the time that sending takes.
+        ws_per_message_deflate=False,
         timeout_graceful_shutdown=1,
         ssl_certfile=certificate,
         ssl_keyfile=key,

@@ -15,6 +15,7 @@ from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway.clock import GatewayClock
+from gateway.panel.access import WS_POLICY_VIOLATION
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.state.vehicle_picture import PathPoint
 
@@ -25,6 +26,7 @@ INTERVAL_S: Final = 0.033
 and a state could wait a whole interval. The browser interpolates."""
 IDLE_S: Final = 0.5
 """Interval of frames without new data, so that ages are updated."""
+GRANT: Final = "1"
 GRANTS: Final = 2
 """Frames that may be in transit at once."""
 
@@ -52,7 +54,11 @@ class TelemetryFeed:
         sending = asyncio.create_task(self._send(socket, grants))
         with suppress(WebSocketDisconnect, asyncio.CancelledError):
             while True:
-                if (await socket.receive())["type"] == "websocket.disconnect":
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                if message.get("text") != GRANT:
+                    await socket.close(WS_POLICY_VIOLATION, "only grants may be sent")
                     break
                 if grants._value < GRANTS:  # noqa: SLF001 -- a browser may not save up
                     grants.release()

@@ -28,6 +28,8 @@ LIMIT_S: Final = 1
 ENDED_BY_KERNEL: Final = (-signal.SIGXCPU, -signal.SIGKILL)
 EVERYTHING: Final = ".*"
 AT_ONCE: Final = 2
+MAX_PENDING: Final = 8
+"""Expressions that are tried or wait for it."""
 
 SIEVE: Final = f"""
 import json, re, resource, sys
@@ -115,6 +117,7 @@ class NameFilters:
     def __init__(self, names: Iterable[str]) -> None:
         self._names = frozenset(names)
         self._turns = asyncio.Semaphore(AT_ONCE)
+        self._pending = 0
         self._known = functools.lru_cache(maxsize=64)(self._remember)
 
     async def matching(self, pattern: str) -> frozenset[str]:
@@ -129,6 +132,8 @@ class NameFilters:
             return self._names
         if len(pattern) > MAX_PATTERN:
             raise ValueError(f"filter: it has more than {MAX_PATTERN} letters")
+        if self._pending >= MAX_PENDING:
+            raise ValueError("filter: too many are being tried; connect again later")
         # Shielded: a client that leaves meanwhile must not cancel the answer to the others.
         return await asyncio.shield(self._known(pattern))
 
@@ -136,6 +141,17 @@ class NameFilters:
         return asyncio.create_task(self._try(pattern))
 
     async def _try(self, pattern: str) -> frozenset[str]:
+        self._pending += 1
+        try:
+            found = await self._run(pattern)
+        finally:
+            self._pending -= 1
+        if isinstance(found, str):
+            raise ValueError(f"filter {pattern!r}: {found}")  # noqa: TRY004 -- the value is wrong
+        return frozenset(found)
+
+    async def _run(self, pattern: str) -> str | list[str]:
+        """Return the names that match, or why the expression cannot be tried."""
         async with self._turns:
             process = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-I", "-S", "-c", SIEVE),
@@ -146,11 +162,9 @@ class NameFilters:
             question = json.dumps([pattern, sorted(self._names)]).encode()
             answer, _ = await process.communicate(question)
         if process.returncode in ENDED_BY_KERNEL:
-            raise ValueError(f"filter {pattern!r}: it takes too long")
-        found = json.loads(answer or b'"it cannot be tried"')
-        if isinstance(found, str):
-            raise ValueError(f"filter {pattern!r}: {found}")  # noqa: TRY004 -- the value is wrong
-        return frozenset(found)
+            return "it takes too long"
+        found: str | list[str] = json.loads(answer or b'"it cannot be tried"')
+        return found
 
 
 def with_header(message: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from nicegui import ui
 
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets.charts import LiveChart
+from gateway.printable import printable
 
 REFRESH_S: Final = 0.25
 CHOICES_S: Final = 2.0
@@ -110,7 +111,7 @@ class _Strip:
         with ui.element("div").classes("card strip-card") as self.card:
             with ui.element("div").classes("strip-head"):
                 self._choice = ui.select(
-                    self._fields,
+                    {name: name for name in self._fields},
                     value=self._fields,
                     multiple=True,
                     with_input=True,
@@ -125,7 +126,8 @@ class _Strip:
             self.chart.element.on("paused", view.on_hand)
 
     def offer(self, names: list[str]) -> None:
-        self._choice.set_options(sorted({*names, *self._fields}), value=self._fields)
+        options = {name: printable(name) for name in sorted({*names, *self._fields})}
+        self._choice.set_options(options, value=self._fields)
 
     def _on_choice(self, event: Any) -> None:
         if list(event.value) != self._fields:

@@ -114,7 +114,8 @@ class _TuningView:
             groups = sorted(
                 {_group_of(name, dialogue.metas) for name in dialogue.parameters.entries}
             )
-            self._group.set_options([ALL, *groups], value=self._group.value)
+            options = {group: printable(group) for group in (ALL, *groups)}
+            self._group.set_options(options, value=self._group.value)
             self._draw()
         for row in self._rows.values():
             row.refresh(dialogue)

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from nicegui import ui
+from nicegui.elements.mixins.text_element import TextElement
 
 from gateway.edges.disk.recordings import RecordingError
 from gateway.live.control_socket import ControlError
@@ -18,9 +19,9 @@ FAILURES: Final = (
 )  # fmt: skip
 
 
-def heading(text: str) -> ui.label:
-    """Add the heading of a card, which a screen reader finds as one."""
-    return ui.label(text).classes("title").props("role=heading aria-level=2")
+def heading(text: str) -> TextElement:
+    """Add the heading of a card."""
+    return TextElement(tag="h2", text=text).classes("title")
 
 
 @contextmanager
