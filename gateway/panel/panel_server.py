@@ -202,11 +202,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     add_recording_files(app, parts)
     app.mount("/web", _CheckedFiles(directory=WEB))
     app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))
-    ui.add_head_html('<link rel="stylesheet" href="/web/panel.css">', shared=True)
-    ui.add_head_html('<link rel="stylesheet" href="/web/tools.css">', shared=True)
-    ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
-    ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
-
+    _add_head()
     pending = _PendingPages()
 
     @ui.page("/")
@@ -254,6 +250,14 @@ async def _serve(
         parts.playback.close()
         parts.watch.close()
         parts.uplink.close()
+
+
+def _add_head() -> None:
+    """Load the style sheets and the telemetry of every page."""
+    ui.add_head_html('<link rel="stylesheet" href="/web/panel.css">', shared=True)
+    ui.add_head_html('<link rel="stylesheet" href="/web/tools.css">', shared=True)
+    ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
+    ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
 
 
 class _PendingPages:
