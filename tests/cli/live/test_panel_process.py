@@ -87,5 +87,5 @@ async def test_traceback_of_the_panel_is_one_record_that_ends_with_its_error(
     await PanelProcess(None)._read(SimpleNamespace(stdout=stream))  # type: ignore[arg-type]
     caplog.handler.removeFilter(limit)
     (logged,) = caplog.records
-    assert logged.getMessage().startswith("panel: It failed\nTraceback")
+    assert logged.getMessage().startswith("panel: It failed\n")
     assert logged.getMessage().endswith("OSError: the reason, with \\x1b[2J and a\nline break")
